@@ -1,0 +1,40 @@
+"""Exceptions raised by the package; all derive from :class:`SlamObserverError`."""
+
+from __future__ import annotations
+
+
+class SlamObserverError(Exception):
+    """Root of every error that this package raises on purpose."""
+
+
+class ParameterError(SlamObserverError):
+    """A parameter is unknown, of the wrong type, or out of its range."""
+
+
+class InvalidEventError(SlamObserverError):
+    """An event can't be used and is dropped whole.
+
+    Parameters
+    ----------
+    reason : str
+        Short key under which the event is counted, for example ``'not_finite'``.
+    message : str
+        What is wrong, for the log.
+
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class MessageError(SlamObserverError):
+    """A ROS message is malformed or lacks a field that is needed."""
+
+
+class RecordingError(SlamObserverError):
+    """A recording can't be read or written, or its topics are missing or ambiguous."""
+
+
+class DataSetError(SlamObserverError):
+    """A public data set's files are missing or not in their published format."""

@@ -1,0 +1,97 @@
+"""Time-stamped events: what the estimator takes in, and the truth that it is compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from slam_observer_ros.types import FloatArray, IntArray
+
+UNKNOWN_ID = -1
+"""Landmark id of a point that its sensor could not identify."""
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityEvent:
+    """Body velocity, held from its stamp until the next one.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of validity, nanoseconds.
+    body_velocity : FloatArray
+        (6,) angular then linear velocity (Ω, v) as in the paper's (9), in the base frame,
+        rad/s and m/s.
+    covariance : FloatArray or None
+        (6, 6) covariance of ``body_velocity``, same order and units squared; None if unknown.
+
+    """
+
+    stamp_ns: int
+    body_velocity: FloatArray
+    covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationEvent:
+    """Landmarks seen at one instant.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of validity, nanoseconds.
+    ids : IntArray
+        (m,) landmark ids, :data:`UNKNOWN_ID` where the sensor gives none.
+    points : FloatArray
+        (m, 3) positions in the base frame, metres.
+    covariances : FloatArray or None
+        (m, 3, 3) covariance of each point in the base frame, m²; None if unknown.
+    velocities : FloatArray or None
+        (m, 3) velocity of each landmark itself, expressed in the base frame, m/s (the paper's
+        v_i (19)); None for static landmarks.
+
+    """
+
+    stamp_ns: int
+    ids: IntArray
+    points: FloatArray
+    covariances: FloatArray | None = None
+    velocities: FloatArray | None = None
+
+
+Event: TypeAlias = VelocityEvent | ObservationEvent
+"""Anything that :meth:`slam_observer_ros.estimator.Estimator.add` takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseTruth:
+    """True pose of the robot.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of validity, nanoseconds.
+    pose : FloatArray
+        (4, 4) transform from the base frame to the world.
+
+    """
+
+    stamp_ns: int
+    pose: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkTruth:
+    """True landmark positions.
+
+    Attributes
+    ----------
+    ids : IntArray
+        (n,) landmark ids.
+    world_points : FloatArray
+        (n, 3) positions in the world, metres.
+
+    """
+
+    ids: IntArray
+    world_points: FloatArray
