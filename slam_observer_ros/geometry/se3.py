@@ -1,0 +1,279 @@
+"""Poses SE(3) as 4×4 homogeneous matrices (3); twists (Ω, v), angular part first (9)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.types import FloatArray
+
+_HAT = np.array(
+    [
+        [0, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 0],
+        [0, 0, 1, 0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0, 0],
+        [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0],
+    ],
+    dtype=np.float64,
+)
+_IDENTITY = np.eye(4)
+
+
+def pose(R: FloatArray, x: FloatArray) -> FloatArray:
+    """Homogeneous matrix [[R, x], [0, 1]] (3).
+
+    Parameters
+    ----------
+    R : FloatArray, shape (..., 3, 3)
+        Rotation matrix.
+    x : FloatArray, shape (..., 3)
+        Translation, m.
+
+    Returns
+    -------
+    FloatArray, shape (..., 4, 4)
+        Pose.
+
+    """
+    T = np.zeros(R.shape[:-2] + (4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = x
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def inverse(T: FloatArray) -> FloatArray:
+    """Inverse pose [[Rᵀ, −Rᵀ x], [0, 1]].
+
+    Parameters
+    ----------
+    T : FloatArray, shape (..., 4, 4)
+        Pose.
+
+    Returns
+    -------
+    FloatArray, shape (..., 4, 4)
+        Inverse pose.
+
+    """
+    R_transposed = T[..., :3, :3].swapaxes(-1, -2)
+    return pose(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
+
+
+def transform(T: FloatArray, points: FloatArray) -> FloatArray:
+    """Move points: R p + x, the homogeneous product T p̄.
+
+    Parameters
+    ----------
+    T : FloatArray, shape (..., 4, 4)
+        Pose.
+    points : FloatArray, shape (..., n, 3)
+        Points, m.
+
+    Returns
+    -------
+    FloatArray, shape (..., n, 3)
+        Points in the frame that T maps to, m.
+
+    """
+    return rotate(T, points) + T[..., None, :3, 3]
+
+
+def rotate(T: FloatArray, directions: FloatArray) -> FloatArray:
+    """Turn directions: R v, the homogeneous product with a zero in the fourth entry (6).
+
+    Parameters
+    ----------
+    T : FloatArray, shape (..., 4, 4)
+        Pose.
+    directions : FloatArray, shape (..., n, 3)
+        Velocities or differences of points.
+
+    Returns
+    -------
+    FloatArray, shape (..., n, 3)
+        Directions in the frame that T maps to.
+
+    """
+    return directions @ T[..., :3, :3].swapaxes(-1, -2)
+
+
+def hat(xi: FloatArray) -> FloatArray:
+    """Matrix (Ω, v)_∧ = [[Ω_×, v], [0, 0]] of a twist (9).
+
+    Parameters
+    ----------
+    xi : FloatArray, shape (..., 6)
+        Twist (Ω, v).
+
+    Returns
+    -------
+    FloatArray, shape (..., 4, 4)
+        Element of se(3).
+
+    """
+    return (xi @ _HAT).reshape(xi.shape[:-1] + (4, 4))
+
+
+def vee(V: FloatArray) -> FloatArray:
+    """Twist of a matrix of se(3): the inverse of `hat`.
+
+    Parameters
+    ----------
+    V : FloatArray, shape (..., 4, 4)
+        Element of se(3).
+
+    Returns
+    -------
+    FloatArray, shape (..., 6)
+        Twist (Ω, v).
+
+    """
+    return np.concatenate([so3.vee(V), V[..., :3, 3]], axis=-1)
+
+
+def project(M: FloatArray) -> FloatArray:
+    """Orthogonal (Frobenius) projection onto se(3): [[(M₁ − M₁ᵀ) / 2, m₂], [0, 0]] (10).
+
+    Parameters
+    ----------
+    M : FloatArray, shape (..., 4, 4)
+        Any matrix.
+
+    Returns
+    -------
+    FloatArray, shape (..., 4, 4)
+        Element of se(3).
+
+    """
+    V = np.zeros_like(M)
+    V[..., :3, :3] = 0.5 * (M[..., :3, :3] - M[..., :3, :3].swapaxes(-1, -2))
+    V[..., :3, 3] = M[..., :3, 3]
+    return V
+
+
+def exp(xi: FloatArray) -> FloatArray:
+    """Pose exp(V) = I + V + b V² + c V³ with V = (Ω, v)_∧ (b, c: see `so3`).
+
+    Parameters
+    ----------
+    xi : FloatArray, shape (..., 6)
+        Twist times time (Ω, v), rad and m.
+
+    Returns
+    -------
+    FloatArray, shape (..., 4, 4)
+        Pose.
+
+    """
+    V = hat(xi)
+    theta_squared, a, b = so3.coefficients(xi[..., :3])
+    # 1 − a cancels near zero, but V³ = O(θ²) takes the error back to rounding.
+    c = (1.0 - a) / theta_squared
+    V_squared = V @ V
+    return _IDENTITY + V + b * V_squared + c * (V_squared @ V)
+
+
+def log(T: FloatArray) -> FloatArray:
+    """Twist (φ, J(φ)⁻¹ x) of a pose, |φ| ≤ π: the inverse of `exp`.
+
+    Parameters
+    ----------
+    T : FloatArray, shape (..., 4, 4)
+        Pose.
+
+    Returns
+    -------
+    FloatArray, shape (..., 6)
+        Twist (Ω, v), rad and m.
+
+    """
+    phi = so3.log(T[..., :3, :3])
+    v = so3.left_jacobian_inverse(phi) @ T[..., :3, 3:]
+    return np.concatenate([phi, v[..., 0]], axis=-1)
+
+
+def adjoint(T: FloatArray) -> FloatArray:
+    """Matrix of Ad_T V = T V T⁻¹ on twists (Ω, v): [[R, 0], [x_× R, R]].
+
+    Parameters
+    ----------
+    T : FloatArray, shape (..., 4, 4)
+        Pose.
+
+    Returns
+    -------
+    FloatArray, shape (..., 6, 6)
+        Adjoint matrix.
+
+    """
+    R = T[..., :3, :3]
+    return _lower_triangular(R, so3.hat(T[..., :3, 3]) @ R)
+
+
+def left_jacobian(xi: FloatArray) -> FloatArray:
+    """Left Jacobian [[J, 0], [Q, J]] of SE(3): exp(ξ + δ) = exp(J(ξ) δ) exp(ξ) to first order.
+
+    Q is the derivative of J(φ) = I + b K + c K² of SO(3) along v: twists are dual vectors φ + ε v.
+
+    Parameters
+    ----------
+    xi : FloatArray, shape (..., 6)
+        Twist times time (Ω, v), rad and m.
+
+    Returns
+    -------
+    FloatArray, shape (..., 6, 6)
+        Left Jacobian.
+
+    """
+    return _lower_triangular(so3.left_jacobian(xi[..., :3]), _jacobian_coupling(xi))
+
+
+def left_jacobian_inverse(xi: FloatArray) -> FloatArray:
+    """Inverse of `left_jacobian` for |Ω| < 2π: [[J⁻¹, 0], [−J⁻¹ Q J⁻¹, J⁻¹]].
+
+    Parameters
+    ----------
+    xi : FloatArray, shape (..., 6)
+        Twist times time (Ω, v), rad and m.
+
+    Returns
+    -------
+    FloatArray, shape (..., 6, 6)
+        Inverse left Jacobian.
+
+    """
+    J_inverse = so3.left_jacobian_inverse(xi[..., :3])
+    return _lower_triangular(J_inverse, -J_inverse @ _jacobian_coupling(xi) @ J_inverse)
+
+
+# Where θ² < 0.1 the series of c below is used: its first missing term is θ¹² / 15! < 1e-18.
+_SERIES_BELOW = 0.1
+_C_SERIES = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
+
+
+def _jacobian_coupling(xi: FloatArray) -> FloatArray:
+    """Q = b U + c (K U + U K) + (φ·v) (b′ K + c′ K²), U = v_×, primes for d/d(θ²/2)."""
+    phi, v = xi[..., :3], xi[..., 3:]
+    K, U = so3.hat(phi), so3.hat(v)
+    theta_squared, a, b = so3.coefficients(phi)
+    # Unlike in exp, the rounding error of 1 − a is not multiplied by θ² here.
+    small = theta_squared < _SERIES_BELOW
+    series = np.polynomial.polynomial.polyval(theta_squared, _C_SERIES)
+    c = np.where(small, series, (1.0 - a) / theta_squared)
+    b_prime = (a - 2.0 * b) / theta_squared
+    c_prime = (b - 3.0 * c) / theta_squared
+    along = phi[..., None, :] @ v[..., :, None]
+    return b * U + c * (K @ U + U @ K) + along * (b_prime * K + c_prime * (K @ K))
+
+
+def _lower_triangular(diagonal: FloatArray, lower: FloatArray) -> FloatArray:
+    """Block matrix [[D, 0], [L, D]] of shape (..., 6, 6)."""
+    matrix = np.zeros(diagonal.shape[:-2] + (6, 6))
+    matrix[..., :3, :3] = diagonal
+    matrix[..., 3:, 3:] = diagonal
+    matrix[..., 3:, :3] = lower
+    return matrix

@@ -1,0 +1,192 @@
+"""The group SLAM_n(3), the spaces it acts on, its actions, and the lifted SLAM kinematics.
+
+The paper writes A p̄ for points and A v⃗ for directions; here these are `se3.transform` and
+`se3.rotate`. All functions take n = 0, 1 or many landmarks and any leading axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlamElement:
+    """Element X = (A, a_1, …, a_n) of SLAM_n(3), or a stack of them.
+
+    Attributes
+    ----------
+    A : FloatArray, shape (..., 4, 4)
+        Pose part.
+    a : FloatArray, shape (..., n, 3)
+        Translations of the landmarks, m.
+
+    """
+
+    A: FloatArray
+    a: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TotalState:
+    """Raw coordinates Ξ = (P, p_1, …, p_n) in the total space T_n(3), or a stack of them.
+
+    Attributes
+    ----------
+    P : FloatArray, shape (..., 4, 4)
+        Pose of the robot, body → world.
+    p : FloatArray, shape (..., n, 3)
+        Landmarks in the world frame, m.
+
+    """
+
+    P: FloatArray
+    p: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlamVelocity:
+    """Input u = (V, v_1, …, v_n) of the SLAM kinematics, in body coordinates (19).
+
+    Attributes
+    ----------
+    V : FloatArray, shape (..., 6)
+        Twist (Ω, v) of the robot, rad/s and m/s.
+    v : FloatArray, shape (..., n, 3)
+        Velocities of the landmarks themselves, m/s; zero in a static scene.
+
+    """
+
+    V: FloatArray
+    v: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tangent:
+    """Time derivative of a `TotalState` or of a `SlamElement`, as matrices.
+
+    Attributes
+    ----------
+    pose_rate : FloatArray, shape (..., 4, 4)
+        Ṗ or Ȧ.
+    point_rates : FloatArray, shape (..., n, 3)
+        ṗ_i or ȧ_i, m/s.
+
+    """
+
+    pose_rate: FloatArray
+    point_rates: FloatArray
+
+
+def identity(n: int) -> SlamElement:
+    """Identity (I₄, 0, …, 0) of SLAM_n(3) (22)."""
+    return SlamElement(np.eye(4), np.zeros((n, 3)))
+
+
+def compose(X: SlamElement, Y: SlamElement) -> SlamElement:
+    """Product (A, a_i) · (B, b_i) = (A B, a_i + R_A b_i) (22)."""
+    return SlamElement(X.A @ Y.A, X.a + se3.rotate(X.A, Y.a))
+
+
+def inverse(X: SlamElement) -> SlamElement:
+    """Inverse (A, a_i)⁻¹ = (A⁻¹, −R_{A⁻¹} a_i) (22)."""
+    A_inverse = se3.inverse(X.A)
+    return SlamElement(A_inverse, -se3.rotate(A_inverse, X.a))
+
+
+def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
+    """Group exponential (exp Δ, J(Ω_Δ) d_i), with the left Jacobian J of SO(3).
+
+    With held body velocity and landmark velocities, `compose(X, exp(V dt, v dt))` solves the
+    lifted kinematics exactly over dt.
+
+    Parameters
+    ----------
+    Delta : FloatArray, shape (..., 6)
+        Twist (Ω_Δ, v_Δ), rad and m.
+    d : FloatArray, shape (..., n, 3)
+        Translations, m.
+
+    Returns
+    -------
+    SlamElement
+        Element of SLAM_n(3).
+
+    """
+    J = so3.left_jacobian(Delta[..., :3])
+    return SlamElement(se3.exp(Delta), d @ J.swapaxes(-1, -2))
+
+
+def alpha(S: FloatArray, Xi: TotalState) -> TotalState:
+    """Change of reference frame α(S, (P, p_i)) = (S⁻¹ P, S⁻¹ p_i), S in SE(3) (11)."""
+    S_inverse = se3.inverse(S)
+    return TotalState(S_inverse @ Xi.P, se3.transform(S_inverse, Xi.p))
+
+
+def output(Xi: TotalState) -> FloatArray:
+    """Observations y_i = P⁻¹ p_i of the landmarks in the body frame, shape (..., n, 3), m (15)."""
+    return se3.transform(se3.inverse(Xi.P), Xi.p)
+
+
+def configuration(Xi: TotalState) -> TotalState:
+    """Representative (I, P⁻¹ p_i) = α(P, Ξ) of the class π(Ξ) = [P, p_i] in M_n(3) (13), (14)."""
+    return alpha(Xi.P, Xi)
+
+
+def same_configuration(Xi: TotalState, other: TotalState, tolerance_m: float) -> bool:
+    """Tell whether two raw states differ by a change of reference frame only (13).
+
+    Parameters
+    ----------
+    Xi, other : TotalState
+        Raw states with the same number of landmarks.
+    tolerance_m : float
+        Largest difference allowed in any coordinate of the representatives, m.
+
+    """
+    difference = configuration(Xi).p - configuration(other).p
+    return bool(np.all(np.abs(difference) <= tolerance_m))
+
+
+def phi_total(X: SlamElement, Xi: TotalState) -> TotalState:
+    """Right action Φ((A, a_i), (P, p_i)) = (P A, p_i + R_P a_i) on the total space (24)."""
+    return TotalState(Xi.P @ X.A, Xi.p + se3.rotate(Xi.P, X.a))
+
+
+def phi(X: SlamElement, Xi: TotalState) -> TotalState:
+    """Right action φ(X, [Ξ]) = [Φ(X, Ξ)] on configurations, as `configuration` gives them (23)."""
+    return configuration(phi_total(X, Xi))
+
+
+def psi(X: SlamElement, u: SlamVelocity) -> SlamVelocity:
+    """Right action ψ((A, a_i), (V, v_i)) = (Ad_{A⁻¹} V, R_A⁻¹ (v_i + Ω × a_i)) on inputs (26).
+
+    It is Ad_{X⁻¹} of SLAM_n(3) once inputs are read as elements of its Lie algebra.
+    """
+    A_inverse = se3.inverse(X.A)
+    V = (se3.adjoint(A_inverse) @ u.V[..., :, None])[..., 0]
+    turned = X.a @ so3.hat(u.V[..., :3]).swapaxes(-1, -2)
+    return SlamVelocity(V, se3.rotate(A_inverse, u.v + turned))
+
+
+def rho(X: SlamElement, y: FloatArray) -> FloatArray:
+    """Right action ρ((A, a_i), y_i) = A⁻¹ (y_i + a_i) on outputs (..., n, 3) (Lemma 4.5)."""
+    return se3.transform(se3.inverse(X.A), y + X.a)
+
+
+def kinematics(Xi: TotalState, u: SlamVelocity) -> Tangent:
+    """SLAM kinematics f: Ṗ = P V, ṗ_i = R_P v_i (20), (21)."""
+    return Tangent(Xi.P @ se3.hat(u.V), se3.rotate(Xi.P, u.v))
+
+
+def lift(X: SlamElement, u: SlamVelocity) -> Tangent:
+    """Lifted kinematics on SLAM_n(3): Ȧ = A V, ȧ_i = R_A v_i (27).
+
+    The paper prints the static scene, ȧ_i = 0. With landmark velocities this lift keeps
+    φ(X(t), ξ°) = ξ(t): d/dt (p_i° + R_P° a_i) = R_P° R_A v_i = R_P v_i, as in (20).
+    """
+    return Tangent(X.A @ se3.hat(u.V), se3.rotate(X.A, u.v))
