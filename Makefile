@@ -1,0 +1,58 @@
+# `make demo` and `make test` set up all they need, in .venv; the second time they start at once.
+
+VENV := .venv
+PYTHON_IN_VENV := $(VENV)/bin/python
+READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),wheels)
+
+ifndef ROS_DISTRO
+# where ament_index finds the wheels' packages
+export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
+endif
+ifdef _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# make was started by a Python with ROS wheels of its own, whose libraries must not be used here
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
+endif
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format pytest colcon benchmark-accuracy docs venv clean
+
+help:  ## list these targets
+	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
+
+demo: $(READY)  ## run simulator and observer until they converge; pictures in demo_output/
+	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo
+
+test: lint pytest colcon  ## everything that a change must pass
+
+lint: $(READY)  ## ruff, mypy --strict, the layers of the architecture
+	$(VENV)/bin/ruff check --no-cache
+	$(VENV)/bin/ruff format --no-cache --check
+	$(VENV)/bin/mypy --cache-dir /dev/null
+	$(VENV)/bin/lint-imports --no-cache
+
+format: $(READY)  ## let ruff mend style and layout
+	$(VENV)/bin/ruff check --no-cache --fix
+	$(VENV)/bin/ruff format --no-cache
+
+pytest: $(READY)  ## the tests alone
+	$(PYTHON_IN_VENV) -m pytest
+
+colcon: $(READY)  ## build, install and test as a ROS workspace does
+	scripts/colcon_check.sh $(VENV)
+
+benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
+	$(PYTHON_IN_VENV) -m pip install --quiet --constraint constraints.txt '.[benchmark]'
+	$(PYTHON_IN_VENV) benchmark/accuracy.py
+
+docs: $(READY)  ## write the README's tables anew from the parameter table
+	$(PYTHON_IN_VENV) scripts/write_tables.py
+
+venv: $(READY)  ## only set up .venv
+
+$(READY): setup.py constraints.txt $(wildcard scripts/setup_venv.sh scripts/build_tf2_msgs.py)
+	scripts/setup_venv.sh $(VENV)
+	touch $@
+
+clean:  ## remove all that make made, but demo_output
+	rm -rf $(VENV) build install log *.egg-info .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
