@@ -1,0 +1,127 @@
+"""Reading of plain CDR, the byte format of ROS 2 messages, without building message objects."""
+
+from __future__ import annotations
+
+import struct
+from typing import TypeAlias
+
+import numpy as np
+
+from slam_observer_ros.errors import MessageError
+from slam_observer_ros.types import FloatArray
+
+Buffer: TypeAlias = bytes | bytearray | memoryview
+"""One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""
+
+ENCAPSULATION_BYTES = 4
+NANOSECONDS_PER_SECOND = 1_000_000_000
+MAXIMUM_PADDING_BYTES = 3
+
+_UINT32 = {'<': struct.Struct('<I'), '>': struct.Struct('>I')}
+_STAMP = {'<': struct.Struct('<iI'), '>': struct.Struct('>iI')}
+_FLOAT32 = {'<': np.dtype('<f4'), '>': np.dtype('>f4')}
+_FLOAT64 = {'<': np.dtype('<f8'), '>': np.dtype('>f8')}
+
+
+class CdrReader:
+    """Cursor over one serialised message; every read checks that the bytes are there.
+
+    Parameters
+    ----------
+    raw : Buffer
+        The message with its 4-byte encapsulation header, little or big endian.
+
+    Attributes
+    ----------
+    byte_order : str
+        ``'<'`` or ``'>'``, as numpy and struct write it.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are not plain CDR.
+
+    """
+
+    __slots__ = ('_position', '_raw', 'byte_order')
+
+    def __init__(self, raw: Buffer) -> None:
+        if len(raw) < ENCAPSULATION_BYTES:
+            raise MessageError(f'too short: {len(raw)} bytes hold no CDR header')
+        if raw[0] != 0 or raw[1] > 1:
+            raise MessageError(f'not plain CDR: encapsulation {bytes(raw[:2]).hex()}')
+        self._raw = raw
+        self._position = ENCAPSULATION_BYTES
+        self.byte_order = '<' if raw[1] else '>'
+
+    def _take(self, size: int, alignment: int) -> int:
+        # CDR aligns to the first byte after the encapsulation header.
+        start = self._position + (ENCAPSULATION_BYTES - self._position) % alignment
+        if start + size > len(self._raw):
+            raise MessageError(f'too short: {start + size} bytes needed, {len(self._raw)} present')
+        self._position = start + size
+        return start
+
+    def uint8(self) -> int:
+        """Read one byte (uint8 or bool)."""
+        return self._raw[self._take(1, 1)]
+
+    def uint32(self) -> int:
+        """Read a uint32; also the length of a sequence."""
+        value: int = _UINT32[self.byte_order].unpack_from(self._raw, self._take(4, 4))[0]
+        return value
+
+    def stamp_ns(self) -> int:
+        """Read a builtin_interfaces/Time as nanoseconds."""
+        seconds, nanoseconds = _STAMP[self.byte_order].unpack_from(self._raw, self._take(8, 4))
+        if nanoseconds >= NANOSECONDS_PER_SECOND:
+            raise MessageError(f'stamp with {nanoseconds} ns in its nanosecond field')
+        stamp_ns: int = seconds * NANOSECONDS_PER_SECOND + nanoseconds
+        return stamp_ns
+
+    def string(self) -> str:
+        """Read a string; its terminating NUL is left out."""
+        size = self.uint32()
+        start = self._take(size, 1)
+        try:
+            return bytes(self._raw[start : start + size]).rstrip(b'\0').decode()
+        except UnicodeDecodeError as error:
+            raise MessageError('a string is not UTF-8') from error
+
+    def header(self) -> tuple[int, str]:
+        """Read a std_msgs/Header: stamp in nanoseconds and frame id."""
+        return self.stamp_ns(), self.string()
+
+    def float64(self, count: int) -> FloatArray:
+        """Read ``count`` float64 values, shape (count,)."""
+        return self._array(_FLOAT64[self.byte_order], count, alignment=8)
+
+    def float32(self, count: int) -> FloatArray:
+        """Read ``count`` float32 values as float64, shape (count,)."""
+        return self._array(_FLOAT32[self.byte_order], count, alignment=4)
+
+    def _array(
+        self, dtype: np.dtype[np.float32] | np.dtype[np.float64], count: int, alignment: int
+    ) -> FloatArray:
+        if count == 0:  # CDR puts no alignment bytes before an empty sequence.
+            return np.zeros(0)
+        start = self._take(count * dtype.itemsize, alignment)
+        return np.frombuffer(self._raw, dtype, count, start).astype(np.float64)
+
+    def data(self, size: int) -> memoryview:
+        """Read ``size`` bytes without copying them."""
+        start = self._take(size, 1)
+        return memoryview(self._raw)[start : start + size]
+
+    def finish(self) -> None:
+        """Check that the message ends here, but for padding.
+
+        Raises
+        ------
+        MessageError
+            If bytes are left: the message is of another type.
+
+        """
+        left = len(self._raw) - self._position
+        if left > MAXIMUM_PADDING_BYTES:
+            raise MessageError(f'{left} bytes too long: is it of another type?')

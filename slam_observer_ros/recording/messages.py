@@ -1,0 +1,294 @@
+"""The one boundary between ROS messages and numpy, for live topics and recordings alike.
+
+Decoders take a message as serialised bytes, which rclpy's raw subscriptions and rosbags' raw data
+give alike; a malformed message raises :class:`MessageError` with the reason. ROS puts linear
+before angular components; the paper's (9), and all arrays that leave this module, put angular
+first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from slam_observer_ros.errors import MessageError
+from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.recording.cdr import Buffer, CdrReader
+from slam_observer_ros.recording.point_clouds import (
+    decode_point_cloud,
+    decode_point_cloud2,
+    ObservationMessage,
+)
+from slam_observer_ros.types import FloatArray
+
+_ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
+_QUATERNION_NORM_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityMessage:
+    """A velocity and the frame that its message gives for it.
+
+    Attributes
+    ----------
+    frame_id : str
+        Frame in which the velocity is expressed; empty if the message doesn't say.
+    event : VelocityEvent
+        The velocity as the message holds it, not yet moved to the base frame.
+
+    """
+
+    frame_id: str
+    event: VelocityEvent
+
+
+@dataclass(frozen=True, slots=True)
+class ImuMessage:
+    """The angular velocity of a sensor_msgs/Imu.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    frame_id : str
+        Frame of the sensor.
+    angular_velocity : FloatArray
+        (3,) rad/s in the sensor's frame.
+    covariance : FloatArray or None
+        (3, 3) rad²/s²; None if unknown.
+
+    """
+
+    stamp_ns: int
+    frame_id: str
+    angular_velocity: FloatArray
+    covariance: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True)
+class PoseMessage:
+    """A pose or transform, from ``child_frame_id`` to ``frame_id``.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    frame_id : str
+        Frame in which the pose is expressed.
+    child_frame_id : str
+        Frame whose pose it is; empty if the message doesn't say.
+    position : FloatArray
+        (3,) metres.
+    quaternion : FloatArray
+        (4,) xyzw, of unit norm.
+    covariance : FloatArray or None
+        (6, 6) of rotation vector and position in the axes of ``frame_id``; None if unknown.
+
+    """
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    position: FloatArray
+    quaternion: FloatArray
+    covariance: FloatArray | None = None
+
+    @property
+    def pose(self) -> FloatArray:
+        """(4, 4) transform that takes points from ``child_frame_id`` to ``frame_id``."""
+        return pose_matrices(self.position, self.quaternion)
+
+
+VelocityDecoder: TypeAlias = Callable[[Buffer, int], VelocityMessage]
+"""From the serialised message and its receive time, which only unstamped messages use."""
+
+ObservationDecoder: TypeAlias = Callable[[Buffer, int], ObservationMessage]
+"""As :data:`VelocityDecoder`, for landmarks."""
+
+PoseDecoder: TypeAlias = Callable[[Buffer], PoseMessage]
+
+
+def pose_matrices(positions: FloatArray, quaternions: FloatArray) -> FloatArray:
+    """Build homogeneous transforms.
+
+    Parameters
+    ----------
+    positions : FloatArray
+        (..., 3) metres.
+    quaternions : FloatArray
+        (..., 4) xyzw.
+
+    Returns
+    -------
+    FloatArray
+        (..., 4, 4).
+
+    """
+    poses = np.zeros((*positions.shape[:-1], 4, 4))
+    poses[..., :3, :3] = so3.from_quaternion(quaternions)
+    poses[..., :3, 3] = positions
+    poses[..., 3, 3] = 1.0
+    return poses
+
+
+def decode_twist(raw: Buffer, receive_stamp_ns: int) -> VelocityMessage:
+    """Decode a geometry_msgs/Twist, whose only time is that of its reception."""
+    reader = CdrReader(raw)
+    event = VelocityEvent(receive_stamp_ns, _read_twist(reader))
+    reader.finish()
+    return VelocityMessage('', event)
+
+
+def decode_twist_stamped(raw: Buffer, _receive_stamp_ns: int = 0) -> VelocityMessage:
+    """Decode a geometry_msgs/TwistStamped."""
+    reader = CdrReader(raw)
+    stamp_ns, frame_id = reader.header()
+    event = VelocityEvent(stamp_ns, _read_twist(reader))
+    reader.finish()
+    return VelocityMessage(frame_id, event)
+
+
+def decode_twist_with_covariance_stamped(
+    raw: Buffer, _receive_stamp_ns: int = 0
+) -> VelocityMessage:
+    """Decode a geometry_msgs/TwistWithCovarianceStamped."""
+    reader = CdrReader(raw)
+    stamp_ns, frame_id = reader.header()
+    event = VelocityEvent(stamp_ns, _read_twist(reader), _read_covariance(reader))
+    reader.finish()
+    return VelocityMessage(frame_id, event)
+
+
+def decode_odometry_twist(raw: Buffer, _receive_stamp_ns: int = 0) -> VelocityMessage:
+    """Decode the twist of a nav_msgs/Odometry, which is in its child frame."""
+    return _read_odometry(raw)[1]
+
+
+def decode_odometry_pose(raw: Buffer) -> PoseMessage:
+    """Decode the pose of a nav_msgs/Odometry."""
+    return _checked(_read_odometry(raw)[0])
+
+
+def decode_pose_stamped(raw: Buffer) -> PoseMessage:
+    """Decode a geometry_msgs/PoseStamped."""
+    reader = CdrReader(raw)
+    message = PoseMessage(*reader.header(), '', *_read_pose(reader))
+    reader.finish()
+    return _checked(message)
+
+
+def decode_pose_with_covariance_stamped(raw: Buffer) -> PoseMessage:
+    """Decode a geometry_msgs/PoseWithCovarianceStamped."""
+    reader = CdrReader(raw)
+    message = PoseMessage(*reader.header(), '', *_read_pose(reader), _read_covariance(reader))
+    reader.finish()
+    return _checked(message)
+
+
+def decode_transform_stamped(raw: Buffer) -> PoseMessage:
+    """Decode a geometry_msgs/TransformStamped."""
+    reader = CdrReader(raw)
+    message = _read_transform(reader)
+    reader.finish()
+    return _checked(message)
+
+
+def decode_transforms(raw: Buffer) -> list[PoseMessage]:
+    """Decode a tf2_msgs/TFMessage, as on /tf and /tf_static."""
+    reader = CdrReader(raw)
+    messages = [_checked(_read_transform(reader)) for _ in range(reader.uint32())]
+    reader.finish()
+    return messages
+
+
+def decode_imu(raw: Buffer) -> ImuMessage:
+    """Decode the angular velocity of a sensor_msgs/Imu.
+
+    Raises
+    ------
+    MessageError
+        If the message is malformed, or says (-1 in its covariance) that it measures none.
+
+    """
+    reader = CdrReader(raw)
+    stamp_ns, frame_id = reader.header()
+    reader.float64(13)  # Orientation and its covariance.
+    values = reader.float64(12)
+    reader.float64(12)  # Linear acceleration and its covariance.
+    reader.finish()
+    angular_velocity, covariance = values[:3], values[3:].reshape(3, 3)
+    if covariance[0, 0] == -1.0:
+        raise MessageError('this Imu says that it measures no angular velocity')
+    return ImuMessage(stamp_ns, frame_id, angular_velocity, _known(covariance))
+
+
+VELOCITY_DECODERS: dict[str, VelocityDecoder] = {
+    'geometry_msgs/msg/Twist': decode_twist,
+    'geometry_msgs/msg/TwistStamped': decode_twist_stamped,
+    'geometry_msgs/msg/TwistWithCovarianceStamped': decode_twist_with_covariance_stamped,
+    'nav_msgs/msg/Odometry': decode_odometry_twist,
+}
+"""Message types that give a velocity."""
+
+LANDMARK_DECODERS: dict[str, ObservationDecoder] = {
+    'sensor_msgs/msg/PointCloud': decode_point_cloud,
+    'sensor_msgs/msg/PointCloud2': decode_point_cloud2,
+}
+"""Message types that give landmark observations."""
+
+POSE_DECODERS: dict[str, PoseDecoder] = {
+    'geometry_msgs/msg/PoseStamped': decode_pose_stamped,
+    'geometry_msgs/msg/PoseWithCovarianceStamped': decode_pose_with_covariance_stamped,
+    'geometry_msgs/msg/TransformStamped': decode_transform_stamped,
+    'nav_msgs/msg/Odometry': decode_odometry_pose,
+}
+"""Message types that give a pose."""
+
+
+def _read_twist(reader: CdrReader) -> FloatArray:
+    values = reader.float64(6)
+    return np.concatenate((values[3:], values[:3]))
+
+
+def _read_covariance(reader: CdrReader) -> FloatArray | None:
+    """Read a 6 × 6 covariance; rotational part first."""
+    covariance = _known(reader.float64(36).reshape(6, 6))
+    return None if covariance is None else covariance[np.ix_(_ANGULAR_FIRST, _ANGULAR_FIRST)]
+
+
+def _known(covariance: FloatArray) -> FloatArray | None:
+    """Tell a real covariance from the two ways in which ROS messages say 'unknown'."""
+    if covariance[0, 0] == -1.0 or not covariance.any():
+        return None
+    return covariance
+
+
+def _read_pose(reader: CdrReader) -> tuple[FloatArray, FloatArray]:
+    values = reader.float64(7)
+    return values[:3], values[3:]
+
+
+def _read_odometry(raw: Buffer) -> tuple[PoseMessage, VelocityMessage]:
+    reader = CdrReader(raw)
+    stamp_ns, frame_id = reader.header()
+    child_frame_id = reader.string()
+    pose = PoseMessage(
+        stamp_ns, frame_id, child_frame_id, *_read_pose(reader), _read_covariance(reader)
+    )
+    velocity = VelocityEvent(stamp_ns, _read_twist(reader), _read_covariance(reader))
+    reader.finish()
+    return pose, VelocityMessage(child_frame_id, velocity)
+
+
+def _read_transform(reader: CdrReader) -> PoseMessage:
+    return PoseMessage(*reader.header(), reader.string(), *_read_pose(reader))
+
+
+def _checked(message: PoseMessage) -> PoseMessage:
+    norm = float(np.linalg.norm(message.quaternion))
+    # Written so that NaN is refused too.
+    if not abs(norm - 1.0) < _QUATERNION_NORM_TOLERANCE:
+        raise MessageError(f'quaternion of norm {norm:.3g}, not 1')
+    return message
