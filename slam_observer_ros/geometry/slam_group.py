@@ -133,7 +133,7 @@ def output(Xi: TotalState) -> FloatArray:
 
 
 def configuration(Xi: TotalState) -> TotalState:
-    """Representative (I, P⁻¹ p_i) = α(P, Ξ) of the class π(Ξ) = [P, p_i] in M_n(3) (13), (14)."""
+    """Represent the class π(Ξ) = [P, p_i] of M_n(3) by (I, P⁻¹ p_i) = α(P, Ξ) (13), (14)."""
     return alpha(Xi.P, Xi)
 
 

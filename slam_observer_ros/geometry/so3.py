@@ -51,7 +51,7 @@ def vee(K: FloatArray) -> FloatArray:
     Parameters
     ----------
     K : FloatArray, shape (..., 3, 3)
-        Skew-symmetric matrix; only its lower and upper entries below are read.
+        Skew-symmetric matrix; only the entries (2, 1), (0, 2), (1, 0) are read.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def vee(K: FloatArray) -> FloatArray:
         Vector.
 
     """
-    return np.stack([K[..., 2, 1], K[..., 0, 2], K[..., 1, 0]], axis=-1)
+    return K[..., (2, 0, 1), (1, 2, 0)]
 
 
 def coefficients(phi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -120,7 +120,6 @@ def log(R: FloatArray) -> FloatArray:
     """
     quaternion = to_quaternion(R)
     v, w = quaternion[..., :3], quaternion[..., 3:]
-    # hypot-like guard: below 1e-150 the ratio is 2 / w = 2 to rounding.
     sine = np.sqrt(np.sum(v * v, axis=-1, keepdims=True) + _ZERO_GUARD)
     return (2.0 * np.arctan2(sine, w) / sine) * v
 
@@ -187,10 +186,10 @@ def from_quaternion(quaternion: FloatArray) -> FloatArray:
 
 
 def to_quaternion(R: FloatArray) -> FloatArray:
-    """Unit quaternion of a rotation matrix.
+    """Return the unit quaternion q = (v, w) of a rotation matrix.
 
-    Every row of 4 q qᵀ is a multiple of q, and its entries are sums of entries of R: the row with
-    the largest diagonal entry (at least 1) gives q without loss of precision at any angle.
+    4 q qᵀ = [[R + Rᵀ + (1 − tr R) I, (R − Rᵀ)^∨], [·, 1 + tr R]]. Each row is a multiple of q, and
+    the one with the largest diagonal entry (at least 1) is well conditioned at any angle.
 
     Parameters
     ----------
@@ -203,21 +202,16 @@ def to_quaternion(R: FloatArray) -> FloatArray:
         Quaternion xyzw (the order of ROS) with w ≥ 0.
 
     """
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = np.moveaxis(R, (-2, -1), (0, 1))
-    outer = np.empty(R.shape[:-2] + (4, 4))
-    outer[..., 0, 0] = 1.0 + r00 - r11 - r22
-    outer[..., 1, 1] = 1.0 - r00 + r11 - r22
-    outer[..., 2, 2] = 1.0 - r00 - r11 + r22
-    outer[..., 3, 3] = 1.0 + r00 + r11 + r22
-    outer[..., 0, 1] = outer[..., 1, 0] = r01 + r10
-    outer[..., 0, 2] = outer[..., 2, 0] = r02 + r20
-    outer[..., 1, 2] = outer[..., 2, 1] = r12 + r21
-    outer[..., 0, 3] = outer[..., 3, 0] = r21 - r12
-    outer[..., 1, 3] = outer[..., 3, 1] = r02 - r20
-    outer[..., 2, 3] = outer[..., 3, 2] = r10 - r01
-    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    return row / np.copysign(np.linalg.norm(row, axis=-1, keepdims=True), row[..., 3:])
+    R_transposed = R.swapaxes(-1, -2)
+    trace = np.trace(R, axis1=-2, axis2=-1)[..., None]
+    products = np.empty(R.shape[:-2] + (4, 4))
+    products[..., :3, :3] = R + R_transposed + (1.0 - trace[..., None]) * _IDENTITY
+    products[..., 3, :3] = products[..., :3, 3] = vee(R - R_transposed)
+    products[..., 3, 3:] = 1.0 + trace
+    rows = products.reshape(-1, 4, 4)
+    largest = np.argmax(np.diagonal(rows, axis1=1, axis2=2), axis=1)
+    q = rows[np.arange(len(rows)), largest].reshape(R.shape[:-2] + (4,))
+    return q / np.copysign(np.linalg.norm(q, axis=-1, keepdims=True), q[..., 3:])
 
 
 def normalise(R: FloatArray) -> FloatArray:
