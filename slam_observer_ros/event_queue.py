@@ -1,0 +1,117 @@
+"""Puts events in stamp order and refuses stamps that can't be right."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+import heapq
+from typing import TypeAlias
+
+from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.events import Event, ObservationEvent
+
+Key: TypeAlias = tuple[int, bool, bytes]
+
+CONFIRMATIONS = 5
+"""How many events in a row must agree before a jump of the clock is believed."""
+
+
+class EventQueue:
+    """Holds events back for a reorder window, then gives them out in stamp order.
+
+    Of two events with one stamp the velocity comes first, and two observations are ordered by
+    their ids, so the order does not depend on which arrived first. An event that has the stamp,
+    the kind and the ids of another one is a duplicate.
+
+    Parameters
+    ----------
+    window_ns : int
+        How far behind the newest stamp an event is given out, nanoseconds.
+    max_jump_ns : int
+        How far ahead of the newest stamp an event may be, nanoseconds.
+    late_limit_ns : int
+        How far behind the window an event may be, nanoseconds.
+
+    """
+
+    def __init__(self, window_ns: int, max_jump_ns: int, late_limit_ns: int) -> None:
+        self._window_ns = window_ns
+        self._max_jump_ns = max_jump_ns
+        self._late_limit_ns = late_limit_ns
+        self._heap: list[tuple[Key, Event]] = []
+        self._known: set[Key] = set()
+        self._given_out: deque[Key] = deque()
+        self._strays = 0
+        self.newest_ns: int | None = None
+
+    def push(self, event: Event) -> bool:
+        """Take an event; return whether it shows that the clock has jumped.
+
+        Raises
+        ------
+        InvalidEventError
+            If the stamp is far from all others (``'stamp_jump'``, ``'too_late'``), or the event
+            is already known (``'duplicate'``).
+
+        """
+        jumped = self._check(event.stamp_ns)
+        if not jumped:
+            self._insert(event)
+        return jumped
+
+    def restart(self, event: Event) -> None:
+        """Empty the queue and begin anew with ``event``, after a jump of the clock."""
+        self._heap.clear()
+        self._known.clear()
+        self._given_out.clear()
+        self.newest_ns = None
+        self._insert(event)
+
+    def pop_ready(self) -> Iterator[Event]:
+        """Give out, in order, the events that have left the window."""
+        newest_ns = self.newest_ns or 0
+        while self._heap and self._heap[0][0][0] <= newest_ns - self._window_ns:
+            yield self._pop()
+        oldest_ns = newest_ns - self._window_ns - self._late_limit_ns
+        while self._given_out and self._given_out[0][0] < oldest_ns:
+            self._known.discard(self._given_out.popleft())
+
+    def pop_all(self) -> Iterator[Event]:
+        """Give out all events that are left, in order."""
+        while self._heap:
+            yield self._pop()
+
+    def _pop(self) -> Event:
+        key, event = heapq.heappop(self._heap)
+        self._given_out.append(key)
+        return event
+
+    def _insert(self, event: Event) -> None:
+        is_observation = isinstance(event, ObservationEvent)
+        ids = event.ids.tobytes() if isinstance(event, ObservationEvent) else b""
+        key = (event.stamp_ns, is_observation, ids)
+        if key in self._known:
+            raise InvalidEventError("duplicate", "an event with this stamp is already known")
+        self._known.add(key)
+        heapq.heappush(self._heap, (key, event))
+        self.newest_ns = max(event.stamp_ns, self.newest_ns or event.stamp_ns)
+
+    def _check(self, stamp_ns: int) -> bool:
+        """Return whether ``stamp_ns`` confirms a jump; raise if it is the first to claim one."""
+        if self.newest_ns is None:
+            return False
+        ahead_ns = stamp_ns - self.newest_ns
+        too_early = ahead_ns > self._max_jump_ns
+        too_late = ahead_ns < -(self._window_ns + self._late_limit_ns)
+        if not (too_early or too_late):
+            self._strays = 0
+            return False
+        self._strays += 1
+        if self._strays >= CONFIRMATIONS:
+            self._strays = 0
+            return True
+        reason = "stamp_jump" if too_early else "too_late"
+        side = "ahead of" if too_early else "behind"
+        raise InvalidEventError(
+            reason, f"stamp is {abs(ahead_ns) / 1e9:.3f} s {side} the newest event's"
+        )

@@ -1,0 +1,86 @@
+"""What a gain design is given and what it returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from slam_observer_ros.observer import Correction
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motion since the last observation, in k pieces of held velocity.
+
+    Attributes
+    ----------
+    path : FloatArray
+        (k + 1, 4, 4) Â before, between and after the pieces.
+    body_velocities : FloatArray
+        (k, 6) velocities (Ω, v), rad/s and m/s.
+    dt_s : FloatArray
+        (k,) seconds that each velocity was held.
+    covariances : FloatArray
+        (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
+
+    """
+
+    path: FloatArray
+    body_velocities: FloatArray
+    dt_s: FloatArray
+    covariances: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """One observation of m known landmarks, as a gain design sees it.
+
+    Attributes
+    ----------
+    indices : IntArray
+        (m,) which landmarks are seen.
+    e : FloatArray
+        (m, 3) errors (29), metres, reference frame.
+    r : FloatArray
+        (m, 3) residuals e_i − y_i°, metres.
+    covariances : FloatArray
+        (m, 3, 3) covariance of the observations, rotated into the reference frame, m².
+    dt_s : float
+        Seconds since the innovation before this one.
+
+    """
+
+    indices: IntArray
+    e: FloatArray
+    r: FloatArray
+    covariances: FloatArray
+    dt_s: float
+
+
+class GainDesign(Protocol):
+    """Strategy that turns residuals into the innovation (D, d_i)."""
+
+    def change_settings(self, settings: Settings) -> None:
+        """Use the settings that may change while running."""
+
+    def predict(self, motion: Motion) -> None:
+        """Account for the noise of a motion."""
+
+    def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Account for landmarks (m, 3) whose first observation has ``covariances`` (m, 3, 3)."""
+
+    def remove_landmarks(self, indices: IntArray) -> None:
+        """Forget the landmarks at ``indices``."""
+
+    def correct(self, innovation: Innovation) -> tuple[Correction, BoolArray]:
+        """Return the correction, and which of the m observations took part (m,)."""
+
+    @property
+    def pose_covariance(self) -> FloatArray | None:
+        """(6, 6) covariance of the error ε of Â = exp(ε) A, (Ω, v) order; None if unknown."""
+
+    @property
+    def landmark_covariances(self) -> FloatArray | None:
+        """(n, 3, 3) covariances of the landmarks, reference frame, m²; None if unknown."""

@@ -1,0 +1,143 @@
+"""The paper's gains: constant k_i and l_i, integrated so that every time step is stable.
+
+The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²). Here
+the pose is moved by an exponential integrator of the linearised flow instead. With J_i = [−[e_i]×, I],
+g = Σ k_i J_iᵀ r_i and the Gauss–Newton matrix H = Σ k_i J_iᵀ J_i, that is
+
+    ξ = −U diag((1 − e^{−λ dt})/λ) Uᵀ g,      H = U diag(λ) Uᵀ,
+
+and the landmarks close the share 1 − e^{−(l/k) dt} of what remains. To first order in dt this is
+Δ dt and δ_i dt; for dt → ∞ it is one Gauss–Newton step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from slam_observer_ros.gains.base import Innovation, Motion
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.observer import Correction, lyapunov
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
+"""Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
+
+
+class ConstantGains:
+    """Constant gains k and l, the same for every landmark.
+
+    Parameters
+    ----------
+    settings : Settings
+        ``gain_k`` is k of (30), ``gain_l`` is l of (31). The ``step_mode`` 'paper' turns about
+        the reference's origin with the metric of (10), and so converges to the paper's
+        differential equation for dt → 0; 'exponential' turns about the centroid of the e_i,
+        where rotation and translation do not compete.
+
+    """
+
+    pose_covariance = None
+    landmark_covariances = None
+
+    def __init__(self, settings: Settings) -> None:
+        self.change_settings(settings)
+
+    def change_settings(self, settings: Settings) -> None:
+        """Take over k, l and the step mode."""
+        self.gain_k = settings.gain_k
+        self.gain_l = settings.gain_l
+        self.step_mode = settings.step_mode
+
+    def predict(self, motion: Motion) -> None:
+        """Do nothing: constant gains know no noise."""
+
+    def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Do nothing: constant gains know no noise."""
+
+    def remove_landmarks(self, indices: IntArray) -> None:
+        """Do nothing: constant gains have no state."""
+
+    def correct(self, innovation: Innovation) -> tuple[Correction, BoolArray]:
+        """Return the innovation; all observations take part."""
+        k = np.full(len(innovation.r), self.gain_k)
+        step = paper_step if self.step_mode == "paper" else centroid_step
+        D = safe_step(step, k, innovation.e, innovation.r, innovation.dt_s)
+        remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
+        d = -np.expm1(-self.gain_l / self.gain_k * innovation.dt_s) * remaining  # (31)
+        return Correction(D, innovation.indices, d), np.ones(len(k), dtype=bool)
+
+
+def centroid_step(k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float) -> FloatArray:
+    """Return the pose's step D (4, 4), turning about the gain-weighted centroid of the e_i.
+
+    Parameters
+    ----------
+    k : FloatArray
+        (m,) gains k_i.
+    e, r : FloatArray
+        (m, 3) errors and residuals, metres.
+    dt_s : float
+        Time step, seconds.
+
+    """
+    total = np.sum(k)
+    centre = k @ e / total if total > 0.0 else np.zeros(3)
+    return _step_about(centre, np.ones(6), k, e, r, dt_s)
+
+
+def paper_step(k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float) -> FloatArray:
+    """Return the pose's step D (4, 4) that tends to exp(Δ dt), Δ as in (30), for dt → 0.
+
+    Parameters are those of :func:`centroid_step`.
+    """
+    return _step_about(np.zeros(3), PAPER_METRIC, k, e, r, dt_s)
+
+
+def safe_step(
+    step: Callable[[FloatArray, FloatArray, FloatArray, float], FloatArray],
+    k: FloatArray,
+    e: FloatArray,
+    r: FloatArray,
+    dt_s: float,
+) -> FloatArray:
+    """Return ``step``'s D for the longest dt / 2^j at which L does not grow.
+
+    The flow itself never raises L (35), so a short enough step doesn't either. Only turns of many
+    degrees at once ever need j > 0.
+    """
+    rounding = np.finfo(float).eps * (np.max(np.abs(e), initial=0.0) + 1.0)
+    bound = lyapunov(k, r) * (1.0 + 1e-12) + lyapunov(k, np.full_like(r, rounding))
+    D = step(k, e, r, dt_s)
+    while lyapunov(k, se3.transform(D, e) - e + r) > bound:
+        dt_s /= 2.0
+        D = step(k, e, r, dt_s)
+    return D
+
+
+def _step_about(
+    centre: FloatArray,
+    metric: FloatArray,
+    k: FloatArray,
+    e: FloatArray,
+    r: FloatArray,
+    dt_s: float,
+) -> FloatArray:
+    """Return the exponential step D (4, 4) about ``centre`` with the diagonal ``metric``."""
+    arms = e - centre
+    J = np.concatenate([-so3.hat(arms), np.broadcast_to(np.eye(3), (len(e), 3, 3))], axis=2)
+    root = np.sqrt(metric)
+    g = root * np.einsum("i,ijk,ij->k", k, J, r)
+    H = root[:, None] * np.einsum("i,ijk,ijl->kl", k, J, J) * root
+    rates, U = np.linalg.eigh(H)
+    xi = -root * (U @ (_held_time(rates, dt_s) * (U.T @ g)))
+    R = so3.exp(xi[:3])
+    return se3.pose(R, centre - R @ centre + xi[3:])
+
+
+def _held_time(rates: FloatArray, dt_s: float) -> FloatArray:
+    """Return (1 − e^{−λ dt})/λ for ``rates`` λ in 1/s, and its limit dt at λ = 0."""
+    positive = np.maximum(rates, np.finfo(float).tiny)
+    return np.where(rates > 0.0, -np.expm1(-positive * dt_s) / positive, dt_s)

@@ -1,0 +1,215 @@
+"""The SLAM_n(3) observer: state, propagation (27), error (29) and Lyapunov function (34).
+
+The state X̂ = (Â, â_1 … â_n) lives on the group; with the reference ξ° = [P°, p_i°] it gives the
+estimate P̂ = P° Â and p̂_i = p_i° + R_P° â_i (23). Everything here is written in the frame of P°,
+where the reference landmarks are y_i° = P°⁻¹ p_i°.
+
+The innovation moves the state from the left by a group element (D, d_i), a :class:`Correction`:
+
+    X̂ ← (D, d_i) · X̂,   that is   Â ← D Â,   â_i ← R_D â_i + d_i.
+
+To first order D = exp(Δ dt) and d_i + R_D â_i − â_i = δ_i dt with the paper's Δ and δ_i (28). How
+large D and d_i are is what the gain designs in :mod:`slam_observer_ros.gains` decide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import accumulate
+
+import numpy as np
+
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """Element (D, d_i) of SLAM_n(3) by which an innovation moves the state from the left.
+
+    Attributes
+    ----------
+    D : FloatArray
+        (4, 4) rigid motion in the reference frame.
+    indices : IntArray or slice
+        Landmarks that are moved, m of them; the others stay where they are in the world.
+    d : FloatArray
+        (m, 3) translations in the reference frame, metres.
+
+    """
+
+    D: FloatArray
+    indices: IntArray | slice
+    d: FloatArray
+
+
+class Observer:
+    """State X̂ on SLAM_n(3) with its reference ξ°.
+
+    Parameters
+    ----------
+    reference_pose : FloatArray
+        (4, 4) P°, body to world.
+
+    Attributes
+    ----------
+    A : FloatArray
+        (4, 4) Â.
+    a : FloatArray
+        (n, 3) â_i, metres, reference frame.
+    y_ref : FloatArray
+        (n, 3) y_i° = P°⁻¹ p_i°, metres, reference frame.
+    reference_pose : FloatArray
+        (4, 4) P°.
+
+    """
+
+    def __init__(self, reference_pose: FloatArray) -> None:
+        self.reference_pose = reference_pose
+        self.A: FloatArray = np.eye(4)
+        self.a: FloatArray = np.empty((0, 3))
+        self.y_ref: FloatArray = np.empty((0, 3))
+
+    @property
+    def pose(self) -> FloatArray:
+        """(4, 4) estimated pose P̂ = P° Â, body to world."""
+        return self.reference_pose @ self.A
+
+    @property
+    def world_points(self) -> FloatArray:
+        """(n, 3) estimated landmarks p̂_i = p_i° + R_P° â_i = P° (y_i° + â_i), metres, world."""
+        return se3.transform(self.reference_pose, self.y_ref + self.a)
+
+    def add_landmarks(self, points: FloatArray) -> None:
+        """Append landmarks seen for the first time, so that their residual is zero.
+
+        Parameters
+        ----------
+        points : FloatArray
+            (m, 3) observations y_i, metres, body frame; the reference becomes y_i° = Â y_i.
+
+        """
+        self.add_reference_landmarks(se3.transform(self.A, points))
+
+    def add_reference_landmarks(self, y_ref: FloatArray) -> None:
+        """Append landmarks with given reference y_i° (m, 3), metres, and â_i = 0."""
+        self.y_ref = np.concatenate([self.y_ref, y_ref])
+        self.a = np.concatenate([self.a, np.zeros_like(y_ref)])
+
+    def remove_landmarks(self, indices: IntArray) -> None:
+        """Delete the landmarks at ``indices``; those behind move up."""
+        self.y_ref = np.delete(self.y_ref, indices, axis=0)
+        self.a = np.delete(self.a, indices, axis=0)
+
+    def errors(
+        self, indices: IntArray | slice, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the error (29) and the residual of seen landmarks.
+
+        Parameters
+        ----------
+        indices : IntArray or slice
+            Which landmarks are seen, m of them.
+        points : FloatArray
+            (m, 3) observations y_i, metres, body frame.
+
+        Returns
+        -------
+        e : FloatArray
+            (m, 3) e_i = ρ(X̂⁻¹, y)_i = R_Â y_i + x_Â − â_i (29), metres, reference frame.
+        r : FloatArray
+            (m, 3) r_i = e_i − y_i°. The paper prints e_i − p_i°, which is this for P° = I.
+
+        """
+        e = se3.transform(self.A, points) - self.a[indices]  # (29)
+        return e, e - self.y_ref[indices]
+
+    def propagate(self, body_velocities: FloatArray, dt_s: FloatArray) -> FloatArray:
+        """Advance along k held velocities, exactly: Â ← Â exp(V_1 dt_1) … exp(V_k dt_k) (27).
+
+        Parameters
+        ----------
+        body_velocities : FloatArray
+            (k, 6) velocities (Ω, v), rad/s and m/s, body frame.
+        dt_s : FloatArray
+            (k,) how long each is held, seconds.
+
+        Returns
+        -------
+        FloatArray
+            (k + 1, 4, 4) Â before, between and after the k motions.
+
+        """
+        motions = se3.exp(body_velocities * dt_s[:, None])
+        path = np.array(list(accumulate(motions, np.matmul, initial=self.A)))
+        path[-1, :3, :3] = so3.normalise(path[-1, :3, :3])
+        self.A = path[-1]
+        return path
+
+    def move_landmarks(self, indices: IntArray, shifts: FloatArray) -> None:
+        """Add ``shifts`` (m, 3), metres, to â_i: the lift ȧ_i = R_A v_i of landmarks that move."""
+        self.a[indices] += shifts
+
+    def correct(self, correction: Correction) -> None:
+        """Move the state from the left by (D, d_i); see the module's text."""
+        D, indices = correction.D, correction.indices
+        self.A = D @ self.A
+        self.a[indices] = self.a[indices] @ D[:3, :3].T + correction.d
+
+
+def lyapunov(gain_k: FloatArray | float, r: FloatArray) -> float:
+    """Return L = Σ k_i/2 |r_i|² (34) for gains k_i (m,) and residuals ``r`` (m, 3) in metres."""
+    return float(0.5 * np.sum(gain_k * np.sum(r * r, axis=-1)))
+
+
+def lyapunov_rate(gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray) -> float:
+    """Return dL/dt under the paper's innovation: −‖P(Σ k_i r_i ē_iᵀ)‖² − Σ l_i |r_i|² (35).
+
+    Parameters
+    ----------
+    gain_k, gain_l : FloatArray
+        (m,) gains k_i and l_i.
+    e, r : FloatArray
+        (m, 3) errors (29) and residuals, metres.
+
+    """
+    projection = se3.project(_outer_sum(gain_k, e, r))
+    return float(-np.sum(projection**2) - np.sum(gain_l * np.sum(r * r, axis=-1)))
+
+
+def paper_innovation(
+    gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray, a: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the paper's innovation (Δ, δ_i) in continuous time, with the signs put right.
+
+    As printed, (30) lacks a minus and (31) has one too many: with the printed signs L grows. The
+    signs here follow from ė_i = Δ e_i + Δ â_i − δ_i, for which (35) holds.
+
+    Parameters
+    ----------
+    gain_k, gain_l : FloatArray
+        (m,) gains k_i and l_i.
+    e, r : FloatArray
+        (m, 3) errors (29) and residuals, metres.
+    a : FloatArray
+        (m, 3) â_i, metres.
+
+    Returns
+    -------
+    Delta : FloatArray
+        (4, 4) Δ ∈ se(3).
+    delta : FloatArray
+        (m, 3) δ_i, m/s.
+
+    """
+    Delta = -se3.project(_outer_sum(gain_k, e, r))  # (30)
+    delta = a @ Delta[:3, :3].T + (gain_l / gain_k)[:, None] * r  # (31)
+    return Delta, delta
+
+
+def _outer_sum(k: FloatArray, e: FloatArray, r: FloatArray) -> FloatArray:
+    """Return Σ k_i r_i ē_iᵀ (4, 4), with r_i a direction and ē_i = (e_i, 1) a point."""
+    M = np.zeros((4, 4))
+    M[:3, :3] = np.einsum("i,ij,ik->jk", k, r, e)
+    M[:3, 3] = k @ r
+    return M

@@ -1,0 +1,95 @@
+"""Velocities of the recent past, each held until the next one."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class HeldVelocities:
+    """k velocities that cover an interval of time.
+
+    Attributes
+    ----------
+    body_velocities : FloatArray
+        (k, 6) the velocities (Ω, v), rad/s and m/s.
+    covariances : list of FloatArray or None
+        k covariances (6, 6) of them, None where unknown.
+    dt_s : FloatArray
+        (k,) seconds that each was held.
+    gap_s : FloatArray
+        (k,) seconds after each during which no velocity was known, since it had timed out.
+
+    """
+
+    body_velocities: FloatArray
+    covariances: list[FloatArray | None]
+    dt_s: FloatArray
+    gap_s: FloatArray
+
+
+class VelocityHistory:
+    """Velocity events in stamp order.
+
+    Parameters
+    ----------
+    timeout_ns : int
+        How long a velocity is held at most, nanoseconds.
+
+    """
+
+    def __init__(self, timeout_ns: int) -> None:
+        self._timeout_ns = timeout_ns
+        self._stamps_ns: list[int] = []
+        self._events: list[VelocityEvent] = []
+
+    def append(self, event: VelocityEvent) -> None:
+        """Add an event whose stamp is behind none of the others."""
+        self._stamps_ns.append(event.stamp_ns)
+        self._events.append(event)
+
+    def latest(self, stamp_ns: int) -> VelocityEvent | None:
+        """Return the velocity in force at ``stamp_ns``; None if there is none or it timed out."""
+        place = bisect_right(self._stamps_ns, stamp_ns) - 1
+        if place < 0 or stamp_ns - self._stamps_ns[place] > self._timeout_ns:
+            return None
+        return self._events[place]
+
+    def count_since(self, stamp_ns: int) -> int:
+        """Return how many velocities are newer than ``stamp_ns``."""
+        return len(self._stamps_ns) - bisect_right(self._stamps_ns, stamp_ns)
+
+    def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
+        """Return the velocities in force from ``start_ns`` to ``end_ns``."""
+        first = bisect_right(self._stamps_ns, start_ns) - 1
+        last = bisect_left(self._stamps_ns, end_ns)
+        events = self._events[max(first, 0) : last]
+        if first < 0:
+            events.insert(0, VelocityEvent(start_ns - self._timeout_ns, np.zeros(6)))
+        stamps = np.array([event.stamp_ns for event in events], dtype=np.int64)
+        begins = np.maximum(stamps, start_ns)
+        ends = np.append(stamps[1:], end_ns)
+        stops = np.clip(stamps + self._timeout_ns, begins, ends)
+        return HeldVelocities(
+            np.array([event.body_velocity for event in events]),
+            [event.covariance for event in events],
+            _seconds(stops - begins),
+            _seconds(ends - stops),
+        )
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop velocities that were no longer in force at ``stamp_ns``."""
+        first = bisect_right(self._stamps_ns, stamp_ns) - 1
+        if first > len(self._stamps_ns) // 2:
+            del self._stamps_ns[:first]
+            del self._events[:first]
+
+
+def _seconds(nanoseconds: IntArray) -> FloatArray:
+    return nanoseconds.astype(np.float64) * 1e-9
