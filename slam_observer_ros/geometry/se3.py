@@ -37,7 +37,7 @@ def pose(R: FloatArray, x: FloatArray) -> FloatArray:
         Pose.
 
     """
-    T = np.zeros(R.shape[:-2] + (4, 4))
+    T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3] = R
     T[..., :3, 3] = x
     T[..., 3, 3] = 1.0
@@ -114,7 +114,7 @@ def hat(xi: FloatArray) -> FloatArray:
         Element of se(3).
 
     """
-    return (xi @ _HAT).reshape(xi.shape[:-1] + (4, 4))
+    return (xi @ _HAT).reshape((*xi.shape[:-1], 4, 4))
 
 
 def vee(V: FloatArray) -> FloatArray:
@@ -272,7 +272,7 @@ def _jacobian_coupling(xi: FloatArray) -> FloatArray:
 
 def _lower_triangular(diagonal: FloatArray, lower: FloatArray) -> FloatArray:
     """Block matrix [[D, 0], [L, D]] of shape (..., 6, 6)."""
-    matrix = np.zeros(diagonal.shape[:-2] + (6, 6))
+    matrix = np.zeros((*diagonal.shape[:-2], 6, 6))
     matrix[..., :3, :3] = diagonal
     matrix[..., 3:, 3:] = diagonal
     matrix[..., 3:, :3] = lower

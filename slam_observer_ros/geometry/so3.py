@@ -42,7 +42,7 @@ def hat(phi: FloatArray) -> FloatArray:
 
     """
     # One small product with the basis of so(3) costs a third of six indexed assignments.
-    return (phi @ _HAT).reshape(phi.shape[:-1] + (3, 3))
+    return (phi @ _HAT).reshape((*phi.shape[:-1], 3, 3))
 
 
 def vee(K: FloatArray) -> FloatArray:
@@ -204,13 +204,13 @@ def to_quaternion(R: FloatArray) -> FloatArray:
     """
     R_transposed = R.swapaxes(-1, -2)
     trace = np.trace(R, axis1=-2, axis2=-1)[..., None]
-    products = np.empty(R.shape[:-2] + (4, 4))
+    products = np.empty((*R.shape[:-2], 4, 4))
     products[..., :3, :3] = R + R_transposed + (1.0 - trace[..., None]) * _IDENTITY
     products[..., 3, :3] = products[..., :3, 3] = vee(R - R_transposed)
     products[..., 3, 3:] = 1.0 + trace
     rows = products.reshape(-1, 4, 4)
     largest = np.argmax(np.diagonal(rows, axis1=1, axis2=2), axis=1)
-    q = rows[np.arange(len(rows)), largest].reshape(R.shape[:-2] + (4,))
+    q = rows[np.arange(len(rows)), largest].reshape((*R.shape[:-2], 4))
     return q / np.copysign(np.linalg.norm(q, axis=-1, keepdims=True), q[..., 3:])
 
 
