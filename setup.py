@@ -31,7 +31,7 @@ setup(
         'setuptools',  # what colcon builds ament_python packages with
         'numpy',  # all the mathematics
         'scipy',  # rotation conversions, chi-square quantiles
-        'rosbags',  # reads and writes ROS 1 bags, rosbag2 sqlite3 and MCAP without a ROS installation
+        'rosbags',  # reads and writes ROS 1 bags, rosbag2 sqlite3 and MCAP without ROS
         'mcap',  # salvages recordings that were cut off, which rosbags refuses
         'PyYAML',  # the node's parameter files
         'matplotlib',  # figures
@@ -55,7 +55,6 @@ setup(
             'types-PyYAML',
             'import-linter',  # holds the layers of the architecture
             'flake8',  # what ament_flake8 runs, with the plug-ins that it has on a ROS machine:
-            'flake8-builtins',
             'flake8-comprehensions',
             'flake8-import-order',
             'flake8-quotes',

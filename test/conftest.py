@@ -3,5 +3,5 @@
 from hypothesis import settings
 
 # No deadline: no test may depend on how busy the machine is.
-settings.register_profile("suite", deadline=None, max_examples=25)
-settings.load_profile("suite")
+settings.register_profile('suite', deadline=None, max_examples=25)
+settings.load_profile('suite')
