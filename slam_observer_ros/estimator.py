@@ -127,7 +127,7 @@ class Estimator:
             self._drop(error)
             return False
         if jumped:
-            logger.warning("The clock has jumped; starting again.")
+            logger.warning('The clock has jumped; starting again.')
             self.reset(self._observer.reference_pose)
             self._queue.restart(event)
         for ready in self._queue.pop_ready():
@@ -228,7 +228,7 @@ class Estimator:
         self.dropped[error.reason] += 1
         if _is_power_of_ten(self.dropped[error.reason]):
             logger.warning(
-                "Dropped an event (%s, %d so far): %s",
+                'Dropped an event (%s, %d so far): %s',
                 error.reason,
                 self.dropped[error.reason],
                 error,
@@ -242,11 +242,11 @@ class Estimator:
 
     def _process_velocity(self, event: VelocityEvent) -> None:
         if self._stamp_ns is not None and event.stamp_ns < self._stamp_ns:
-            self._drop(InvalidEventError("too_late", "a newer velocity was already used"))
+            self._drop(InvalidEventError('too_late', 'a newer velocity was already used'))
             return
         self._velocities.append(event)
         self._begin(event.stamp_ns)
-        self.counts["velocity"] += 1
+        self.counts['velocity'] += 1
         if self._velocities.count_since(self._state_ns or 0) >= MAX_PENDING_VELOCITIES:
             self._advance(event.stamp_ns)
 
@@ -258,7 +258,7 @@ class Estimator:
         rows = self._landmarks.indices_of(event.ids)
         self._last = self._innovate(_select(event, rows >= 0), rows[rows >= 0])
         self._initialise(_select(event, rows < 0))
-        self.counts["observation"] += 1
+        self.counts['observation'] += 1
         if self._on_update is not None:
             self._on_update(self._last)
 
@@ -278,7 +278,7 @@ class Estimator:
         """Return what would be seen at the state's stamp: Φ⁻¹ y(t − τ), Φ the motion since."""
         state_ns = self._state_ns or 0
         back = self._motion(state_ns, event.stamp_ns)
-        self.counts["late_observation"] += 1
+        self.counts['late_observation'] += 1
         turn = back[:3, :3]
         return replace(
             event,
@@ -349,4 +349,4 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def _is_power_of_ten(count: int) -> bool:
-    return str(count).rstrip("0") == "1"
+    return str(count).rstrip('0') == '1'

@@ -22,7 +22,7 @@ def check_event(event: Event) -> None:
 
     """
     if event.stamp_ns < 0:
-        raise InvalidEventError("negative_stamp", f"stamp {event.stamp_ns} ns is negative")
+        raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
     if isinstance(event, VelocityEvent):
         _check_velocity(event)
     else:
@@ -30,37 +30,37 @@ def check_event(event: Event) -> None:
 
 
 def _check_velocity(event: VelocityEvent) -> None:
-    _check_array("body velocity", event.body_velocity, (6,))
+    _check_array('body velocity', event.body_velocity, (6,))
     if event.covariance is not None:
-        _check_array("velocity covariance", event.covariance, (6, 6))
-        _check_variances("velocity covariance", event.covariance)
+        _check_array('velocity covariance', event.covariance, (6, 6))
+        _check_variances('velocity covariance', event.covariance)
 
 
 def _check_observation(event: ObservationEvent) -> None:
     m = len(event.points)
-    _check_array("landmark points", event.points, (m, 3))
+    _check_array('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
-        raise InvalidEventError("wrong_shape", f"{len(event.ids)} ids for {m} landmark points")
+        raise InvalidEventError('wrong_shape', f'{len(event.ids)} ids for {m} landmark points')
     known = event.ids[event.ids != UNKNOWN_ID]
     if len(known) and known.min() < 0:
-        raise InvalidEventError("negative_id", f"landmark id {known.min()} is negative")
+        raise InvalidEventError('negative_id', f'landmark id {known.min()} is negative')
     if len(known) > 1 and len(np.unique(known)) != len(known):
-        raise InvalidEventError("repeated_id", "one observation has the same landmark id twice")
+        raise InvalidEventError('repeated_id', 'one observation has the same landmark id twice')
     if event.covariances is not None:
-        _check_array("landmark covariances", event.covariances, (m, 3, 3))
-        _check_variances("landmark covariances", event.covariances)
+        _check_array('landmark covariances', event.covariances, (m, 3, 3))
+        _check_variances('landmark covariances', event.covariances)
     if event.velocities is not None:
-        _check_array("landmark velocities", event.velocities, (m, 3))
+        _check_array('landmark velocities', event.velocities, (m, 3))
 
 
 def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
-        raise InvalidEventError("wrong_shape", f"{name} have shape {array.shape}, not {shape}")
+        raise InvalidEventError('wrong_shape', f'{name} have shape {array.shape}, not {shape}')
     # One NaN or infinity makes the sum not finite, at a third of the cost of np.isfinite.
     if not math.isfinite(array.sum()):
-        raise InvalidEventError("not_finite", f"{name} have a NaN or infinite entry")
+        raise InvalidEventError('not_finite', f'{name} have a NaN or infinite entry')
 
 
 def _check_variances(name: str, covariances: FloatArray) -> None:
     if np.diagonal(covariances, axis1=-2, axis2=-1).min(initial=0.0) < 0.0:
-        raise InvalidEventError("bad_covariance", f"{name} have a negative variance")
+        raise InvalidEventError('bad_covariance', f'{name} have a negative variance')

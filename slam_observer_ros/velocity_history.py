@@ -74,10 +74,10 @@ class VelocityHistory:
             events.insert(0, VelocityEvent(start_ns - self._timeout_ns, np.zeros(6)))
         stamps = np.array([event.stamp_ns for event in events], dtype=np.int64)
         begins = np.maximum(stamps, start_ns)
-        ends = np.append(stamps[1:], end_ns)
+        ends = np.append(stamps[1:], end_ns)[: len(stamps)]
         stops = np.clip(stamps + self._timeout_ns, begins, ends)
         return HeldVelocities(
-            np.array([event.body_velocity for event in events]),
+            np.array([event.body_velocity for event in events]).reshape(-1, 6),
             [event.covariance for event in events],
             _seconds(stops - begins),
             _seconds(ends - stops),

@@ -1,7 +1,7 @@
 """The paper's gains: constant k_i and l_i, integrated so that every time step is stable.
 
 The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²). Here
-the pose is moved by an exponential integrator of the linearised flow instead. With J_i = [−[e_i]×, I],
+the pose is moved by an exponential integrator of the linearised flow. With J_i = [−[e_i]×, I],
 g = Σ k_i J_iᵀ r_i and the Gauss–Newton matrix H = Σ k_i J_iᵀ J_i, that is
 
     ξ = −U diag((1 − e^{−λ dt})/λ) Uᵀ g,      H = U diag(λ) Uᵀ,
@@ -63,7 +63,7 @@ class ConstantGains:
     def correct(self, innovation: Innovation) -> tuple[Correction, BoolArray]:
         """Return the innovation; all observations take part."""
         k = np.full(len(innovation.r), self.gain_k)
-        step = paper_step if self.step_mode == "paper" else centroid_step
+        step = paper_step if self.step_mode == 'paper' else centroid_step
         D = safe_step(step, k, innovation.e, innovation.r, innovation.dt_s)
         remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
         d = -np.expm1(-self.gain_l / self.gain_k * innovation.dt_s) * remaining  # (31)
@@ -105,8 +105,8 @@ def safe_step(
 ) -> FloatArray:
     """Return ``step``'s D for the longest dt / 2^j at which L does not grow.
 
-    The flow itself never raises L (35), so a short enough step doesn't either. Only turns of many
-    degrees at once ever need j > 0.
+    The flow itself never raises L (35), so a short enough step doesn't either. Only large
+    turns of few landmarks ever need j > 0.
     """
     rounding = np.finfo(float).eps * (np.max(np.abs(e), initial=0.0) + 1.0)
     bound = lyapunov(k, r) * (1.0 + 1e-12) + lyapunov(k, np.full_like(r, rounding))
@@ -129,8 +129,8 @@ def _step_about(
     arms = e - centre
     J = np.concatenate([-so3.hat(arms), np.broadcast_to(np.eye(3), (len(e), 3, 3))], axis=2)
     root = np.sqrt(metric)
-    g = root * np.einsum("i,ijk,ij->k", k, J, r)
-    H = root[:, None] * np.einsum("i,ijk,ijl->kl", k, J, J) * root
+    g = root * np.einsum('i,ijk,ij->k', k, J, r)
+    H = root[:, None] * np.einsum('i,ijk,ijl->kl', k, J, J) * root
     rates, U = np.linalg.eigh(H)
     xi = -root * (U @ (_held_time(rates, dt_s) * (U.T @ g)))
     R = so3.exp(xi[:3])

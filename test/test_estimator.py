@@ -1,0 +1,200 @@
+"""The estimator: order, lateness, gaps, landmark life cycle, and refusal of bad events."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.settings import Settings
+
+START_NS = 1_700_000_000_000_000_000
+LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 1], [0, 4, 0.5], [1, -4, 0], [2, 2, 2]])
+BODY_VELOCITY = np.array([0.05, -0.1, 0.3, 1.0, 0.1, -0.05])
+
+
+def true_pose(time_s):
+    return se3.exp(BODY_VELOCITY * time_s)
+
+
+def velocity(time_s, body_velocity=BODY_VELOCITY):
+    return VelocityEvent(START_NS + round(time_s * 1e9), np.array(body_velocity, dtype=float))
+
+
+def observation(time_s, ids=range(5), noise=None):
+    rows = np.array(list(ids), dtype=np.int64)
+    points = se3.transform(se3.inverse(true_pose(time_s)), LANDMARKS[rows])
+    if noise is not None:
+        points = points + noise.normal(scale=0.05, size=points.shape)
+    return ObservationEvent(START_NS + round(time_s * 1e9), rows, points)
+
+
+def run(events, **changes):
+    estimator = Estimator(Settings(**changes))
+    for event in events:
+        estimator.add(event)
+    estimator.flush()
+    return estimator
+
+
+def drive(duration_s=4.0, noise_seed=0):
+    """A drive with velocities at 20 Hz and noisy observations at 10 Hz, in stamp order."""
+    noise = np.random.default_rng(noise_seed)
+    events = []
+    for step in range(round(duration_s * 20)):
+        events.append(velocity(0.05 * step))
+        if step % 2 == 1:
+            seen = noise.permutation(5)[: noise.integers(0, 5)]
+            events.append(observation(0.05 * step, seen, noise))
+    return events
+
+
+def assert_same_state(one, other):
+    assert one.stamp_ns == other.stamp_ns
+    np.testing.assert_array_equal(one.pose, other.pose)
+    np.testing.assert_array_equal(one.landmark_ids, other.landmark_ids)
+    np.testing.assert_array_equal(one.world_points, other.world_points)
+
+
+def test_first_sight_initialises_a_landmark_from_the_current_pose():
+    estimator = run([velocity(0.0), observation(1.0, [2])], velocity_timeout=5.0)
+    np.testing.assert_allclose(estimator.world_points, LANDMARKS[[2]], atol=1e-9)
+    np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
+
+
+def test_seen_again_a_landmark_corrects_the_drift_of_the_velocity():
+    wrong = BODY_VELOCITY * [1, 1, 0.5, 1.1, 1, 1]
+    events = [observation(0.0)]
+    for step in range(200):
+        events.append(velocity(0.05 * step, wrong))
+        events.append(observation(0.05 * step + 0.05))
+    drifted = run([event for event in events if isinstance(event, VelocityEvent)])
+    corrected = run(events)
+    error = np.linalg.norm(corrected.pose[:3, 3] - true_pose(10.0)[:3, 3])
+    assert error < 0.25 * np.linalg.norm(drifted.pose[:3, 3] - true_pose(9.95)[:3, 3])
+
+
+@hypothesis_settings(max_examples=20, deadline=None)
+@given(st.randoms(use_true_random=False))
+def test_events_shuffled_within_the_window_give_the_same_bits(random):
+    events = drive()
+    arrivals = {id(event): event.stamp_ns + random.randrange(200_000_000) for event in events}
+    shuffled = sorted(events, key=lambda event: arrivals[id(event)])
+    assert_same_state(run(shuffled, reorder_window=0.2), run(events, reorder_window=0.2))
+
+
+def test_asking_for_the_pose_never_changes_the_estimate():
+    asked = Estimator(Settings())
+    for event in drive():
+        asked.add(event)
+        _ = asked.pose, asked.pose_at(event.stamp_ns + 123_456_789), asked.body_velocity
+    asked.flush()
+    assert_same_state(asked, run(drive()))
+
+
+def test_long_stretches_of_velocity_move_the_state_on_and_stay_exact():
+    estimator = run([velocity(0.01 * step) for step in range(1001)])
+    np.testing.assert_allclose(estimator.pose, true_pose(10.0), atol=1e-9)
+
+
+def test_an_observation_later_than_the_window_is_carried_forward():
+    events = [velocity(0.05 * step) for step in range(41)]
+    events += [observation(2.0), observation(1.2, [4]), velocity(2.05)]
+    estimator = run(events, reorder_window=0.0)
+    assert estimator.counts['late_observation'] == 1
+    np.testing.assert_allclose(estimator.world_points, LANDMARKS, atol=1e-9)
+
+
+def test_an_event_later_than_the_limit_is_refused():
+    events = [velocity(0.05 * step) for step in range(100)] + [observation(1.0)]
+    estimator = run(events, reorder_window=0.1, late_limit=1.0)
+    assert estimator.dropped == {'too_late': 1}
+    assert len(estimator.landmark_ids) == 0
+
+
+def test_in_a_gap_the_pose_is_held_and_flagged():
+    estimator = run([velocity(0.0), observation(3.0, [0])], velocity_timeout=0.5)
+    np.testing.assert_allclose(estimator.pose, true_pose(0.5), atol=1e-9)
+    assert estimator.velocity_is_stale
+    np.testing.assert_array_equal(estimator.body_velocity, np.zeros(6))
+
+
+def test_without_any_velocity_observations_still_build_a_map():
+    estimator = run([observation(0.0), observation(1.0)])
+    assert estimator.velocity_is_stale
+    assert len(estimator.landmark_ids) == 5
+
+
+def test_a_forgotten_landmark_leaves_the_others_alone_and_may_come_back():
+    estimator = run(drive())
+    ids, points = list(estimator.landmark_ids), estimator.world_points
+    row = ids.index(3)
+    assert estimator.forget(3)
+    assert not estimator.forget(3)
+    np.testing.assert_array_equal(estimator.world_points, np.delete(points, row, axis=0))
+    estimator.add(observation(4.2, [3]))
+    estimator.flush()
+    assert estimator.landmark_ids[-1] == 3
+
+
+def test_reset_forgets_everything():
+    estimator = run(drive())
+    estimator.reset()
+    assert len(estimator.landmark_ids) == 0
+    np.testing.assert_array_equal(estimator.pose, np.eye(4))
+
+
+def bad_events():
+    good = observation(5.0, [0, 1])
+    stamp_ns = good.stamp_ns
+    points = good.points
+    return [
+        ('negative_stamp', VelocityEvent(-1, BODY_VELOCITY)),
+        ('wrong_shape', VelocityEvent(stamp_ns, BODY_VELOCITY[:5])),
+        ('not_finite', VelocityEvent(stamp_ns, BODY_VELOCITY * np.nan)),
+        ('not_finite', VelocityEvent(stamp_ns, np.array([np.inf, 0, 0, -np.inf, 0, 0]))),
+        ('bad_covariance', VelocityEvent(stamp_ns, BODY_VELOCITY, -np.eye(6))),
+        ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points[:, :2])),
+        ('wrong_shape', ObservationEvent(stamp_ns, good.ids[:1], points)),
+        ('not_finite', ObservationEvent(stamp_ns, good.ids, points * np.inf)),
+        ('repeated_id', ObservationEvent(stamp_ns, np.array([7, 7]), points)),
+        ('negative_id', ObservationEvent(stamp_ns, np.array([7, -2]), points)),
+        ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points, np.ones((2, 3)))),
+        ('not_finite', ObservationEvent(stamp_ns, good.ids, points, np.full((2, 3, 3), np.nan))),
+        ('stamp_jump', VelocityEvent(stamp_ns + 10**12, BODY_VELOCITY)),
+        ('duplicate', drive()[-2]),
+        ('duplicate', drive()[-1]),
+    ]
+
+
+@pytest.mark.parametrize(('reason', 'event'), bad_events())
+def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason, event):
+    estimator, untouched = Estimator(Settings()), Estimator(Settings())
+    for good in drive():
+        assert estimator.add(good)
+        untouched.add(good)
+    assert not estimator.add(event)
+    assert estimator.dropped == {reason: 1}
+    estimator.flush()
+    untouched.flush()
+    assert_same_state(estimator, untouched)
+
+
+def test_one_stray_stamp_is_refused_but_a_clock_that_jumped_is_followed():
+    estimator = run(drive())
+    jumped = [velocity(5000.0 + 0.05 * step) for step in range(20)]
+    accepted = [estimator.add(event) for event in jumped]
+    assert accepted == [False] * 4 + [True] * 16
+    assert estimator.newest_stamp_ns == jumped[-1].stamp_ns
+
+
+def test_an_empty_observation_moves_the_state_on_and_nothing_else():
+    empty = ObservationEvent(START_NS + 10**9, np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    estimator = run([velocity(0.0), empty], velocity_timeout=2.0)
+    assert estimator.stamp_ns == empty.stamp_ns
+    np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
