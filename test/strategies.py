@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import strategies as st
 import numpy as np
 
-from slam_observer_ros.geometry import se3, slam_group, so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.slam_group import SlamElement, SlamVelocity, TotalState
 from slam_observer_ros.types import FloatArray
 
@@ -92,8 +92,3 @@ def states(n: int) -> st.SearchStrategy[TotalState]:
 def velocities(n: int) -> st.SearchStrategy[SlamVelocity]:
     """Inputs of the space (19)."""
     return st.builds(SlamVelocity, twists(), points(n))
-
-
-def increments(n: int) -> st.SearchStrategy[SlamElement]:
-    """Exponentials of elements of the Lie algebra of SLAM_n(3)."""
-    return velocities(n).map(lambda u: slam_group.exp(u.V, u.v))

@@ -44,7 +44,7 @@ def slam_matrix(X: SlamElement) -> FloatArray:
 
 def slam_n_3(n: int) -> Group:
     return Group(
-        f"SLAM_{n}(3)",
+        f'SLAM_{n}(3)',
         6 + 3 * n,
         slam_group.identity(n),
         slam_group.compose,
@@ -55,16 +55,16 @@ def slam_n_3(n: int) -> Group:
 
 
 GROUPS = (
-    Group("SO(3)", 3, np.eye(3), np.matmul, lambda R: R.swapaxes(-1, -2), so3.exp),
-    Group("SE(3)", 6, np.eye(4), np.matmul, se3.inverse, se3.exp),
+    Group('SO(3)', 3, np.eye(3), np.matmul, lambda R: R.swapaxes(-1, -2), so3.exp),
+    Group('SE(3)', 6, np.eye(4), np.matmul, se3.inverse, se3.exp),
     slam_n_3(0),
     slam_n_3(1),
     slam_n_3(12),
 )
 
-every_group = pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.name)
+every_group = pytest.mark.parametrize('group', GROUPS, ids=lambda group: group.name)
 every_batch_shape = pytest.mark.parametrize(
-    "batch_shape", [(), (1,), (20,), (2, 3), (0,)], ids=str
+    'batch_shape', [(), (1,), (20,), (2, 3), (0,)], ids=str
 )
 
 

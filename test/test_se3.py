@@ -63,7 +63,7 @@ def test_exp_is_the_matrix_exponential(xi: FloatArray) -> None:
     np.testing.assert_allclose(se3.exp(xi), expm(se3.hat(xi)), rtol=0, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("angle", [1e-160, 1e-12, 1e-10, 1e-8])
+@pytest.mark.parametrize('angle', [1e-160, 1e-12, 1e-10, 1e-8])
 @given(axis=unit_vectors(), v=directions())
 def test_exp_of_tiny_twists_keeps_the_rotation_vector_to_its_last_bits(
     angle: float, axis: FloatArray, v: FloatArray
@@ -117,7 +117,7 @@ def test_project_is_the_orthogonal_projection_onto_se3_10(
     np.testing.assert_array_equal(se3.project(V), V)
 
 
-@pytest.mark.parametrize("angle", DELICATE_ANGLES)
+@pytest.mark.parametrize('angle', DELICATE_ANGLES)
 @given(axis=unit_vectors(), v=directions())
 def test_left_jacobian_is_its_series_on_both_sides_of_every_switch(
     angle: float, axis: FloatArray, v: FloatArray
@@ -140,9 +140,9 @@ def test_left_jacobian_is_the_derivative_of_exp(xi: FloatArray, delta: FloatArra
     np.testing.assert_allclose(se3.left_jacobian(xi) @ (2.0 * step), change, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("batch_shape", [(0,), (1,), (7,), (2, 3)])
+@pytest.mark.parametrize('batch_shape', [(0,), (1,), (7,), (2, 3)])
 @pytest.mark.parametrize(
-    "function", [se3.hat, se3.exp, se3.left_jacobian, se3.left_jacobian_inverse]
+    'function', [se3.hat, se3.exp, se3.left_jacobian, se3.left_jacobian_inverse]
 )
 def test_batches_of_twists_give_what_single_calls_give(
     function: Callable[[FloatArray], FloatArray], batch_shape: tuple[int, ...]
@@ -154,8 +154,8 @@ def test_batches_of_twists_give_what_single_calls_give(
         np.testing.assert_allclose(found[index], function(xi[index]), rtol=0, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("batch_shape", [(0,), (1,), (7,), (2, 3)])
-@pytest.mark.parametrize("function", [se3.inverse, se3.log, se3.adjoint, se3.vee, se3.project])
+@pytest.mark.parametrize('batch_shape', [(0,), (1,), (7,), (2, 3)])
+@pytest.mark.parametrize('function', [se3.inverse, se3.log, se3.adjoint, se3.vee, se3.project])
 def test_batches_of_poses_give_what_single_calls_give(
     function: Callable[[FloatArray], FloatArray], batch_shape: tuple[int, ...]
 ) -> None:

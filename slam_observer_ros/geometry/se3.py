@@ -58,7 +58,7 @@ def inverse(T: FloatArray) -> FloatArray:
         Inverse pose.
 
     """
-    R_transposed = T[..., :3, :3].swapaxes(-1, -2)
+    R_transposed = so3.transpose(T[..., :3, :3])
     return pose(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
 
 
@@ -97,7 +97,7 @@ def rotate(T: FloatArray, directions: FloatArray) -> FloatArray:
         Directions in the frame that T maps to.
 
     """
-    return directions @ T[..., :3, :3].swapaxes(-1, -2)
+    return directions @ so3.transpose(T[..., :3, :3])
 
 
 def hat(xi: FloatArray) -> FloatArray:
@@ -149,7 +149,7 @@ def project(M: FloatArray) -> FloatArray:
 
     """
     V = np.zeros_like(M)
-    V[..., :3, :3] = 0.5 * (M[..., :3, :3] - M[..., :3, :3].swapaxes(-1, -2))
+    V[..., :3, :3] = 0.5 * (M[..., :3, :3] - so3.transpose(M[..., :3, :3]))
     V[..., :3, 3] = M[..., :3, 3]
     return V
 

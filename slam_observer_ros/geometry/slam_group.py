@@ -118,7 +118,7 @@ def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
 
     """
     J = so3.left_jacobian(Delta[..., :3])
-    return SlamElement(se3.exp(Delta), d @ J.swapaxes(-1, -2))
+    return SlamElement(se3.exp(Delta), d @ so3.transpose(J))
 
 
 def alpha(S: FloatArray, Xi: TotalState) -> TotalState:
@@ -169,7 +169,7 @@ def psi(X: SlamElement, u: SlamVelocity) -> SlamVelocity:
     """
     A_inverse = se3.inverse(X.A)
     V = (se3.adjoint(A_inverse) @ u.V[..., :, None])[..., 0]
-    turned = X.a @ so3.hat(u.V[..., :3]).swapaxes(-1, -2)
+    turned = X.a @ so3.transpose(so3.hat(u.V[..., :3]))
     return SlamVelocity(V, se3.rotate(A_inverse, u.v + turned))
 
 

@@ -1,6 +1,6 @@
 """Rotations SO(3) as 3×3 matrices; rotation vectors φ = θ·axis in radians; quaternions xyzw.
 
-With K = φ^× and θ = |φ|, all maps are polynomials in K whose coefficients are
+With K = φ_× and θ = |φ|, all maps are polynomials in K whose coefficients are
 
     a = sin θ / θ,    b = (1 − cos θ) / θ²,    c = (1 − a) / θ² = (θ − sin θ) / θ³.
 
@@ -25,6 +25,12 @@ _IDENTITY = np.eye(3)
 
 # Added to θ²: 0/0 becomes 0 / 1e-300, and any angle above 1e-142 rad keeps all its bits.
 _ZERO_GUARD = 1e-300
+
+
+def transpose(M: FloatArray) -> FloatArray:
+    """Transpose each matrix of a stack: shape (..., m, n) to (..., n, m)."""
+    transposed: FloatArray = M.swapaxes(-1, -2)
+    return transposed
 
 
 def hat(phi: FloatArray) -> FloatArray:
@@ -120,7 +126,7 @@ def log(R: FloatArray) -> FloatArray:
     """
     quaternion = to_quaternion(R)
     v, w = quaternion[..., :3], quaternion[..., 3:]
-    sine = np.sqrt(np.sum(v * v, axis=-1, keepdims=True) + _ZERO_GUARD)
+    sine: FloatArray = np.sqrt(np.sum(v * v, axis=-1, keepdims=True) + _ZERO_GUARD)
     return (2.0 * np.arctan2(sine, w) / sine) * v
 
 
@@ -180,7 +186,7 @@ def from_quaternion(quaternion: FloatArray) -> FloatArray:
         Rotation matrix.
 
     """
-    unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    unit: FloatArray = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     K = hat(unit[..., :3])
     return _IDENTITY + 2.0 * unit[..., 3:, None] * K + 2.0 * (K @ K)
 
@@ -202,7 +208,7 @@ def to_quaternion(R: FloatArray) -> FloatArray:
         Quaternion xyzw (the order of ROS) with w ≥ 0.
 
     """
-    R_transposed = R.swapaxes(-1, -2)
+    R_transposed = transpose(R)
     trace = np.trace(R, axis1=-2, axis2=-1)[..., None]
     products = np.empty((*R.shape[:-2], 4, 4))
     products[..., :3, :3] = R + R_transposed + (1.0 - trace[..., None]) * _IDENTITY
@@ -210,8 +216,9 @@ def to_quaternion(R: FloatArray) -> FloatArray:
     products[..., 3, 3:] = 1.0 + trace
     rows = products.reshape(-1, 4, 4)
     largest = np.argmax(np.diagonal(rows, axis1=1, axis2=2), axis=1)
-    q = rows[np.arange(len(rows)), largest].reshape((*R.shape[:-2], 4))
-    return q / np.copysign(np.linalg.norm(q, axis=-1, keepdims=True), q[..., 3:])
+    q: FloatArray = rows[np.arange(len(rows)), largest].reshape((*R.shape[:-2], 4))
+    length: FloatArray = np.linalg.norm(q, axis=-1, keepdims=True)
+    return q / np.copysign(length, q[..., 3:])
 
 
 def normalise(R: FloatArray) -> FloatArray:
@@ -231,4 +238,4 @@ def normalise(R: FloatArray) -> FloatArray:
         Rotation matrix.
 
     """
-    return 0.5 * R @ (3.0 * _IDENTITY - R.swapaxes(-1, -2) @ R)
+    return 0.5 * R @ (3.0 * _IDENTITY - transpose(R) @ R)
