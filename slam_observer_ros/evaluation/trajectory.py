@@ -1,0 +1,283 @@
+"""Time-stamped poses: interpolation of the truth, and TUM files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+import os
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+NANOSECONDS_PER_SECOND = 1_000_000_000
+
+MAX_GAP_NS = NANOSECONDS_PER_SECOND // 2
+"""Truth is not interpolated between samples further apart than this."""
+
+_TUM_HEADER = '# timestamp[s] x y z [m] qx qy qz qw\n'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses in strictly increasing time.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (k,) stamps, nanoseconds.
+    poses : FloatArray
+        (k, 4, 4) transforms from the body to the world.
+
+    Raises
+    ------
+    EvaluationError
+        The shapes don't fit, a pose isn't finite, or the stamps don't increase.
+
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.stamps_ns.ndim != 1 or self.poses.shape != (len(self.stamps_ns), 4, 4):
+            raise EvaluationError(
+                f'a trajectory needs (k,) stamps and (k, 4, 4) poses, '
+                f'not {self.stamps_ns.shape} and {self.poses.shape}'
+            )
+        if not np.isfinite(self.poses).all():
+            raise EvaluationError("a trajectory's poses must be finite")
+        if not (self.stamps_ns[1:] > self.stamps_ns[:-1]).all():
+            raise EvaluationError("a trajectory's stamps must increase strictly")
+
+    @classmethod
+    def from_samples(cls, stamps_ns: Sequence[int], poses: Sequence[FloatArray]) -> Trajectory:
+        """Collect poses in any order; of those with one stamp, the last given counts.
+
+        Parameters
+        ----------
+        stamps_ns : sequence of int
+            k stamps, nanoseconds.
+        poses : sequence of FloatArray
+            k transforms (4, 4) from the body to the world.
+
+        """
+        latest = dict(zip(stamps_ns, poses, strict=True))
+        ordered = sorted(latest)
+        stacked = np.array([latest[stamp] for stamp in ordered], dtype=np.float64)
+        return cls(np.array(ordered, dtype=np.int64), stacked.reshape(-1, 4, 4))
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def positions(self) -> FloatArray:
+        """(k, 3) positions of the body in the world, metres."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def rotations(self) -> FloatArray:
+        """(k, 3, 3) rotations from body to world axes."""
+        return self.poses[:, :3, :3]
+
+    @property
+    def path_length_m(self) -> float:
+        """Sum of the distances between consecutive positions, metres."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def moved(self, transform: FloatArray) -> Trajectory:
+        """Express the trajectory in another world frame.
+
+        Parameters
+        ----------
+        transform : FloatArray
+            (4, 4) from this world to the other one.
+
+        """
+        return Trajectory(self.stamps_ns, transform @ self.poses)
+
+
+def interpolate(
+    trajectory: Trajectory, stamps_ns: IntArray, max_gap_ns: int = MAX_GAP_NS
+) -> tuple[FloatArray, BoolArray]:
+    """Interpolate poses: linear in position, constant angular velocity in rotation (slerp).
+
+    At the trajectory's own stamps its poses are returned bit for bit. Nothing is extrapolated
+    before the first or after the last stamp, nor bridged over gaps that are too long.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        k poses.
+    stamps_ns : IntArray
+        (m,) times wanted, in any order, nanoseconds.
+    max_gap_ns : int
+        Longest time between two neighbouring poses that is bridged.
+
+    Returns
+    -------
+    poses : FloatArray
+        (m, 4, 4) poses, NaN where not covered.
+    covered : BoolArray
+        (m,) whether the trajectory covers that time.
+
+    """
+    poses = np.full((len(stamps_ns), 4, 4), np.nan)
+    before = np.searchsorted(trajectory.stamps_ns, stamps_ns, side='right') - 1
+    covered: BoolArray = before >= 0
+    before, wanted_ns = before[covered], stamps_ns[covered]
+    after = np.minimum(before + 1, len(trajectory) - 1)
+    elapsed_ns = wanted_ns - trajectory.stamps_ns[before]
+    gap_ns = trajectory.stamps_ns[after] - trajectory.stamps_ns[before]
+    usable = (elapsed_ns == 0) | ((gap_ns > 0) & (gap_ns <= max_gap_ns))
+    covered[covered] = usable
+    fraction = elapsed_ns[usable] / np.maximum(gap_ns[usable], 1)
+    poses[covered] = _between(
+        trajectory.poses[before[usable]], trajectory.poses[after[usable]], fraction
+    )
+    return poses, covered
+
+
+def _between(start: FloatArray, end: FloatArray, fraction: FloatArray) -> FloatArray:
+    R = start[:, :3, :3]
+    turn = so3.log(R.swapaxes(-1, -2) @ end[:, :3, :3])
+    rotations = R @ so3.exp(fraction[:, None] * turn)
+    shift = end[:, :3, 3] - start[:, :3, 3]
+    return se3.pose(rotations, start[:, :3, 3] + fraction[:, None] * shift)
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
+) -> tuple[Trajectory, Trajectory, BoolArray]:
+    """Pair each estimated pose with the true one at the same time.
+
+    Parameters
+    ----------
+    estimate : Trajectory
+        k estimated poses.
+    truth : Trajectory
+        True poses at any rate, interpolated.
+    max_gap_ns : int
+        See :func:`interpolate`.
+
+    Returns
+    -------
+    estimate, truth : Trajectory
+        The pairs, at the stamps of the estimate that the truth covers.
+    covered : BoolArray
+        (k,) which of the estimated poses these are.
+
+    """
+    true_poses, covered = interpolate(truth, estimate.stamps_ns, max_gap_ns)
+    stamps_ns = estimate.stamps_ns[covered]
+    return (
+        Trajectory(stamps_ns, estimate.poses[covered]),
+        Trajectory(stamps_ns, true_poses[covered]),
+        covered,
+    )
+
+
+def write_tum(trajectory: Trajectory, path: Path) -> Path:
+    """Write a TUM file (``t x y z qx qy qz qw``), as evo and others read it.
+
+    Stamps are written to the nanosecond and numbers with all their digits, so reading the file
+    gives the stamps and positions back bit for bit. The file appears whole or not at all.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        Poses to write.
+    path : Path
+        File to create or replace; its folder must exist.
+
+    Returns
+    -------
+    Path
+        ``path``.
+
+    Raises
+    ------
+    EvaluationError
+        The file can't be written.
+
+    """
+    numbers = np.hstack([trajectory.positions, so3.to_quaternion(trajectory.rotations)]).tolist()
+    lines = (
+        f'{_seconds_text(stamp_ns)} {" ".join(map(repr, row))}\n'
+        for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), numbers, strict=True)
+    )
+    unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
+    try:
+        with unfinished.open('w', encoding='ascii') as file:
+            file.write(_TUM_HEADER)
+            file.writelines(lines)
+        unfinished.replace(path)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise EvaluationError(f"can't write {path}: {error.strerror}") from error
+    return path
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM file; empty lines and lines that begin with ``#`` are passed over.
+
+    Parameters
+    ----------
+    path : Path
+        File with ``t x y z qx qy qz qw`` a line, quaternions of any length but zero.
+
+    Returns
+    -------
+    Trajectory
+        Its poses, stamps rounded to the nanosecond.
+
+    Raises
+    ------
+    EvaluationError
+        The file can't be read, a line is malformed, or the stamps don't increase.
+
+    """
+    try:
+        lines = path.read_text(encoding='utf-8').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise EvaluationError(f"can't read {path}: {error}") from error
+    stamps_ns: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or words[0].startswith('#'):
+            continue
+        try:
+            stamp_ns, row = _parse_tum_words(words)
+        except (ValueError, ArithmeticError) as error:
+            raise EvaluationError(f'{path}, line {number}: {error}') from error
+        stamps_ns.append(stamp_ns)
+        rows.append(row)
+    numbers = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    poses = se3.pose(so3.from_quaternion(numbers[:, 3:]), numbers[:, :3])
+    try:
+        return Trajectory(np.array(stamps_ns, dtype=np.int64), poses)
+    except EvaluationError as error:
+        raise EvaluationError(f'{path}: {error}') from error
+
+
+def _parse_tum_words(words: list[str]) -> tuple[int, list[float]]:
+    if len(words) != 8:
+        raise ValueError(f'8 numbers expected, {len(words)} found')
+    stamp_ns = int((Decimal(words[0]) * NANOSECONDS_PER_SECOND).to_integral_value())
+    if abs(stamp_ns) > np.iinfo(np.int64).max:
+        raise ValueError('the stamp is out of range')
+    row = [float(word) for word in words[1:]]
+    norm = float(np.linalg.norm(row[3:]))
+    if norm == 0.0 or not np.isfinite(row).all():
+        raise ValueError('position and quaternion are no pose')
+    return stamp_ns, row[:3] + [value / norm for value in row[3:]]
+
+
+def _seconds_text(stamp_ns: int) -> str:
+    seconds, rest_ns = divmod(abs(stamp_ns), NANOSECONDS_PER_SECOND)
+    return f'{"-" if stamp_ns < 0 else ""}{seconds}.{rest_ns:09d}'

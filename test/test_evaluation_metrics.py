@@ -1,0 +1,190 @@
+"""Metrics measure what can be observed, whatever the world frame."""
+
+from __future__ import annotations
+
+import json
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from strategies import generators, poses
+
+from slam_observer_ros.evaluation import metrics
+from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import LandmarkTruth
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.types import FloatArray
+
+STAMPS_NS = np.arange(40) * 100_000_000
+
+
+def random_pair(rng: np.random.Generator) -> tuple[Trajectory, Trajectory]:
+    true_poses = se3.exp(rng.normal(0.0, [0.3] * 3 + [5.0] * 3, (len(STAMPS_NS), 6)))
+    noise = se3.exp(rng.normal(0.0, 0.1, (len(STAMPS_NS), 6)))
+    return Trajectory(STAMPS_NS, true_poses @ noise), Trajectory(STAMPS_NS, true_poses)
+
+
+def random_map(rng: np.random.Generator) -> LandmarkTruth:
+    return LandmarkTruth(rng.permutation(100)[:12], rng.normal(0.0, 5.0, (12, 3)))
+
+
+@given(generators(), poses())
+def test_a_rigidly_moved_truth_has_no_error(rng: np.random.Generator, G: FloatArray) -> None:
+    _, truth = random_pair(rng)
+    errors = metrics.trajectory_errors(truth.moved(G), truth)
+    assert errors.ate_rmse_m < 1e-11
+    assert errors.rotation_rmse_rad < 1e-11
+
+
+@given(generators(), poses())
+def test_trajectory_errors_ignore_the_estimates_world_frame(
+    rng: np.random.Generator, G: FloatArray
+) -> None:
+    estimate, truth = random_pair(rng)
+    here = metrics.trajectory_errors(estimate, truth)
+    there = metrics.trajectory_errors(estimate.moved(G), truth)
+    np.testing.assert_allclose(there.errors, here.errors, atol=1e-9)
+    assert there.heading_rmse_rad <= there.rotation_rmse_rad
+
+
+def test_heading_error_is_the_turn_about_the_vertical() -> None:
+    rng = np.random.default_rng(1)
+    positions = rng.normal(0.0, 3.0, (len(STAMPS_NS), 3))
+    poses = np.tile(np.eye(4), (len(STAMPS_NS), 1, 1))
+    turned = se3.exp(np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 0.0], (len(STAMPS_NS), 1)))
+    poses[:, :3, 3] = turned[:, :3, 3] = positions
+    errors = metrics.trajectory_errors(Trajectory(STAMPS_NS, turned), Trajectory(STAMPS_NS, poses))
+    assert errors.ate_rmse_m < 1e-12
+    assert errors.heading_rmse_rad == pytest.approx(0.1)
+    assert errors.rotation_rmse_rad == pytest.approx(0.1)
+
+
+def test_only_times_that_the_truth_covers_are_compared() -> None:
+    estimate, truth = random_pair(np.random.default_rng(0))
+    part = Trajectory(truth.stamps_ns[10:20], truth.poses[10:20])
+    errors = metrics.trajectory_errors(estimate, part)
+    np.testing.assert_array_equal(np.flatnonzero(errors.covered), np.arange(10, 20))
+    elsewhere = Trajectory(truth.stamps_ns + 10**12, truth.poses)
+    with pytest.raises(EvaluationError, match='covers'):
+        metrics.trajectory_errors(estimate, elsewhere)
+
+
+@given(generators(), poses())
+def test_landmark_errors_match_ids_and_ignore_the_frame(
+    rng: np.random.Generator, G: FloatArray
+) -> None:
+    truth = random_map(rng)
+    order = rng.permutation(12)
+    noisy = truth.world_points + rng.normal(0.0, 0.1, (12, 3))
+    # One landmark more than the truth knows, in another order and another world.
+    ids = np.append(truth.ids[order], 1_000)
+    points = np.vstack([noisy[order], [9.0, 9.0, 9.0]])
+    here = metrics.landmark_errors(truth.ids, noisy, truth)
+    there = metrics.landmark_errors(ids, se3.transform(G, points), truth)
+    np.testing.assert_array_equal(there.ids, np.sort(truth.ids))
+    assert there.rmse_m == pytest.approx(here.rmse_m, rel=1e-9)
+    assert 0.0 < there.rmse_m < 0.3
+
+
+def test_maps_without_a_common_landmark_cannot_be_compared() -> None:
+    truth = random_map(np.random.default_rng(0))
+    with pytest.raises(EvaluationError, match='no landmark'):
+        metrics.landmark_errors(truth.ids + 1_000, truth.world_points, truth)
+
+
+@given(generators(), poses(), poses(), poses())
+def test_configuration_error_is_gauge_free(
+    rng: np.random.Generator, pose: FloatArray, true_pose: FloatArray, G: FloatArray
+) -> None:
+    truth = random_map(rng)
+    points = truth.world_points + rng.normal(0.0, 1.0, (12, 3))
+    here, there = metrics.ConfigurationError(), metrics.ConfigurationError()
+    here.add(0, pose, truth.ids, points, true_pose, truth)
+    there.add(0, G @ pose, truth.ids, se3.transform(G, points), true_pose, truth)
+    assert here.rmse_m is not None
+    assert there.rmse_m == pytest.approx(here.rmse_m, rel=1e-9)
+
+
+def test_configuration_error_is_the_rms_over_landmarks_and_then_over_time() -> None:
+    truth = LandmarkTruth(np.array([7, 3]), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+    error = metrics.ConfigurationError()
+    assert error.rmse_m is None
+    error.add(5, np.eye(4), np.array([9]), np.zeros((1, 3)), np.eye(4), truth)
+    assert error.rmse_m is None
+    off = np.array([[0.0, 1.0, 0.3], [1.0, 0.0, 0.4], [5.0, 5.0, 5.0]])
+    error.add(6, np.eye(4), np.array([3, 7, 9]), off, np.eye(4), truth)
+    error.add(7, np.eye(4), np.array([3]), off[:1], np.eye(4), truth)
+    assert error.stamps_ns == [6, 7]
+    np.testing.assert_allclose(error.values_m, [np.sqrt((0.09 + 0.16) / 2), 0.3])
+    assert error.rmse_m == pytest.approx(np.sqrt((0.125 + 0.09) / 2))
+
+
+def random_covariance(rng: np.random.Generator, d: int) -> FloatArray:
+    factor = rng.normal(size=(d, d))
+    return factor @ factor.T + 0.1 * np.eye(d)
+
+
+@given(generators(), st.floats(1e-4, 1e4))
+def test_nees_does_not_depend_on_units(rng: np.random.Generator, unit: float) -> None:
+    covariance, error = random_covariance(rng, 6), rng.normal(size=6)
+    scale = np.array([1.0, 1.0, 1.0, unit, unit, unit])
+    nees, degrees_of_freedom = metrics.normalised_squared_errors(
+        scale * error, np.outer(scale, scale) * covariance
+    )
+    assert nees == pytest.approx(error @ np.linalg.solve(covariance, error), rel=1e-6)
+    assert degrees_of_freedom == 6
+
+
+def test_exactly_known_directions_do_not_count() -> None:
+    covariance = np.zeros((6, 6))
+    covariance[2:5, 2:5] = random_covariance(np.random.default_rng(0), 3)
+    error = np.arange(6.0)
+    nees, degrees_of_freedom = metrics.normalised_squared_errors(error, covariance)
+    assert degrees_of_freedom == 3
+    assert nees == pytest.approx(error[2:5] @ np.linalg.solve(covariance[2:5, 2:5], error[2:5]))
+    assert metrics.average_nees(error[None], np.zeros((1, 6, 6))) is None
+
+
+def test_an_indefinite_covariance_is_refused() -> None:
+    with pytest.raises(EvaluationError, match='negative'):
+        metrics.average_nees(np.ones((1, 2)), np.array([[[1.0, 2.0], [2.0, 1.0]]]))
+
+
+@pytest.mark.parametrize(('inflation', 'inside'), [(1.0, True), (0.7, False), (1.4, False)])
+def test_the_band_tells_honest_covariances_from_others(inflation: float, inside: bool) -> None:
+    rng = np.random.default_rng(5)
+    covariance = random_covariance(rng, 6)
+    errors = rng.multivariate_normal(np.zeros(6), covariance, size=200)
+    average = metrics.average_nees(errors, np.tile(inflation * covariance, (200, 1, 1)))
+    lower, upper = metrics.average_nees_band(6, runs=200)
+    assert average is not None
+    assert (lower < average < upper) is inside
+
+
+def test_the_band_is_that_of_the_chi_square_distribution() -> None:
+    # Bar-Shalom's Estimation with Applications to Tracking, 50 runs of 2 degrees of freedom.
+    lower, upper = metrics.average_nees_band(2, runs=50)
+    assert (2 * lower, 2 * upper) == pytest.approx((1.5, 2.6), abs=0.02)
+
+
+@given(generators(), poses())
+def test_anchored_nees_ignores_the_worlds_and_starts_at_zero(
+    rng: np.random.Generator, G: FloatArray
+) -> None:
+    estimate, truth = random_pair(rng)
+    covariances = np.tile(np.eye(6), (len(STAMPS_NS), 1, 1))
+    here = metrics.anchored_average_nees(estimate, covariances, truth)
+    there = metrics.anchored_average_nees(estimate, covariances, truth.moved(G))
+    assert here == pytest.approx(there, rel=1e-6)
+    exact = metrics.anchored_average_nees(truth.moved(G), covariances, truth)
+    assert exact == pytest.approx(0.0, abs=1e-15)
+
+
+def test_a_report_is_one_json_object() -> None:
+    report = metrics.Report(10, 2.0, 0.1, 4, {'not_finite': 1}, ate_rmse_m=0.25)
+    content = json.loads(report.to_json())
+    assert content['dropped'] == {'not_finite': 1}
+    assert content['ate_rmse_m'] == 0.25
+    assert content['landmark_rmse_m'] is None

@@ -1,0 +1,172 @@
+"""Interpolation and TUM files keep what they are given, to the nanosecond and the last bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.evaluation.trajectory import (
+    associate,
+    interpolate,
+    read_tum,
+    Trajectory,
+    write_tum,
+)
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.types import FloatArray, IntArray
+
+SEEDS = st.integers(0, 2**32 - 1)
+EPOCH_NS = 1_700_000_000_123_456_789
+
+
+def random_trajectory(seed: int, k: int, start_ns: int = EPOCH_NS) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    stamps_ns = start_ns + np.cumsum(rng.integers(1, 200_000_000, k))
+    return Trajectory(stamps_ns, se3.exp(rng.normal(0.0, 1.5, (k, 6))))
+
+
+@given(SEEDS, st.integers(1, 20))
+def test_interpolation_is_exact_at_the_knots(seed: int, k: int) -> None:
+    trajectory = random_trajectory(seed, k)
+    poses, covered = interpolate(trajectory, trajectory.stamps_ns)
+    assert covered.all()
+    np.testing.assert_array_equal(poses, trajectory.poses)
+
+
+def test_interpolation_follows_a_held_velocity() -> None:
+    # Straight motion while turning: the two interpolate independently, each linearly.
+    stamps_ns = EPOCH_NS + np.arange(0, 1_000_000_000, 100_000_000)
+    wanted_ns = np.array([EPOCH_NS + 123_456_789, EPOCH_NS + 899_999_999])
+
+    def poses_at(stamps_ns: IntArray) -> FloatArray:
+        seconds = (stamps_ns - EPOCH_NS)[:, None] / 1e9
+        turn = se3.exp(seconds * [0.3, -1.0, 2.0, 0.0, 0.0, 0.0])
+        turn[:, :3, 3] = seconds * [1.0, -2.0, 0.5]
+        return turn
+
+    poses, covered = interpolate(Trajectory(stamps_ns, poses_at(stamps_ns)), wanted_ns)
+    assert covered.all()
+    np.testing.assert_allclose(poses, poses_at(wanted_ns), atol=1e-12)
+
+
+def test_nothing_is_extrapolated_or_bridged_over_a_gap() -> None:
+    stamps_ns = np.array([0, 100, 1_100, 1_200])
+    trajectory = Trajectory(stamps_ns, np.tile(np.eye(4), (4, 1, 1)))
+    wanted_ns = np.array([-1, 0, 50, 100, 101, 1_099, 1_100, 1_200, 1_201])
+    poses, covered = interpolate(trajectory, wanted_ns, max_gap_ns=999)
+    np.testing.assert_array_equal(covered, [0, 1, 1, 1, 0, 0, 1, 1, 0])
+    assert np.isnan(poses[~covered]).all()
+    _, all_covered = interpolate(trajectory, wanted_ns, max_gap_ns=1_000)
+    np.testing.assert_array_equal(all_covered, [0, 1, 1, 1, 1, 1, 1, 1, 0])
+
+
+def test_an_empty_trajectory_covers_nothing() -> None:
+    _, covered = interpolate(Trajectory.from_samples([], []), np.array([0, 1]))
+    assert not covered.any()
+
+
+@given(SEEDS)
+def test_pairs_have_one_stamp(seed: int) -> None:
+    estimate, truth = random_trajectory(seed, 15), random_trajectory(seed + 1, 12)
+    paired, true_paired, covered = associate(estimate, truth)
+    np.testing.assert_array_equal(paired.stamps_ns, estimate.stamps_ns[covered])
+    np.testing.assert_array_equal(paired.stamps_ns, true_paired.stamps_ns)
+    np.testing.assert_array_equal(paired.poses, estimate.poses[covered])
+
+
+def test_samples_are_sorted_and_the_last_of_one_stamp_counts() -> None:
+    poses = se3.exp(np.arange(18.0).reshape(3, 6))
+    trajectory = Trajectory.from_samples([20, 10, 20], list(poses))
+    np.testing.assert_array_equal(trajectory.stamps_ns, [10, 20])
+    np.testing.assert_array_equal(trajectory.poses, poses[[1, 2]])
+
+
+def test_path_length_is_the_sum_of_steps_in_any_frame() -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = [[0, 0, 0], [3, 4, 0], [3, 4, 2]]
+    trajectory = Trajectory(np.arange(3), poses)
+    assert trajectory.path_length_m == pytest.approx(7.0)
+    assert trajectory.moved(se3.exp(np.arange(6.0))).path_length_m == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize(
+    ('stamps_ns', 'poses'),
+    [
+        (np.array([1, 1]), np.tile(np.eye(4), (2, 1, 1))),
+        (np.array([2, 1]), np.tile(np.eye(4), (2, 1, 1))),
+        (np.array([1]), np.tile(np.eye(4), (2, 1, 1))),
+        (np.array([1]), np.full((1, 4, 4), np.nan)),
+    ],
+)
+def test_a_malformed_trajectory_is_refused(stamps_ns: IntArray, poses: FloatArray) -> None:
+    with pytest.raises(EvaluationError):
+        Trajectory(stamps_ns, poses)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(SEEDS, st.integers(0, 10), st.sampled_from([EPOCH_NS, 0, -(10**10), 2**62]))
+def test_tum_round_trip_loses_nothing(tmp_path: Path, seed: int, k: int, start_ns: int) -> None:
+    written = random_trajectory(seed, k, start_ns)
+    read = read_tum(write_tum(written, tmp_path / 'poses.tum'))
+    np.testing.assert_array_equal(read.stamps_ns, written.stamps_ns)
+    np.testing.assert_array_equal(read.positions, written.positions)
+    np.testing.assert_allclose(read.rotations, written.rotations, atol=1e-15)
+
+
+def test_tum_lines_are_what_evo_reads(tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = [0.1, -2.0, 1e-9]
+    path = write_tum(Trajectory(np.array([1_000_000_001]), pose[None]), tmp_path / 'poses.tum')
+    header, line = path.read_text().splitlines()
+    assert header.startswith('#')
+    assert line == '1.000000001 0.1 -2.0 1e-09 0.0 0.0 0.0 1.0'
+
+
+def test_tum_reads_other_programs_files(tmp_path: Path) -> None:
+    path = tmp_path / 'poses.tum'
+    path.write_text(
+        '# comment\n\n1.305031102175800085e+09 1 2 3 0 0 0 2\n1305031102.25 1 2 3 0 0 0 1'
+    )
+    trajectory = read_tum(path)
+    np.testing.assert_array_equal(
+        trajectory.stamps_ns, [1_305_031_102_175_800_085, 1_305_031_102_250_000_000]
+    )
+    np.testing.assert_array_equal(trajectory.poses[0], trajectory.poses[1])
+
+
+@pytest.mark.parametrize(
+    'line',
+    [
+        '1 2 3 0 0 0 1',
+        'x 1 2 3 0 0 0 1',
+        'nan 1 2 3 0 0 0 1',
+        'inf 1 2 3 0 0 0 1',
+        '1e30 1 2 3 0 0 0 1',
+        '1 1 2 nan 0 0 0 1',
+        '1 1 2 3 0 0 0 0',
+    ],
+)
+def test_a_malformed_tum_line_is_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / 'poses.tum'
+    path.write_text(f'0 1 2 3 0 0 0 1\n{line}\n')
+    with pytest.raises(EvaluationError, match=r'poses\.tum, line 2: '):
+        read_tum(path)
+
+
+def test_files_that_cannot_be_opened_are_named(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match='absent'):
+        read_tum(tmp_path / 'absent.tum')
+    with pytest.raises(EvaluationError, match='absent'):
+        write_tum(random_trajectory(0, 2), tmp_path / 'absent' / 'poses.tum')
+
+
+def test_writing_replaces_the_whole_file_and_leaves_no_other(tmp_path: Path) -> None:
+    path = write_tum(random_trajectory(0, 50), tmp_path / 'poses.tum')
+    write_tum(random_trajectory(1, 2), path)
+    assert len(read_tum(path)) == 2
+    assert list(tmp_path.iterdir()) == [path]
