@@ -6,10 +6,10 @@ landmarks. The command line and ``simulator_node`` draw from the same :class:`Si
 
 from __future__ import annotations
 
-import heapq
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+import heapq
+import math
 from typing import TypeAlias
 
 import numpy as np
@@ -48,62 +48,69 @@ class Scenario:
     """What is simulated; the defaults are section VI. Each field is a row of a parameter table."""
 
     velocity_rate: float = parameter(
-        50.0, "Rate of the velocity messages and of the true pose.", unit="Hz", minimum=0.1
+        50.0, 'Rate of the velocity messages and of the true pose', unit='Hz', minimum=0.1
     )
     observation_rate: float = parameter(
-        50.0, "Rate of the landmark observations.", unit="Hz", minimum=0.1
+        50.0, 'Rate of the landmark observations', unit='Hz', minimum=0.1
     )
     duration: float = parameter(
-        80.0, "Simulated time after which it ends; 0 for no end.", unit="s", minimum=0.0
+        0.0, 'Simulated time after which it ends; 0 for no end', unit='s', minimum=0.0
     )
+    laps: float = parameter(0.0, 'Laps after which it ends; 0 for no end', minimum=0.0)
     seed: int = parameter(
-        0, "Seed of everything random; the same seed gives the same run.", minimum=0
+        0, 'Seed of everything random; the same seed gives the same run', minimum=0
     )
     initial_bias: float = parameter(
         0.5,
-        "Length of the bias a_i of random direction on each landmark's first sighting.",
-        unit="m",
+        "Length of the bias a_i of random direction on each landmark's first sighting",
+        unit='m',
         minimum=0.0,
     )
     landmark_count: int = parameter(
         0,
-        "Landmarks in a random field; 0 for the four of the paper.",
+        'Landmarks in a random field; 0 for the four of the paper',
         minimum=0,
     )
     landmark_distance: float = parameter(
-        4.0, "Distance of every landmark from the circle's axis at z = 0.", unit="m", minimum=0.0
+        4.0, "Distance of every landmark from the circle's axis at z = 0", unit='m', minimum=0.0
     )
     landmark_speed: float = parameter(
-        0.0, "Speed at which each landmark runs a circle of 1 m radius.", unit="m/s", minimum=0.0
+        0.0, 'Speed at which each landmark runs a circle of 1 m radius', unit='m/s', minimum=0.0
     )
     angular_velocity_noise: float = parameter(
-        0.0, "Standard deviation of each angular velocity component.", unit="rad/s", minimum=0.0
+        0.0, 'Standard deviation of each angular velocity component', unit='rad/s', minimum=0.0
     )
     linear_velocity_noise: float = parameter(
-        0.0, "Standard deviation of each linear velocity component.", unit="m/s", minimum=0.0
+        0.0, 'Standard deviation of each linear velocity component', unit='m/s', minimum=0.0
     )
     point_noise: float = parameter(
-        0.0, "Standard deviation of each coordinate of an observed point.", unit="m", minimum=0.0
+        0.0, 'Standard deviation of each coordinate of an observed point', unit='m', minimum=0.0
     )
     field_of_view: float = parameter(
         360.0,
-        "Full angle of the cone about the body's x axis in which landmarks are seen.",
-        unit="deg",
+        "Full angle of the cone about the body's x axis in which landmarks are seen",
+        unit='deg',
         minimum=0.0,
         maximum=360.0,
     )
     max_range: float = parameter(
-        0.0, "Distance up to which landmarks are seen; 0 for any.", unit="m", minimum=0.0
+        0.0, 'Distance up to which landmarks are seen; 0 for any', unit='m', minimum=0.0
     )
     drop_fraction: float = parameter(
-        0.0, "Fraction of the messages that never arrive.", minimum=0.0, maximum=1.0
+        0.0, 'Fraction of the messages that never arrive', minimum=0.0, maximum=1.0
     )
     late_fraction: float = parameter(
-        0.0, "Fraction of the messages that arrive late.", minimum=0.0, maximum=1.0
+        0.0, 'Fraction of the messages that arrive late', minimum=0.0, maximum=1.0
     )
     max_lateness: float = parameter(
-        0.1, "Longest delay of a late message; delays are uniform below it.", unit="s", minimum=0.0
+        0.1, 'Longest delay of a late message; delays are uniform below it', unit='s', minimum=0.0
     )
+
+    @property
+    def end_s(self) -> float:
+        """Simulated time of the end, seconds; infinite if neither duration nor laps is set."""
+        ends = (self.duration, self.laps * LAP_S)
+        return min((end for end in ends if end > 0.0), default=math.inf)
 
 
 SimulatedEvent: TypeAlias = Event | PoseTruth
@@ -197,14 +204,14 @@ class Simulation:
         rng = np.random.default_rng(self._noise_seed)
         is_new = np.ones(len(self.landmark_ids), dtype=np.bool_)
         for number, (stamp_ns, kind) in enumerate(self._schedule()):
-            if kind == "truth":
+            if kind == 'truth':
                 yield Delivery(stamp_ns, number, PoseTruth(stamp_ns, self.pose(stamp_ns)))
                 continue
             if rng.random() < self.scenario.drop_fraction:
                 continue
             event: Event = (
                 self._velocity(stamp_ns, rng)
-                if kind == "velocity"
+                if kind == 'velocity'
                 else self._observation(stamp_ns, rng, is_new)
             )
             yield Delivery(stamp_ns + self._draw_delay_ns(rng), number, event)
@@ -214,13 +221,13 @@ class Simulation:
         velocity_stamps = self._stamps(self.scenario.velocity_rate)
         observation_stamps = self._stamps(self.scenario.observation_rate)
         motion = (
-            (stamp_ns, kind) for stamp_ns in velocity_stamps for kind in ("truth", "velocity")
+            (stamp_ns, kind) for stamp_ns in velocity_stamps for kind in ('truth', 'velocity')
         )
-        sightings = ((stamp_ns, "observation") for stamp_ns in observation_stamps)
+        sightings = ((stamp_ns, 'observation') for stamp_ns in observation_stamps)
         return heapq.merge(motion, sightings, key=lambda entry: entry[0])
 
     def _stamps(self, rate_hz: float) -> Iterator[int]:
-        end_ns = self.scenario.duration * NANOSECONDS if self.scenario.duration else math.inf
+        end_ns = self.scenario.end_s * NANOSECONDS
         step = 0
         while (elapsed_ns := round(step * NANOSECONDS / rate_hz)) <= end_ns:
             yield self.start_ns + elapsed_ns

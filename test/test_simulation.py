@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 import itertools
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+import pytest
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.parameters import from_parameters
-from slam_observer_ros.simulation import LAP_S, Delivery, Scenario, SimulatedEvent, Simulation
+from slam_observer_ros.simulation import Delivery, LAP_S, Scenario, SimulatedEvent, Simulation
 
 EXACT = Scenario(initial_bias=0.0, duration=1.0)
 
@@ -117,7 +117,7 @@ def test_noise_options_leave_the_landmarks_where_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    "option", ["point_noise", "linear_velocity_noise", "angular_velocity_noise"]
+    'option', ['point_noise', 'linear_velocity_noise', 'angular_velocity_noise']
 )
 def test_noise_has_the_deviation_asked_for(option: str) -> None:
     scenario = dataclasses.replace(EXACT, duration=20.0, **{option: 0.3})
@@ -206,12 +206,23 @@ def test_rates_and_start_set_the_stamps() -> None:
     assert_allclose(Simulation(scenario, start_ns).pose(start_ns), Simulation(scenario).pose(0))
 
 
-def test_duration_zero_never_ends() -> None:
-    deliveries = Simulation(Scenario(duration=0.0)).deliveries()
+@pytest.mark.parametrize(
+    ('options', 'end_s'),
+    [({'duration': 3.0}, 3.0), ({'laps': 0.1}, 0.1 * LAP_S), ({'duration': 3.0, 'laps': 2}, 3.0)],
+)
+def test_duration_or_laps_end_the_run_whichever_comes_first(
+    options: dict[str, float], end_s: float
+) -> None:
+    *_, last = Simulation(Scenario(**options)).deliveries()
+    assert last.event.stamp_ns * 1e-9 == pytest.approx(end_s, abs=0.02)
+
+
+def test_run_without_duration_or_laps_never_ends() -> None:
+    deliveries = Simulation(Scenario()).deliveries()
     *_, last = itertools.islice(deliveries, 3 * 50 * 100)
     assert last.event.stamp_ns > 99_000_000_000
 
 
 def test_option_out_of_range_is_refused() -> None:
-    with pytest.raises(ParameterError, match="field_of_view"):
-        from_parameters(Scenario, {"field_of_view": 400.0})
+    with pytest.raises(ParameterError, match='field_of_view'):
+        from_parameters(Scenario, {'field_of_view': 400.0})

@@ -1,0 +1,41 @@
+"""Start the observer alone, with a parameter file and topics of one's own robot."""
+
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
+
+
+def generate_launch_description():
+    share = FindPackageShare('slam_observer_ros')
+    default_parameters = PathJoinSubstitution([share, 'config', 'observer.yaml'])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                'params_file', default_value=default_parameters, description='parameter file'
+            ),
+            DeclareLaunchArgument(
+                'twist', default_value='twist', description='topic of the velocity'
+            ),
+            DeclareLaunchArgument(
+                'landmarks', default_value='landmarks', description='topic of the observations'
+            ),
+            DeclareLaunchArgument('use_sim_time', default_value='false'),
+            Node(
+                package='slam_observer_ros',
+                executable='observer_node',
+                name='observer_node',
+                parameters=[
+                    LaunchConfiguration('params_file'),
+                    {'use_sim_time': LaunchConfiguration('use_sim_time')},
+                ],
+                remappings=[
+                    ('twist', LaunchConfiguration('twist')),
+                    ('landmarks', LaunchConfiguration('landmarks')),
+                ],
+                output='screen',
+            ),
+        ]
+    )

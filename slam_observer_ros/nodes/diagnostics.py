@@ -1,0 +1,98 @@
+"""The observer's health as a diagnostic_msgs/DiagnosticArray."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.nodes.inputs import Input
+
+SILENT_S = 2.0
+"""An input without messages for this long is a warning."""
+
+
+class Diagnostics:
+    """Publishes what comes in, what is dropped and why, on ``/diagnostics``.
+
+    Parameters
+    ----------
+    node : Node
+        Node whose health is told.
+    estimator : Estimator
+        Source of counts and drops.
+    inputs : sequence of Input
+        Topics to watch.
+
+    """
+
+    def __init__(self, node: Node, estimator: Estimator, inputs: Sequence[Input[Any]]) -> None:
+        self._node = node
+        self._estimator = estimator
+        self._inputs = inputs
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._last_time_s = time.monotonic()
+        self._last_received = {source.topic: 0 for source in inputs}
+        self._last_dropped = 0
+
+    def publish(self) -> None:
+        """Publish one status; call it about once a second."""
+        values = self._input_values() | self._estimator_values()
+        warnings = self._warnings()
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK,
+            name=f'{self._node.get_name()}: estimate',
+            hardware_id=self._node.get_namespace(),
+            message='; '.join(warnings) or 'running',
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def _input_values(self) -> dict[str, str]:
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._last_time_s
+        self._last_time_s = now_s
+        values = {}
+        for source in self._inputs:
+            new = source.received - self._last_received[source.topic]
+            self._last_received[source.topic] = source.received
+            age = 'never' if source.age_s is None else f'{source.age_s:.3f}'
+            values[f'{source.topic} rate [Hz]'] = f'{new / elapsed_s:.1f}'
+            values[f'{source.topic} age [s]'] = age
+            values[f'{source.topic} malformed'] = str(source.malformed)
+        return values
+
+    def _estimator_values(self) -> dict[str, str]:
+        estimator = self._estimator
+        values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
+        values |= {
+            f'dropped: {reason}': str(count) for reason, count in sorted(estimator.dropped.items())
+        }
+        values['landmarks known'] = str(len(estimator.landmark_ids))
+        values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
+        return values
+
+    def _warnings(self) -> list[str]:
+        warnings = [self._input_warning(source) for source in self._inputs]
+        dropped = sum(self._estimator.dropped.values())
+        dropped += sum(source.malformed for source in self._inputs)
+        if dropped > self._last_dropped:
+            warnings.append(f'{dropped - self._last_dropped} messages dropped')
+        self._last_dropped = dropped
+        if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
+            warnings.append('no velocity in force: the pose is held')
+        return [warning for warning in warnings if warning]
+
+    @staticmethod
+    def _input_warning(source: Input[Any]) -> str:
+        if source.trouble:
+            return source.trouble
+        if source.age_s is None or source.age_s > SILENT_S:
+            return f"no message on '{source.topic}'"
+        return ''

@@ -1,0 +1,81 @@
+"""Landmarks, their ids and residuals as RViz markers."""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import Vector3
+import numpy as np
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.nodes.conversions import point_message
+from slam_observer_ros.types import FloatArray
+
+POINT_SIZE_M = 0.2
+TEXT_HEIGHT_M = 0.3
+LINE_WIDTH_M = 0.03
+
+GREEN = ColorRGBA(r=0.0, g=0.62, b=0.45, a=1.0)
+WHITE = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
+RED = ColorRGBA(r=0.84, g=0.37, b=0.0, a=1.0)
+
+MAX_LABELS = 200
+"""Landmarks that get a text; more could not be read, and each is a message of its own."""
+
+
+def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
+    """Return markers that replace all earlier ones: points, ids and the last residuals.
+
+    Parameters
+    ----------
+    header : Header
+        Map frame and stamp of the state.
+    estimator : Estimator
+        Whose map is drawn.
+
+    """
+    points = estimator.world_points
+    labels = [
+        _label(header, number, landmark_id, point)
+        for number, (landmark_id, point) in enumerate(
+            zip(estimator.landmark_ids[:MAX_LABELS].tolist(), points, strict=False)
+        )
+    ]
+    clear = Marker(header=header, action=Marker.DELETEALL)
+    return MarkerArray(
+        markers=[clear, _points(header, points), _residual_lines(header, estimator), *labels]
+    )
+
+
+def _points(header: Header, points: FloatArray) -> Marker:
+    marker = _marker(header, 'landmarks', Marker.SPHERE_LIST, GREEN, POINT_SIZE_M)
+    marker.points = [point_message(point) for point in points]
+    return marker
+
+
+def _residual_lines(header: Header, estimator: Estimator) -> Marker:
+    """Return a line from each landmark just seen to where it was seen."""
+    marker = _marker(header, 'residuals', Marker.LINE_LIST, RED, LINE_WIDTH_M)
+    update = estimator.last_update
+    if update is not None:
+        _, seen, rows = np.intersect1d(update.ids, estimator.landmark_ids, return_indices=True)
+        ends = estimator.world_points[rows]
+        lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
+        marker.points = [point_message(point) for point in lines]
+    return marker
+
+
+def _label(header: Header, number: int, landmark_id: int, point: FloatArray) -> Marker:
+    marker = _marker(header, 'ids', Marker.TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)
+    marker.id = number
+    marker.text = str(landmark_id)
+    marker.pose.position = point_message(point)
+    marker.pose.position.z += TEXT_HEIGHT_M
+    return marker
+
+
+def _marker(header: Header, namespace: str, kind: int, color: ColorRGBA, size_m: float) -> Marker:
+    marker = Marker(header=header, ns=namespace, type=kind, action=Marker.ADD, color=color)
+    marker.pose.orientation.w = 1.0
+    marker.scale = Vector3(x=size_m, y=size_m, z=size_m)
+    return marker

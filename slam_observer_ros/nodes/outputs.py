@@ -1,0 +1,147 @@
+"""What the observer publishes about its estimate."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    TwistWithCovariance,
+)
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud, PointCloud2
+from std_msgs.msg import Float64
+from visualization_msgs.msg import MarkerArray
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.nodes.conversions import (
+    header_message,
+    point_cloud2_message,
+    pose_covariance_field,
+    pose_message,
+    twist_message,
+    unknown_covariance_field,
+)
+from slam_observer_ros.nodes.markers import landmark_markers
+from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.nodes.transforms import TransformPublisher
+from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
+
+PATH_SPACING_NS = 100_000_000
+"""Least time between two poses of the path, nanoseconds."""
+
+
+class Outputs:
+    """Publishers of the estimate.
+
+    Each message carries the stamp of the estimator's state, never the present time, and no stamp
+    is published twice.
+
+    Parameters
+    ----------
+    node : Node
+        Node that publishes.
+    settings : ObserverNodeSettings
+        Frames, rates and lengths.
+    estimator : Estimator
+        Where the estimate comes from.
+
+    """
+
+    def __init__(self, node: Node, settings: ObserverNodeSettings, estimator: Estimator) -> None:
+        self._settings = settings
+        self._estimator = estimator
+        self._fast_stamp_ns: int | None = None
+        self._slow_stamp_ns: int | None = None
+        self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
+        self._path_stamp_ns: int | None = None
+        self._odometry = node.create_publisher(Odometry, 'odometry', RELIABLE_QOS)
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', RELIABLE_QOS)
+        self._lyapunov = node.create_publisher(Float64, 'lyapunov', RELIABLE_QOS)
+        self._estimates = node.create_publisher(PointCloud, 'landmark_estimates', RELIABLE_QOS)
+        self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
+        self._map = node.create_publisher(PointCloud2, 'map', LATCHED_QOS)
+        self._markers = node.create_publisher(MarkerArray, 'markers', RELIABLE_QOS)
+        self._transform: TransformPublisher | None = None
+        if settings.publish_tf:
+            self._transform = TransformPublisher(node, '/tf', RELIABLE_QOS)
+
+    def publish_state(self) -> None:
+        """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
+        stamp_ns = self._estimator.stamp_ns
+        if stamp_ns is None or stamp_ns == self._fast_stamp_ns:
+            return
+        self._fast_stamp_ns = stamp_ns
+        self._publish_pose(stamp_ns)
+        self._extend_path(stamp_ns)
+        self._lyapunov.publish(Float64(data=float(self._estimator.lyapunov)))
+        self._estimates.publish(
+            encode_point_cloud(
+                stamp_ns,
+                self._settings.map_frame,
+                self._estimator.landmark_ids,
+                self._estimator.world_points,
+            )
+        )
+
+    def publish_overview(self) -> None:
+        """Publish path, map and markers if they are new; they are costly, so seldom."""
+        stamp_ns = self._estimator.stamp_ns
+        if stamp_ns is None or stamp_ns == self._slow_stamp_ns:
+            return
+        self._slow_stamp_ns = stamp_ns
+        header = header_message(stamp_ns, self._settings.map_frame)
+        self._path_publisher.publish(Path(header=header, poses=list(self._path)))
+        self._map.publish(
+            point_cloud2_message(
+                stamp_ns,
+                self._settings.map_frame,
+                self._estimator.landmark_ids,
+                self._estimator.world_points,
+                self._estimator.landmark_covariances,
+            )
+        )
+        if self._markers.get_subscription_count() > 0:
+            self._markers.publish(landmark_markers(header, self._estimator))
+
+    def forget_path(self) -> None:
+        """Begin the path anew."""
+        self._path.clear()
+        self._path_stamp_ns = None
+
+    def _publish_pose(self, stamp_ns: int) -> None:
+        header = header_message(stamp_ns, self._settings.map_frame)
+        covariance = pose_covariance_field(self._estimator.pose_covariance)
+        pose = PoseWithCovariance(pose=pose_message(self._estimator.pose), covariance=covariance)
+        twist = TwistWithCovariance(
+            twist=twist_message(self._estimator.body_velocity),
+            covariance=unknown_covariance_field(),
+        )
+        self._pose.publish(PoseWithCovarianceStamped(header=header, pose=pose))
+        self._odometry.publish(
+            Odometry(
+                header=header,
+                child_frame_id=self._settings.base_frame,
+                pose=pose,
+                twist=twist,
+            )
+        )
+        if self._transform is not None:
+            self._transform.publish(
+                stamp_ns,
+                self._settings.map_frame,
+                self._settings.base_frame,
+                self._estimator.pose,
+            )
+
+    def _extend_path(self, stamp_ns: int) -> None:
+        last_ns = self._path_stamp_ns
+        if last_ns is not None and 0 <= stamp_ns - last_ns < PATH_SPACING_NS:
+            return
+        self._path_stamp_ns = stamp_ns
+        header = header_message(stamp_ns, self._settings.map_frame)
+        self._path.append(PoseStamped(header=header, pose=pose_message(self._estimator.pose)))

@@ -1,0 +1,81 @@
+"""Start a node, spin it and stop it cleanly; shared by all nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import signal
+from types import FrameType
+
+import rclpy
+from rclpy.exceptions import InvalidParameterValueException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from slam_observer_ros.errors import SlamObserverError
+
+STOP_LATENCY_S = 0.1
+"""Longest time that an idle node takes to notice a signal."""
+
+
+class StopSignal:
+    """Turns SIGINT and SIGTERM into a flag.
+
+    rclpy's own handlers raise KeyboardInterrupt or ExternalShutdownException wherever the program
+    happens to be, a second time even inside the clean-up. A flag interrupts nothing.
+    """
+
+    def __init__(self) -> None:
+        self.is_set = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._set)
+
+    def _set(self, _number: int, _frame: FrameType | None) -> None:
+        self.is_set = True
+
+
+def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+    """Spin a node until it shuts its context down or a signal asks it to stop.
+
+    Parameters
+    ----------
+    make_node : callable
+        Returns the node; called once ROS is initialised.
+    args : sequence of str or None
+        Command line with ROS arguments; None for the process's own.
+
+    Returns
+    -------
+    int
+        Exit code: 0 after a clean stop, 2 where the node refused to start.
+
+    """
+    stop = StopSignal()
+    rclpy.init(
+        args=list(args) if args is not None else None,
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    try:
+        return _spin(make_node, stop)
+    finally:
+        rclpy.try_shutdown()
+
+
+def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
+    try:
+        node = make_node()
+    except (SlamObserverError, InvalidParameterValueException) as error:
+        get_logger('slam_observer_ros').fatal(str(error))
+        return 2
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop.is_set and rclpy.ok():
+            executor.spin_once(timeout_sec=STOP_LATENCY_S)
+    except ExternalShutdownException:
+        node.get_logger().debug('context was shut down')
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+    return 0

@@ -1,0 +1,183 @@
+"""The paper's simulation as a ROS 2 node, with the truth beside the measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import math
+import sys
+import time
+
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from rclpy.clock import Clock as RosClock
+from rclpy.clock import ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud, PointCloud2
+
+from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.nodes.conversions import (
+    header_message,
+    point_cloud2_message,
+    pose_message,
+    time_message,
+    twist_message,
+)
+from slam_observer_ros.nodes.parameters import declare_settings, read_settings
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.runner import run
+from slam_observer_ros.nodes.settings import SimulatorNodeSettings
+from slam_observer_ros.nodes.transforms import TransformPublisher
+from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
+from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
+
+QUEUE_DEPTH = 1000
+"""Deep enough that nothing is lost while a reliable reader falls behind for a moment."""
+
+TICK_S = 0.005
+"""Wall time between two looks at what is due."""
+
+MATCH_DELAY_S = 1.0
+"""A publisher knows of its reader before the reader can receive; wait so much longer."""
+
+SIMULATED_EPOCH_NS = 1_000_000_000
+"""First stamp where /clock is simulated; zero would mean 'no time yet'."""
+
+WAIT_REPORT_PERIOD_S = 10.0
+
+
+class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
+    """Publishes a :class:`Simulation` in real time, or faster or slower with ``/clock``."""
+
+    def __init__(self) -> None:
+        super().__init__('simulator_node')
+        declare_settings(self, Scenario, SimulatorNodeSettings)
+        self._settings = read_settings(self, SimulatorNodeSettings)
+        self._scenario = read_settings(self, Scenario)
+        self._create_publishers()
+        self._steady_clock = RosClock(clock_type=ClockType.STEADY_TIME)
+        self._start_wall_s = math.inf
+        self._wait_timer = self.create_timer(TICK_S, self._wait, clock=self._steady_clock)
+
+    def _create_publishers(self) -> None:
+        twist_class = TwistStamped if self._settings.stamped else Twist
+        is_cloud2 = self._settings.landmarks_type == 'PointCloud2'
+        cloud_class = PointCloud2 if is_cloud2 else PointCloud
+        self._twist = self.create_publisher(twist_class, 'twist', QUEUE_DEPTH)
+        self._landmarks = self.create_publisher(cloud_class, 'landmarks', QUEUE_DEPTH)
+        self._true_pose = self.create_publisher(PoseStamped, 'ground_truth/pose', QUEUE_DEPTH)
+        self._true_landmarks = self.create_publisher(
+            PointCloud2, 'ground_truth/landmarks', LATCHED_QOS
+        )
+        self._publishes_clock = self._settings.real_time_factor != 1.0
+        if self._publishes_clock:
+            self._clock_publisher = self.create_publisher(Clock, '/clock', 10)
+
+    def _wait(self) -> None:
+        """Start once the subscribers are there: the biased first sighting must not be missed."""
+        needed = self._settings.wait_for_subscribers
+        lacking = [
+            publisher.topic_name
+            for publisher in (self._twist, self._landmarks)
+            if publisher.get_subscription_count() < needed
+        ]
+        if lacking:
+            self._start_wall_s = math.inf
+            self.get_logger().info(
+                f'waiting for {needed} subscriber(s) on {" and ".join(lacking)}'
+                ' (parameter wait_for_subscribers)',
+                throttle_duration_sec=WAIT_REPORT_PERIOD_S,
+            )
+            return
+        self._start_wall_s = min(
+            self._start_wall_s, time.monotonic() + MATCH_DELAY_S * (needed > 0)
+        )
+        if time.monotonic() >= self._start_wall_s:
+            self.destroy_timer(self._wait_timer)
+            self._start()
+
+    def _start(self) -> None:
+        self._start_ns = (
+            SIMULATED_EPOCH_NS if self._publishes_clock else self.get_clock().now().nanoseconds
+        )
+        self._simulation = Simulation(self._scenario, self._start_ns)
+        self._deliveries: Iterator[Delivery] = self._simulation.deliveries()
+        self._next: Delivery | None = next(self._deliveries, None)
+        self._publish_true_landmarks(self._start_ns)
+        self._publish_start()
+        self.create_timer(TICK_S, self._publish_due, clock=self._steady_clock)
+        self.get_logger().info('the robot starts')
+
+    def _publish_due(self) -> None:
+        elapsed_s = (time.monotonic() - self._start_wall_s) * self._settings.real_time_factor
+        now_ns = self._start_ns + round(elapsed_s * 1e9)
+        if self._publishes_clock:
+            self._clock_publisher.publish(Clock(clock=time_message(now_ns)))
+        while self._next is not None and self._next.arrival_ns <= now_ns:
+            self._publish(self._next.event)
+            self._next = next(self._deliveries, None)
+        if self._next is None:
+            self._finish()
+
+    def _finish(self) -> None:
+        for publisher in (self._twist, self._landmarks, self._true_pose):
+            publisher.wait_for_all_acked(Duration(seconds=1))
+        self.get_logger().info('the run is over')
+        self.context.try_shutdown()
+
+    def _publish(self, event: SimulatedEvent) -> None:
+        match event:
+            case VelocityEvent():
+                self._publish_velocity(event)
+            case ObservationEvent():
+                self._publish_observation(event)
+            case PoseTruth():
+                self._publish_true_pose(event)
+
+    def _publish_velocity(self, event: VelocityEvent) -> None:
+        twist = twist_message(event.body_velocity)
+        if not self._settings.stamped:
+            self._twist.publish(twist)
+            return
+        header = header_message(event.stamp_ns, self._settings.base_frame)
+        self._twist.publish(TwistStamped(header=header, twist=twist))
+
+    def _publish_observation(self, event: ObservationEvent) -> None:
+        contents = (event.stamp_ns, self._settings.base_frame, event.ids, event.points)
+        if self._settings.landmarks_type == 'PointCloud2':
+            self._landmarks.publish(point_cloud2_message(*contents, velocities=event.velocities))
+        else:
+            self._landmarks.publish(encode_point_cloud(*contents))
+
+    def _publish_start(self) -> None:
+        """Tell where an estimate that starts at the identity lies in the true world."""
+        self._start_transform = TransformPublisher(self, '/tf_static', LATCHED_QOS)
+        self._start_transform.publish(
+            self._start_ns,
+            self._settings.truth_frame,
+            self._settings.map_frame,
+            self._simulation.pose(self._start_ns),
+        )
+
+    def _publish_true_pose(self, truth: PoseTruth) -> None:
+        header = header_message(truth.stamp_ns, self._settings.truth_frame)
+        self._true_pose.publish(PoseStamped(header=header, pose=pose_message(truth.pose)))
+        if self._scenario.landmark_speed > 0.0:
+            self._publish_true_landmarks(truth.stamp_ns)
+
+    def _publish_true_landmarks(self, stamp_ns: int) -> None:
+        truth = self._simulation.landmark_truth(stamp_ns)
+        self._true_landmarks.publish(
+            point_cloud2_message(
+                stamp_ns, self._settings.truth_frame, truth.ids, truth.world_points
+            )
+        )
+
+
+def main() -> int:
+    """Run the simulator node until its laps are over or it is asked to stop; return exit code."""
+    return run(SimulatorNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
