@@ -213,7 +213,8 @@ def _records(
             f'data too short: {height} x {width} points need {needed} bytes, not {len(data)}'
         )
     strides = (row_step if height > 1 else needed, dtype.itemsize)
-    return np.ndarray((height, width), dtype, data, strides=strides)
+    records: Records = np.ndarray((height, width), dtype, data, strides=strides)
+    return records
 
 
 def _observation(stamp_ns: int, records: Records, is_dense: bool) -> ObservationEvent:

@@ -1,0 +1,93 @@
+"""What every data set is read into, and its way into a recording."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class DataSet:
+    """One run of one robot.
+
+    Attributes
+    ----------
+    velocity_stamps_ns : IntArray
+        (k,) nanoseconds.
+    body_velocities : FloatArray
+        (k, 6) angular then linear, rad/s and m/s, body frame.
+    observations : list of ObservationEvent
+        Landmarks seen, in the body frame, in stamp order; none is empty.
+    truth_stamps_ns : IntArray
+        (p,) nanoseconds.
+    true_poses : FloatArray
+        (p, 4, 4) body to world.
+    landmarks : LandmarkTruth
+        True positions of all landmarks.
+    left_out : Counter
+        Measurements that are no landmark observations, by reason.
+
+    """
+
+    velocity_stamps_ns: IntArray
+    body_velocities: FloatArray
+    observations: list[ObservationEvent]
+    truth_stamps_ns: IntArray
+    true_poses: FloatArray
+    landmarks: LandmarkTruth
+    left_out: Counter[str] = field(default_factory=Counter)
+
+
+def write_data_set(data_set: DataSet, out: Path | str, overwrite: bool = False) -> None:
+    """Write a data set as a recording: velocities, observations and truth in stamp order.
+
+    Parameters
+    ----------
+    data_set : DataSet
+    out : Path or str
+        The .mcap file to be made.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists or can't be written.
+
+    """
+    # At equal stamps the velocity comes first, then what is seen, then the truth.
+    velocities = [
+        VelocityEvent(stamp_ns, body_velocity)
+        for stamp_ns, body_velocity in zip(
+            data_set.velocity_stamps_ns.tolist(), data_set.body_velocities, strict=True
+        )
+    ]
+    true_poses = [
+        PoseTruth(stamp_ns, pose)
+        for stamp_ns, pose in zip(
+            data_set.truth_stamps_ns.tolist(), data_set.true_poses, strict=True
+        )
+    ]
+    items: list[VelocityEvent | ObservationEvent | PoseTruth] = [
+        *velocities,
+        *data_set.observations,
+        *true_poses,
+    ]
+    order = np.argsort([item.stamp_ns for item in items], kind='stable')
+    with RecordingWriter(out, overwrite) as writer:
+        writer.write_landmarks(items[order[0]].stamp_ns, data_set.landmarks)
+        for index in order:
+            item = items[index]
+            if isinstance(item, VelocityEvent):
+                writer.write_velocity(item)
+            elif isinstance(item, ObservationEvent):
+                writer.write_observation(item)
+            else:
+                writer.write_pose(item)

@@ -1,0 +1,156 @@
+"""Starry Night: a stereo camera and gyroscopes moved by hand above 20 LEDs, full 3D.
+
+Data set 3 of T. Barfoot's course and book *State Estimation for Robotics*, University of Toronto.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+
+from slam_observer_ros.errors import DataSetError
+from slam_observer_ros.events import LandmarkTruth, ObservationEvent
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.recording.cdr import NANOSECONDS_PER_SECOND
+from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+EPOCH_NS = 1_256_566_448 * NANOSECONDS_PER_SECOND
+"""Time zero of the recording, which states none: when its file was made, 2009-10-26."""
+
+_SHAPES = {
+    't': (1, -1),
+    'v_vk_vk_i': (3, -1),
+    'w_vk_vk_i': (3, -1),
+    'y_k_j': (4, -1, 20),
+    'r_i_vk_i': (3, -1),
+    'theta_vk_i': (3, -1),
+    'rho_i_pj_i': (3, 20),
+    'C_c_v': (3, 3),
+    'rho_v_c_v': (3, 1),
+    **dict.fromkeys(('fu', 'fv', 'cu', 'cv', 'b'), (1, 1)),
+}
+"""Shape of each variable; -1 is the number of frames."""
+
+
+def load_starry_night(file: Path | str) -> DataSet:
+    """Read ``dataset3.mat``.
+
+    Landmark ids are the indices of the LEDs; the body frame is the data set's vehicle frame.
+
+    Parameters
+    ----------
+    file : Path or str
+        The .mat file.
+
+    Raises
+    ------
+    DataSetError
+        If it is missing, isn't a .mat file, or lacks a variable.
+
+    """
+    variables = _read(Path(file))
+    stamps_ns = EPOCH_NS + np.rint(variables['t'][0] * NANOSECONDS_PER_SECOND).astype(np.int64)
+    # The file's angular velocity has its sign flipped, as the stereo points and the truth show.
+    body_velocities = np.hstack((-variables['w_vk_vk_i'].T, variables['v_vk_vk_i'].T))
+    true_poses = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+    true_poses[:, :3, :3] = so3.exp(variables['theta_vk_i'].T)
+    true_poses[:, :3, 3] = variables['r_i_vk_i'].T
+    world_points = variables['rho_i_pj_i'].T
+    return DataSet(
+        stamps_ns,
+        body_velocities,
+        _observations(stamps_ns, variables),
+        stamps_ns,
+        true_poses,
+        LandmarkTruth(np.arange(len(world_points)), world_points),
+    )
+
+
+def convert_starry_night(file: Path | str, out: Path | str, overwrite: bool = False) -> DataSet:
+    """Write ``dataset3.mat`` as a recording.
+
+    Parameters
+    ----------
+    file : Path or str
+        The .mat file.
+    out : Path or str
+        The .mcap file to be made.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    DataSetError
+        If the data set can't be read.
+    RecordingError
+        If the recording can't be written.
+
+    """
+    data_set = load_starry_night(file)
+    write_data_set(data_set, out, overwrite)
+    return data_set
+
+
+def triangulate(pixels: FloatArray, variables: dict[str, FloatArray]) -> FloatArray:
+    """Find points from where a stereo camera sees them.
+
+    Parameters
+    ----------
+    pixels : FloatArray
+        (4, ...) columns and rows in the left and the right image: u_l, v_l, u_r, v_r.
+    variables : dict
+        Intrinsics ``fu fv cu cv``, baseline ``b`` in metres, and the camera's mounting:
+        ``C_c_v`` takes vehicle axes to camera axes, ``rho_v_c_v`` is its place in the vehicle.
+
+    Returns
+    -------
+    FloatArray
+        (..., 3) points in the vehicle frame, metres.
+
+    """
+    fu, fv, cu, cv, baseline = (variables[name].item() for name in ('fu', 'fv', 'cu', 'cv', 'b'))
+    left_column, left_row, right_column, right_row = pixels
+    depth = fu * baseline / (left_column - right_column)
+    camera_points = np.stack(
+        (
+            (left_column - cu) * depth / fu,
+            ((left_row + right_row) / 2.0 - cv) * depth / fv,
+            depth,
+        ),
+        axis=-1,
+    )
+    # Row vectors: p C is Cᵀ p.
+    vehicle_points: FloatArray = camera_points @ variables['C_c_v'] + variables['rho_v_c_v'][:, 0]
+    return vehicle_points
+
+
+def _read(file: Path) -> dict[str, FloatArray]:
+    try:
+        variables: dict[str, FloatArray] = scipy.io.loadmat(file, appendmat=False)
+    except FileNotFoundError as error:
+        raise DataSetError(f'{file}: no such file; give dataset3.mat of Starry Night') from error
+    except (OSError, TypeError, ValueError, NotImplementedError) as error:
+        raise DataSetError(f'{file}: not a MATLAB file: {error}') from error
+    missing = [name for name in _SHAPES if name not in variables]
+    if missing:
+        raise DataSetError(f'{file}: not Starry Night: it lacks {" ".join(missing)}')
+    frames = variables['t'].size
+    for name, shape in _SHAPES.items():
+        expected = tuple(frames if size == -1 else size for size in shape)
+        if variables[name].shape != expected:
+            raise DataSetError(f'{file}: {name} has shape {variables[name].shape}, not {expected}')
+    return variables
+
+
+def _observations(stamps_ns: IntArray, variables: dict[str, FloatArray]) -> list[ObservationEvent]:
+    pixels = variables['y_k_j']
+    seen: BoolArray = np.asarray(pixels >= 0.0).all(axis=0)  # -1 where a landmark isn't seen.
+    observations = []
+    for frame in np.flatnonzero(seen.any(axis=1)).tolist():
+        ids = np.flatnonzero(seen[frame])
+        points = triangulate(pixels[:, frame, ids], variables)
+        observations.append(ObservationEvent(int(stamps_ns[frame]), ids, points))
+    return observations

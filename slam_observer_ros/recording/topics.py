@@ -1,0 +1,184 @@
+"""Choice of the topics that a replay needs, by message type first and by name where two fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.recording.messages import (
+    LANDMARK_DECODERS,
+    POSE_DECODERS,
+    VELOCITY_DECODERS,
+)
+from slam_observer_ros.recording.sources import Topic
+
+TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
+"""Topics with one of these between the slashes of their name hold truth, not measurements."""
+
+ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
+"""Landmarks that an observer publishes, and does not measure."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicNames:
+    """Names that the user gives; None where the topic is to be found.
+
+    Attributes
+    ----------
+    velocity, landmarks, pose_truth, landmark_truth : str or None
+        Topic names, with or without leading slash.
+
+    """
+
+    velocity: str | None = None
+    landmarks: str | None = None
+    pose_truth: str | None = None
+    landmark_truth: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SelectedTopics:
+    """The topics of a replay.
+
+    Attributes
+    ----------
+    velocity, landmarks : Topic
+        What the estimator takes in.
+    pose_truth, landmark_truth : Topic or None
+        What its estimate is compared with, where the recording has it.
+
+    """
+
+    velocity: Topic
+    landmarks: Topic
+    pose_truth: Topic | None
+    landmark_truth: Topic | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Role:
+    """What a topic is wanted for: its option, its types, and which name is preferred."""
+
+    name: str
+    option: str
+    message_types: Iterable[str]
+    is_truth: bool
+    rank: Callable[[str], int]
+
+
+def select_topics(
+    topics: Sequence[Topic], names: TopicNames, identifies: Callable[[Topic], bool]
+) -> SelectedTopics:
+    """Pick one topic for each purpose.
+
+    Parameters
+    ----------
+    topics : sequence of Topic
+        All topics of a recording.
+    names : TopicNames
+        What the user chose; any topic of a fitting type is allowed.
+    identifies : callable
+        Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
+        them, such as a lidar's, are taken only if they are chosen by name.
+
+    Raises
+    ------
+    RecordingError
+        If no topic fits, or two do; it lists them, and names the option that decides.
+
+    """
+    used = [topic for topic in topics if topic.count > 0]
+
+    def pick(role: _Role, name: str | None) -> Topic | None:
+        if name is not None:
+            return _named(topics, role, name)
+        fitting = [
+            topic
+            for topic in used
+            if topic.message_type in role.message_types
+            and _is_truth(topic.name) == role.is_truth
+            and (topic.message_type not in LANDMARK_DECODERS or identifies(topic))
+        ]
+        return _best(fitting, role)
+
+    return SelectedTopics(
+        _required(pick(_VELOCITY, names.velocity), _VELOCITY, used),
+        _required(pick(_LANDMARKS, names.landmarks), _LANDMARKS, used),
+        pick(_POSE_TRUTH, names.pose_truth),
+        pick(_LANDMARK_TRUTH, names.landmark_truth),
+    )
+
+
+def _velocity_rank(name: str) -> int:
+    """Prefer ``twist``; put commands behind measurements."""
+    if _last_part(name) == 'twist':
+        return 0
+    return 2 if 'cmd' in name or 'command' in name else 1
+
+
+def _landmark_rank(name: str) -> int:
+    """Prefer ``landmarks``; put an observer's own estimates last."""
+    if _last_part(name) == 'landmarks':
+        return 0
+    return 2 if _last_part(name) in ESTIMATE_NAMES else 1
+
+
+def _pose_rank(name: str) -> int:
+    return 0 if _last_part(name) == 'pose' else 1
+
+
+_VELOCITY = _Role('velocity', '--velocity-topic', VELOCITY_DECODERS, False, _velocity_rank)
+_LANDMARKS = _Role('landmark', '--landmarks-topic', LANDMARK_DECODERS, False, _landmark_rank)
+_POSE_TRUTH = _Role('true pose', '--pose-truth-topic', POSE_DECODERS, True, _pose_rank)
+_LANDMARK_TRUTH = _Role(
+    'true landmark', '--landmark-truth-topic', LANDMARK_DECODERS, True, _landmark_rank
+)
+
+
+def _is_truth(name: str) -> bool:
+    return not TRUTH_NAMES.isdisjoint(name.lower().split('/'))
+
+
+def _last_part(name: str) -> str:
+    return name.rpartition('/')[2]
+
+
+def _named(topics: Sequence[Topic], role: _Role, name: str) -> Topic:
+    same_name = [topic for topic in topics if topic.name.strip('/') == name.strip('/')]
+    fitting = [topic for topic in same_name if topic.message_type in role.message_types]
+    if fitting:
+        return fitting[0]
+    if same_name:
+        raise RecordingError(
+            f'{same_name[0]} can not be the {role.name} topic, which is one of '
+            f'{_join(role.message_types)}'
+        )
+    raise RecordingError(f'no topic {name}; the recording holds {_join(topics)}')
+
+
+def _best(fitting: Sequence[Topic], role: _Role) -> Topic | None:
+    if not fitting:
+        return None
+    first = min(role.rank(topic.name) for topic in fitting)
+    best = [topic for topic in fitting if role.rank(topic.name) == first]
+    if len(best) > 1:
+        raise RecordingError(
+            f'{len(best)} topics could be the {role.name} topic: {_join(best)}; '
+            f'choose one with {role.option}'
+        )
+    return best[0]
+
+
+def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topic:
+    if topic is not None:
+        return topic
+    with_ids = ' with ids' if role is _LANDMARKS else ''
+    raise RecordingError(
+        f'no {role.name} topic: none of type {_join(role.message_types)}{with_ids}; '
+        f'choose another with {role.option}; the recording holds {_join(topics)}'
+    )
+
+
+def _join(items: Iterable[object]) -> str:
+    return ', '.join(map(str, items)) or 'nothing'

@@ -1,0 +1,327 @@
+"""Writing of recordings: one MCAP file that ros2 bag, Foxglove and our own reader play."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import tempfile
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    StoragePlugin,
+    Writer,
+    WriterError,
+)
+from rosbags.typesys import get_typestore, Stores
+
+from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.recording.cdr import Buffer, NANOSECONDS_PER_SECOND
+from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout, PointCloud2Layout
+from slam_observer_ros.types import FloatArray
+
+VELOCITY_TOPIC = '/twist'
+LANDMARKS_TOPIC = '/landmarks'
+POSE_TRUTH_TOPIC = '/ground_truth/pose'
+LANDMARK_TRUTH_TOPIC = '/ground_truth/landmarks'
+ODOMETRY_TOPIC = '/odometry'
+BASE_FRAME = 'base_link'
+MAP_FRAME = 'map'
+
+_NO_LIMIT = QosTime(0, 0)
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    _NO_LIMIT,
+    _NO_LIMIT,
+    QosLiveliness.AUTOMATIC,
+    _NO_LIMIT,
+    False,
+)
+
+
+class RecordingWriter:
+    """Writes messages to a file that appears, whole, when the ``with`` block ends without error.
+
+    Parameters
+    ----------
+    path : Path or str
+        The .mcap file to be made, in an existing directory.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists, isn't named .mcap, or can't be written.
+
+    """
+
+    def __init__(self, path: Path | str, overwrite: bool = False) -> None:
+        self.path = Path(path)
+        self._overwrite = overwrite
+        self._connections: dict[tuple[str, str], Connection] = {}
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        if self.path.suffix != '.mcap':
+            raise RecordingError(f'{self.path}: recordings are written as .mcap files')
+        self._refuse_to_overwrite()
+        try:
+            # Beside its destination, so that the file can be moved there in one step.
+            self._directory = tempfile.TemporaryDirectory(dir=self.path.parent, prefix='.writing-')
+        except OSError as error:
+            raise RecordingError(f'{self.path}: {error.strerror}') from error
+        self._bag = Writer(
+            Path(self._directory.name) / self.path.stem,
+            version=Writer.VERSION_LATEST,
+            storage_plugin=StoragePlugin.MCAP,
+        )
+        self._bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._bag.open()
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.close()
+        else:
+            self.abort()
+
+    def close(self) -> None:
+        """Finish the file and put it in its place."""
+        with self._directory:
+            try:
+                self._bag.close()
+                self._refuse_to_overwrite()
+                (self._bag.path / self.path.name).replace(self.path)
+            except (WriterError, OSError) as error:
+                raise RecordingError(f'{self.path}: {error}') from error
+
+    def abort(self) -> None:
+        """Leave nothing behind."""
+        with self._directory:
+            self._bag.abort()
+
+    def write(
+        self,
+        topic: str,
+        message_type: str,
+        data: Buffer,
+        receive_stamp_ns: int,
+        latched: bool = False,
+    ) -> None:
+        """Write a serialised message.
+
+        Parameters
+        ----------
+        topic : str
+            Name with its leading slash.
+        message_type : str
+            For example ``geometry_msgs/msg/Twist``.
+        data : Buffer
+            CDR bytes, as a raw subscription gives them.
+        receive_stamp_ns : int
+            Time of reception, nanoseconds; messages play in this order.
+        latched : bool
+            Whether players shall keep the message for late subscribers.
+
+        """
+        key = (topic, message_type)
+        if key not in self._connections:
+            self._connections[key] = self._bag.add_connection(
+                topic,
+                message_type,
+                typestore=self._typestore,
+                offered_qos_profiles=[_LATCHED] if latched else [],
+            )
+        self._bag.write(self._connections[key], receive_stamp_ns, memoryview(data))
+
+    def write_velocity(
+        self,
+        event: VelocityEvent,
+        topic: str = VELOCITY_TOPIC,
+        frame_id: str = BASE_FRAME,
+        receive_stamp_ns: int | None = None,
+    ) -> None:
+        """Write a TwistStamped; it has no place for a covariance.
+
+        Parameters
+        ----------
+        event : VelocityEvent
+        topic, frame_id : str
+        receive_stamp_ns : int or None
+            Time of reception if it isn't the event's stamp.
+
+        """
+        message = self._make(
+            'geometry_msgs/msg/TwistStamped',
+            self._header(event.stamp_ns, frame_id),
+            self._twist(event.body_velocity),
+        )
+        self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
+
+    def write_observation(
+        self,
+        event: ObservationEvent,
+        topic: str = LANDMARKS_TOPIC,
+        frame_id: str = BASE_FRAME,
+        receive_stamp_ns: int | None = None,
+    ) -> None:
+        """Write a PointCloud2 with ids, and covariances and velocities if the event has them.
+
+        Parameters
+        ----------
+        event : ObservationEvent
+        topic, frame_id : str
+        receive_stamp_ns : int or None
+            Time of reception if it isn't the event's stamp.
+
+        """
+        layout = point_cloud2_layout(event.ids, event.points, event.covariances, event.velocities)
+        message = self._point_cloud2(event.stamp_ns, frame_id, layout)
+        self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
+
+    def write_pose(
+        self, truth: PoseTruth, topic: str = POSE_TRUTH_TOPIC, frame_id: str = MAP_FRAME
+    ) -> None:
+        """Write a true pose as PoseStamped."""
+        message = self._make(
+            'geometry_msgs/msg/PoseStamped',
+            self._header(truth.stamp_ns, frame_id),
+            self._pose(truth.pose),
+        )
+        self._write_message(topic, message, truth.stamp_ns)
+
+    def write_landmarks(
+        self,
+        stamp_ns: int,
+        truth: LandmarkTruth,
+        topic: str = LANDMARK_TRUTH_TOPIC,
+        frame_id: str = MAP_FRAME,
+    ) -> None:
+        """Write true landmark positions as a latched PointCloud2 with ids."""
+        layout = point_cloud2_layout(truth.ids, truth.world_points)
+        message = self._point_cloud2(stamp_ns, frame_id, layout)
+        self._write_message(topic, message, stamp_ns, latched=True)
+
+    def write_odometry(
+        self,
+        stamp_ns: int,
+        pose: FloatArray,
+        body_velocity: FloatArray,
+        pose_covariance: FloatArray | None = None,
+        topic: str = ODOMETRY_TOPIC,
+    ) -> None:
+        """Write an estimate as Odometry.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Time of validity.
+        pose : FloatArray
+            (4, 4) base frame to map.
+        body_velocity : FloatArray
+            (6,) angular then linear.
+        pose_covariance : FloatArray or None
+            (6, 6) of rotation vector and position in the axes of the map; None if unknown.
+        topic : str
+
+        """
+        unknown = np.zeros(36)
+        unknown[0] = -1.0
+        message = self._make(
+            'nav_msgs/msg/Odometry',
+            self._header(stamp_ns, MAP_FRAME),
+            BASE_FRAME,
+            self._make(
+                'geometry_msgs/msg/PoseWithCovariance',
+                self._pose(pose),
+                # ROS puts position before rotation.
+                unknown
+                if pose_covariance is None
+                else np.roll(pose_covariance, 3, (0, 1)).ravel(),
+            ),
+            self._make(
+                'geometry_msgs/msg/TwistWithCovariance', self._twist(body_velocity), unknown
+            ),
+        )
+        self._write_message(topic, message, stamp_ns)
+
+    def _write_message(
+        self,
+        topic: str,
+        message: object,
+        stamp_ns: int,
+        receive_stamp_ns: int | None = None,
+        latched: bool = False,
+    ) -> None:
+        message_type: str = message.__msgtype__  # type: ignore[attr-defined]
+        data = self._typestore.serialize_cdr(message, message_type)
+        received = stamp_ns if receive_stamp_ns is None else receive_stamp_ns
+        self.write(topic, message_type, data, received, latched)
+
+    def _refuse_to_overwrite(self) -> None:
+        if self.path.exists() and not self._overwrite:
+            raise RecordingError(f'{self.path}: exists already, and is not overwritten')
+
+    def _make(self, message_type: str, *fields: Any) -> Any:
+        return self._typestore.types[message_type](*fields)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> object:
+        stamp = self._make(
+            'builtin_interfaces/msg/Time', *divmod(stamp_ns, NANOSECONDS_PER_SECOND)
+        )
+        return self._make('std_msgs/msg/Header', stamp, frame_id)
+
+    def _twist(self, body_velocity: FloatArray) -> object:
+        components = body_velocity.tolist()
+        return self._make(
+            'geometry_msgs/msg/Twist',
+            self._make('geometry_msgs/msg/Vector3', *components[3:]),
+            self._make('geometry_msgs/msg/Vector3', *components[:3]),
+        )
+
+    def _pose(self, pose: FloatArray) -> object:
+        return self._make(
+            'geometry_msgs/msg/Pose',
+            self._make('geometry_msgs/msg/Point', *pose[:3, 3].tolist()),
+            self._make('geometry_msgs/msg/Quaternion', *so3.to_quaternion(pose[:3, :3]).tolist()),
+        )
+
+    def _point_cloud2(self, stamp_ns: int, frame_id: str, layout: PointCloud2Layout) -> object:
+        fields = [
+            self._make('sensor_msgs/msg/PointField', f.name, f.offset, f.datatype, f.count)
+            for f in layout.fields
+        ]
+        return self._make(
+            'sensor_msgs/msg/PointCloud2',
+            self._header(stamp_ns, frame_id),
+            1,
+            layout.width,
+            fields,
+            False,
+            layout.point_step,
+            layout.point_step * layout.width,
+            np.frombuffer(layout.data, np.uint8),
+            True,
+        )
