@@ -31,7 +31,7 @@ def test_recovers_a_rigid_motion(
 def test_recovers_the_motion_of_coplanar_points(
     rng: np.random.Generator, T: FloatArray, n: int
 ) -> None:
-    points = rng.normal(size=(n, 3)) * [5.0, 3.0, 0.0]
+    points = rng.normal(size=(n, 3)) * [5.0, 0.0, 3.0]
     np.testing.assert_allclose(align(points, se3.transform(T, points)), T, atol=1e-7)
 
 
@@ -54,6 +54,15 @@ def test_collinear_points_cause_no_roll(rng: np.random.Generator, R: FloatArray,
     # The rotation nearest to the identity turns by the angle between the two lines, no further.
     cosine = direction @ new_direction / (direction @ direction)
     assert np.trace(found[:3, :3]) == pytest.approx(1.0 + 2.0 * cosine, abs=1e-7)
+
+
+@given(generators(), st.floats(-3.1, 3.1))
+def test_flat_points_turn_about_the_vertical_only(rng: np.random.Generator, yaw: float) -> None:
+    points = rng.normal(size=(8, 3)) * [5.0, 3.0, 0.0]
+    T = se3.exp(np.array([0.0, 0.0, yaw, 3.0, -2.0, 0.0]))
+    np.testing.assert_allclose(align(points, se3.transform(T, points)), T, atol=1e-9)
+    mirrored = align(points, points * [1.0, -1.0, 1.0])
+    np.testing.assert_allclose(mirrored[2, :3], [0.0, 0.0, 1.0], atol=1e-12)
 
 
 def test_opposite_lines_are_aligned_by_half_a_turn() -> None:

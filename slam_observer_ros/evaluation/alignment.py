@@ -20,7 +20,8 @@ def align(source: FloatArray, target: FloatArray) -> FloatArray:
     Umeyama (1991) without scale: a proper rotation even where a reflection would fit better.
     What the points leave open stays as it is: of all best rotations the one nearest to the
     identity is returned, so collinear points cause no roll about their line, one point is
-    only shifted, and no point at all gives the identity.
+    only shifted, and no point at all gives the identity. Sets that are both flat in z turn about
+    the vertical only, as turned over they would be their own mirror images.
 
     Parameters
     ----------
@@ -67,6 +68,10 @@ def _centred(points: FloatArray) -> FloatArray:
 
 def _closest_rotation(correlation: FloatArray) -> FloatArray:
     """Maximise tr(Rᵀ C) over rotations R; among equals, take the one nearest to the identity."""
+    if not (correlation[2].any() or correlation[:, 2].any()):  # both sets are flat in z
+        rotation = np.eye(3)
+        rotation[:2, :2] = _procrustes(correlation[:2, :2], handedness=1.0)
+        return rotation
     U, sizes, Vt = np.linalg.svd(correlation)
     rank = int(np.sum(sizes > _RANK_TOLERANCE * sizes[0]))
     # R = U diag(1, Q) Vᵀ is optimal for each orthogonal Q that makes det R = 1: one sign where
