@@ -489,7 +489,7 @@ def _space_view(figure: Figure) -> Any:
     # matplotlib's three-dimensional axes carry no types, hence Any.
     axes: Any = figure.add_subplot(projection='3d', elev=32.0, azim=-58.0)
     axes.set_zlabel('z [m]')
-    axes.zaxis.set_major_locator(MaxNLocator(nbins=4))
+    axes.zaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color('white')
     return axes
