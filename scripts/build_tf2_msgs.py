@@ -13,12 +13,12 @@ import contextlib
 import importlib.metadata
 import io
 import os
+from pathlib import Path
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tempfile
-from pathlib import Path
 
 import numpy as np
 from rosidl_cli.command.generate.api import generate

@@ -22,10 +22,10 @@ echo "setting up $venv with $("$python" --version) ..."
 if [ "${ROS_DISTRO:-}" = jazzy ]; then
     "$python" -m venv --clear --system-site-packages "$venv"
     # Jazzy's messages are compiled against numpy 1.
-    "$venv/bin/python" -m pip install --quiet --editable '.[dev]' 'numpy<2'
+    "$venv/bin/python" -m pip install --quiet --editable '.[test,dev]' 'numpy<2'
 elif [ -z "${ROS_DISTRO:-}" ]; then
     "$python" -m venv --clear "$venv"
-    "$venv/bin/python" -m pip install --quiet --constraint constraints.txt --editable '.[dev,ros]'
+    "$venv/bin/python" -m pip install --quiet --constraint constraints.txt --editable '.[test,dev,ros]'
     "$venv/bin/python" scripts/build_tf2_msgs.py
 else
     echo "ROS 2 $ROS_DISTRO is sourced, Jazzy is needed: source that, or use a shell without ROS" >&2
