@@ -1,4 +1,4 @@
-"""Builds ROS messages and serialises them with rosbags, independently of the package's decoders."""
+"""Builds ROS messages and serialises them with rosbags, apart from the package's decoders."""
 
 from __future__ import annotations
 

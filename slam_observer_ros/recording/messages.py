@@ -16,7 +16,7 @@ import numpy as np
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.cdr import Buffer, CdrReader
 from slam_observer_ros.recording.point_clouds import (
     decode_point_cloud,
@@ -126,11 +126,7 @@ def pose_matrices(positions: FloatArray, quaternions: FloatArray) -> FloatArray:
         (..., 4, 4).
 
     """
-    poses = np.zeros((*positions.shape[:-1], 4, 4))
-    poses[..., :3, :3] = so3.from_quaternion(quaternions)
-    poses[..., :3, 3] = positions
-    poses[..., 3, 3] = 1.0
-    return poses
+    return se3.pose(so3.from_quaternion(quaternions), positions)
 
 
 def decode_twist(raw: Buffer, receive_stamp_ns: int) -> VelocityMessage:

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from slam_observer_ros.errors import MessageError, RecordingError
-from slam_observer_ros.events import Event, LandmarkTruth
+from slam_observer_ros.events import Event, LandmarkTruth, UNKNOWN_ID
 from slam_observer_ros.recording.messages import (
     LANDMARK_DECODERS,
     POSE_DECODERS,
@@ -117,10 +117,7 @@ class Recording:
             If no topic fits, or two do; it lists them, and names the option that decides.
 
         """
-        try:
-            return select_topics(self.topics, names or TopicNames(), self._identifies)
-        except RecordingError as error:
-            raise RecordingError(f'{self.path}: {error}') from None
+        return select_topics(self.topics, names or TopicNames(), self._identifies)
 
     def event_count(self, selected: SelectedTopics) -> int:
         """Count the messages that :meth:`events` reads, for a progress bar."""
@@ -218,6 +215,7 @@ class Recording:
             message = self._decoded(raw, _decode_observation)
             if message is not None:
                 positions |= zip(message.event.ids.tolist(), message.event.points, strict=True)
+        positions.pop(UNKNOWN_ID, None)
         if not positions:
             return None
         ids = np.array(sorted(positions), dtype=np.int64)

@@ -4,32 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-import sqlite3
-import struct
 from typing import NamedTuple, Protocol
 
-from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
-from rosbags.rosbag1 import ReaderError as Rosbag1Error
-from rosbags.rosbag2 import Reader
-from rosbags.rosbag2 import ReaderError as Rosbag2Error
-from rosbags.serde import SerdeError
+from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.recording.cdr import Buffer
 
 FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
-
-# A damaged file shows itself in many ways; rosbags passes some of them on as they are.
-_READ_ERRORS = (
-    AnyReaderError, Rosbag1Error, Rosbag2Error, SerdeError, OSError, sqlite3.Error, struct.error,
-    KeyError, TypeError, ValueError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +90,11 @@ class BagSource:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        try:
-            self._reader = AnyReader([path]) if path.suffix == '.bag' else Reader(path)
+        self._is_ros1 = path.suffix == '.bag'
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        with _damage_reported(path):
+            self._reader = rosbag1.Reader(path) if self._is_ros1 else rosbag2.Reader(path)
             self._reader.open()
-        except _READ_ERRORS as error:
-            raise RecordingError(f'{path}: {_first_line(error)}') from error
         counts: Counter[tuple[str, str]] = Counter()
         for connection in self._reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
@@ -119,11 +108,9 @@ class BagSource:
         wanted = [c for c in self._reader.connections if self._topic(c) in topics]
         if not wanted:  # rosbags would take this for all connections.
             return
-        try:
+        with _damage_reported(self._path):
             for connection, stamp_ns, data in self._reader.messages(wanted):
                 yield RawMessage(self._topic(connection), stamp_ns, self._cdr(connection, data))
-        except _READ_ERRORS as error:
-            raise RecordingError(f'{self._path}: {_first_line(error)}') from error
 
     def close(self) -> None:
         """Close the file."""
@@ -133,8 +120,8 @@ class BagSource:
         return self._topics[connection.topic, connection.msgtype]
 
     def _cdr(self, connection: Connection, data: bytes) -> Buffer:
-        if isinstance(self._reader, AnyReader):
-            return self._reader.typestore.ros1_to_cdr(data, connection.msgtype)
+        if self._is_ros1:
+            return self._typestore.ros1_to_cdr(data, connection.msgtype)
         return data
 
 
@@ -145,11 +132,6 @@ class SalvagedMcap:
     ----------
     path : Path
         The .mcap file.
-
-    Raises
-    ------
-    RecordingError
-        If it holds no whole message.
 
     """
 
@@ -163,8 +145,6 @@ class SalvagedMcap:
             counts[name, message_type] += 1
             self.start_ns = min(self.start_ns, message.log_time)
             self.end_ns = max(self.end_ns, message.log_time)
-        if not counts:
-            raise RecordingError(f'{path}: no whole message in this damaged file')
         self._topics = {key: Topic(*key, count) for key, count in counts.items()}
         self.topics = tuple(self._topics.values())
 
@@ -254,21 +234,30 @@ def _storage_files(path: Path) -> list[Path]:
 
 
 def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str]:
-    try:
-        source = SalvagedMcap(path)
-    except RecordingError:
-        raise error from None
+    source = SalvagedMcap(path)
     count = sum(topic.count for topic in source.topics)
-    return source, f'{error} Only the {count} messages before the damage are used.'
+    if count == 0:
+        raise RecordingError(f'{error}; no whole message is left') from error
+    return source, f'{error}; only the {count} messages before the damage are used'
+
+
+@contextmanager
+def _damage_reported(path: Path) -> Iterator[None]:
+    """Turn whatever the reading libraries raise into one line about the file.
+
+    Fed with damaged files they pass on AssertionError, OverflowError, MemoryError, and the errors
+    of their decompressors and of SQLite: no list of classes is complete.
+    """
+    try:
+        yield
+    except Exception as error:
+        reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
+        raise RecordingError(f'{path}: can not be read: {reason}') from error
 
 
 def _next_whole(records: Iterator[object]) -> object | None:
     """Give the next record, or None at the end or the damage."""
     try:
         return next(records, None)
-    except (McapError, *_READ_ERRORS):
+    except Exception:  # noqa: BLE001 (as above: any error means that the damage begins here)
         return None
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().split('\n')[0] or type(error).__name__

@@ -14,7 +14,7 @@ import numpy as np
 
 from slam_observer_ros.errors import DataSetError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -130,10 +130,8 @@ def _on_ground(xy: FloatArray) -> FloatArray:
 
 
 def _planar_poses(x_y_heading: FloatArray) -> FloatArray:
-    poses = np.tile(np.eye(4), (len(x_y_heading), 1, 1))
-    poses[:, :2, 3] = x_y_heading[:, :2]
-    poses[:, :3, :3] = so3.exp(x_y_heading[:, 2:] * np.array([0.0, 0.0, 1.0]))
-    return poses
+    rotations = so3.exp(x_y_heading[:, 2:] * np.array([0.0, 0.0, 1.0]))
+    return se3.pose(rotations, _on_ground(x_y_heading[:, :2]))
 
 
 def _observations(folder: Path, robot: int) -> tuple[list[ObservationEvent], Counter[str]]:

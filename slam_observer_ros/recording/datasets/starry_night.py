@@ -6,16 +6,17 @@ Data set 3 of T. Barfoot's course and book *State Estimation for Robotics*, Univ
 from __future__ import annotations
 
 from pathlib import Path
+import zlib
 
 import numpy as np
 import scipy.io
 
 from slam_observer_ros.errors import DataSetError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.cdr import NANOSECONDS_PER_SECOND
 from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.types import FloatArray, IntArray
 
 EPOCH_NS = 1_256_566_448 * NANOSECONDS_PER_SECOND
 """Time zero of the recording, which states none: when its file was made, 2009-10-26."""
@@ -55,16 +56,14 @@ def load_starry_night(file: Path | str) -> DataSet:
     stamps_ns = EPOCH_NS + np.rint(variables['t'][0] * NANOSECONDS_PER_SECOND).astype(np.int64)
     # The file's angular velocity has its sign flipped, as the stereo points and the truth show.
     body_velocities = np.hstack((-variables['w_vk_vk_i'].T, variables['v_vk_vk_i'].T))
-    true_poses = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
-    true_poses[:, :3, :3] = so3.exp(variables['theta_vk_i'].T)
-    true_poses[:, :3, 3] = variables['r_i_vk_i'].T
+    rotations = so3.exp(variables['theta_vk_i'].T)
     world_points = variables['rho_i_pj_i'].T
     return DataSet(
         stamps_ns,
         body_velocities,
         _observations(stamps_ns, variables),
         stamps_ns,
-        true_poses,
+        se3.pose(rotations, variables['r_i_vk_i'].T),
         LandmarkTruth(np.arange(len(world_points)), world_points),
     )
 
@@ -129,11 +128,12 @@ def triangulate(pixels: FloatArray, variables: dict[str, FloatArray]) -> FloatAr
 
 def _read(file: Path) -> dict[str, FloatArray]:
     try:
-        variables: dict[str, FloatArray] = scipy.io.loadmat(file, appendmat=False)
+        with file.open('rb') as stream:
+            variables: dict[str, FloatArray] = scipy.io.loadmat(stream)
     except FileNotFoundError as error:
         raise DataSetError(f'{file}: no such file; give dataset3.mat of Starry Night') from error
-    except (OSError, TypeError, ValueError, NotImplementedError) as error:
-        raise DataSetError(f'{file}: not a MATLAB file: {error}') from error
+    except (OSError, TypeError, ValueError, NotImplementedError, zlib.error) as error:
+        raise DataSetError(f'{file}: not a MATLAB file, or damaged: {error}') from error
     missing = [name for name in _SHAPES if name not in variables]
     if missing:
         raise DataSetError(f'{file}: not Starry Night: it lacks {" ".join(missing)}')
@@ -147,7 +147,7 @@ def _read(file: Path) -> dict[str, FloatArray]:
 
 def _observations(stamps_ns: IntArray, variables: dict[str, FloatArray]) -> list[ObservationEvent]:
     pixels = variables['y_k_j']
-    seen: BoolArray = np.asarray(pixels >= 0.0).all(axis=0)  # -1 where a landmark isn't seen.
+    seen = pixels.min(axis=0) >= 0.0  # -1 where a landmark isn't seen.
     observations = []
     for frame in np.flatnonzero(seen.any(axis=1)).tolist():
         ids = np.flatnonzero(seen[frame])

@@ -1,0 +1,324 @@
+"""Recordings of every format give the same events; unreadable ones a line that says what to do."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+import shutil
+
+import numpy as np
+import pytest
+import recordings
+import ros_messages as ros
+from rosbags.rosbag2 import StoragePlugin
+
+from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
+from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.topics import TopicNames
+from slam_observer_ros.recording.writer import RecordingWriter
+
+FORMATS = [
+    'mcap file',
+    'mcap directory',
+    'sqlite3 file',
+    'sqlite3 directory',
+    'ROS 1 bag',
+    'own mcap',
+]
+
+
+@pytest.fixture(scope='module')
+def paths(tmp_path_factory) -> dict[str, Path]:
+    """Path of the run in each format."""
+    return recordings.write_all_formats(tmp_path_factory.mktemp('formats'))
+
+
+def assert_same_events(actual: list[Event], expected: list[Event]) -> None:
+    assert [type(event) for event in actual] == [type(event) for event in expected]
+    for one, other in zip(actual, expected, strict=True):
+        for name, value in dataclasses.asdict(other).items():
+            np.testing.assert_array_equal(getattr(one, name), value)
+
+
+def write_big_mcap(path: Path, count: int = 30_000) -> Path:
+    """Write so many velocities, which don't compress, that they fill several chunks."""
+    random = np.random.default_rng(0)
+    with RecordingWriter(path) as writer:
+        writer.write_observation(ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3))))
+        for index in range(count):
+            writer.write_velocity(VelocityEvent(ros.STAMP_NS + index, random.normal(size=6)))
+    return path
+
+
+class TestFormats:
+    @pytest.mark.parametrize('name', FORMATS)
+    def test_every_format_gives_the_same_events(self, paths, name):
+        with open_recording(paths[name]) as recording:
+            selected = recording.find_topics()
+            assert recording.warning is None
+            assert recording.event_count(selected) == 150
+            assert recording.duration_s == pytest.approx(1.98)
+            assert_same_events(list(recording.events(selected)), recordings.events())
+            assert not recording.malformed
+
+    @pytest.mark.parametrize('name', FORMATS)
+    def test_every_format_gives_the_landmark_truth(self, paths, name):
+        with open_recording(paths[name]) as recording:
+            landmarks = recording.truth(recording.find_topics()).landmarks
+        np.testing.assert_array_equal(landmarks.ids, recordings.LANDMARKS.ids)
+        np.testing.assert_array_equal(landmarks.world_points, recordings.LANDMARKS.world_points)
+
+    def test_pose_truth(self, paths):
+        with open_recording(paths['own mcap']) as recording:
+            truth = recording.truth(recording.find_topics())
+        np.testing.assert_array_equal(truth.stamps_ns, list(recordings.stamps_ns()))
+        expected = [true_pose.pose for true_pose in recordings.true_poses()]
+        np.testing.assert_allclose(truth.poses, expected, atol=1e-12)
+
+    def test_without_pose_truth_there_are_no_poses(self, paths):
+        with open_recording(paths['mcap file']) as recording:
+            truth = recording.truth(recording.find_topics())
+        assert truth.stamps_ns.shape == (0,)
+        assert truth.poses.shape == (0, 4, 4)
+
+    def test_frames_are_those_of_the_messages(self, paths):
+        with open_recording(paths['own mcap']) as recording:
+            assert recording.frames(recording.find_topics()) == ('base_link', 'base_link')
+        with open_recording(paths['mcap file']) as recording:  # Its Twists have no frame.
+            assert recording.frames(recording.find_topics()) == ('', 'base_link')
+
+    def test_events_come_as_received_with_the_stamps_of_their_headers(self, tmp_path):
+        late = ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3)))
+        with RecordingWriter(tmp_path / 'late.mcap') as writer:
+            writer.write_observation(late, receive_stamp_ns=ros.STAMP_NS + 50)
+            writer.write_velocity(VelocityEvent(ros.STAMP_NS + 20, np.zeros(6)))
+        with open_recording(tmp_path / 'late.mcap') as recording:
+            events = list(recording.events(recording.find_topics()))
+        assert [event.stamp_ns for event in events] == [ros.STAMP_NS + 20, ros.STAMP_NS]
+
+
+class TestDamage:
+    def test_truncated_mcap_is_read_up_to_the_damage(self, tmp_path):
+        path = write_big_mcap(tmp_path / 'big.mcap')
+        with open_recording(path) as recording:
+            whole = list(recording.events(recording.find_topics()))
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+        with open_recording(path) as recording:
+            selected = recording.find_topics()
+            events = list(recording.events(selected))
+            assert f'only the {len(events)} messages before the damage' in recording.warning
+            assert recording.event_count(selected) == len(events)
+        assert len(whole) // 3 < len(events) < len(whole)
+        assert_same_events(events, whole[: len(events)])
+
+    def test_killed_recorder_leaves_a_directory_without_metadata(self, tmp_path, paths):
+        shutil.copy(write_big_mcap(tmp_path / 'big.mcap'), tmp_path / 'killed_0.mcap')
+        directory = tmp_path / 'killed'
+        directory.mkdir()
+        data = (tmp_path / 'killed_0.mcap').read_bytes()
+        (directory / 'killed_0.mcap').write_bytes(data[: len(data) // 2])
+        with open_recording(directory) as recording:
+            assert 'before the damage' in recording.warning
+        shutil.copy(paths['sqlite3 file'], tmp_path / 'whole.db3')
+        (directory / 'killed_0.mcap').unlink()
+        (tmp_path / 'whole.db3').rename(directory / 'killed_0.db3')
+        with open_recording(directory) as recording:
+            assert recording.warning is None
+
+    def test_several_files_without_metadata_can_not_be_put_together(self, tmp_path, paths):
+        for index in range(2):
+            shutil.copy(paths['mcap file'], tmp_path / f'run_{index}.mcap')
+        with pytest.raises(RecordingError, match='ros2 bag reindex'):
+            open_recording(tmp_path)
+
+    @pytest.mark.parametrize('name', ['mcap file', 'sqlite3 file', 'ROS 1 bag', 'own mcap'])
+    def test_damaged_file_is_read_or_refused_in_one_line(self, tmp_path, paths, name):
+        whole = paths[name].read_bytes()
+        random = np.random.default_rng(3)
+        for trial in range(40):
+            damaged = bytearray(whole)
+            if trial % 2:
+                del damaged[random.integers(len(whole)) :]
+            else:
+                for place in random.integers(len(whole), size=10):
+                    damaged[place] = random.integers(256)
+            path = tmp_path / f'{trial}{paths[name].suffix}'
+            path.write_bytes(damaged)
+            try:
+                with open_recording(path) as recording:
+                    list(recording.events(recording.find_topics()))
+            except RecordingError as error:
+                assert '\n' not in str(error)
+
+    def test_malformed_message_is_left_out_and_counted(self, tmp_path, caplog):
+        path = tmp_path / 'malformed.mcap'
+        with RecordingWriter(path) as writer:
+            twist = ros.serialise(ros.twist_stamped([1.0] * 6))
+            message_type = 'geometry_msgs/msg/TwistStamped'
+            for index, data in enumerate([twist[:20], twist, twist[:30]]):
+                writer.write('/twist', message_type, data, ros.STAMP_NS + index)
+            writer.write_observation(
+                ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3)))
+            )
+        with open_recording(path) as recording:
+            assert len(list(recording.events(recording.find_topics()))) == 2
+            assert recording.malformed == {'/twist': 2}
+        assert 'too short' in caplog.text
+
+
+class TestNothingToRead:
+    def test_missing_file(self, tmp_path):
+        with pytest.raises(RecordingError, match='no such file'):
+            open_recording(tmp_path / 'nothing.mcap')
+
+    def test_wrong_extension(self, tmp_path):
+        (tmp_path / 'run.csv').touch()
+        with pytest.raises(RecordingError, match=r'not a recording; give a \.mcap, \.db3, \.bag'):
+            open_recording(tmp_path / 'run.csv')
+
+    @pytest.mark.parametrize('suffix', ['.mcap', '.db3', '.bag'])
+    def test_empty_file(self, tmp_path, suffix):
+        path = tmp_path / f'empty{suffix}'
+        path.touch()
+        with pytest.raises(RecordingError, match=r'can not be read|empty'):
+            open_recording(path)
+
+    def test_directory_that_is_no_recording(self, tmp_path):
+        with pytest.raises(RecordingError, match='no rosbag2 directory'):
+            open_recording(tmp_path)
+
+    def test_recording_without_messages(self, tmp_path):
+        with RecordingWriter(tmp_path / 'empty.mcap'):
+            pass
+        with pytest.raises(RecordingError, match='the recording is empty'):
+            open_recording(tmp_path / 'empty.mcap')
+
+
+class TestTopics:
+    """What is found without asking, and what is asked."""
+
+    TWIST = ros.twist([1.0] * 6)
+    ODOMETRY = ros.odometry([1.0] * 6, np.eye(6))
+    CLOUD = ros.point_cloud(np.zeros((1, 3)), {'id': np.array([1])})
+    LIDAR = ros.point_cloud(np.zeros((2, 3)), {'intensity': np.zeros(2)})
+    POSE = ros.make(
+        'geometry_msgs/msg/PoseStamped', ros.header('map'), ros.pose([0.0] * 3, [0, 0, 0, 1.0])
+    )
+
+    def find(self, path: Path, messages: dict[str, object], **names: str):
+        with RecordingWriter(path / 'topics.mcap') as writer:
+            for topic, message in messages.items():
+                writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
+        with open_recording(path / 'topics.mcap') as recording:
+            selected = recording.find_topics(TopicNames(**names))
+        return {
+            role: topic.name if topic else None
+            for role, topic in (
+                ('velocity', selected.velocity),
+                ('landmarks', selected.landmarks),
+                ('pose_truth', selected.pose_truth),
+                ('landmark_truth', selected.landmark_truth),
+            )
+        }
+
+    def test_the_only_topics_of_their_types(self, tmp_path):
+        assert self.find(tmp_path, {'/wheels': self.TWIST, '/beacons': self.CLOUD}) == {
+            'velocity': '/wheels',
+            'landmarks': '/beacons',
+            'pose_truth': None,
+            'landmark_truth': None,
+        }
+
+    def test_recording_of_the_demo_with_the_observers_own_output(self, tmp_path):
+        found = self.find(
+            tmp_path,
+            {
+                '/odometry': self.ODOMETRY,
+                '/map': self.CLOUD,
+                '/landmark_estimates': self.CLOUD,
+                '/twist': self.TWIST,
+                '/landmarks': self.CLOUD,
+                '/pose': self.POSE,
+                '/ground_truth/pose': self.POSE,
+                '/ground_truth/odometry': self.ODOMETRY,
+                '/ground_truth/landmarks': self.CLOUD,
+            },
+        )
+        assert found == {
+            'velocity': '/twist',
+            'landmarks': '/landmarks',
+            'pose_truth': '/ground_truth/pose',
+            'landmark_truth': '/ground_truth/landmarks',
+        }
+
+    def test_measured_velocity_comes_before_commands(self, tmp_path):
+        messages = {'/cmd_vel': self.TWIST, '/odom': self.ODOMETRY, '/beacons': self.CLOUD}
+        assert self.find(tmp_path, messages)['velocity'] == '/odom'
+
+    def test_clouds_without_ids_are_taken_only_by_name(self, tmp_path):
+        messages = {'/twist': self.TWIST, '/lidar': self.LIDAR, '/beacons': self.CLOUD}
+        assert self.find(tmp_path, messages)['landmarks'] == '/beacons'
+        (tmp_path / 'topics.mcap').unlink()
+        assert self.find(tmp_path, messages, landmarks='lidar')['landmarks'] == '/lidar'
+
+    @pytest.mark.parametrize(
+        ('others', 'reason'),
+        [
+            (
+                {'/a/twist': TWIST, '/b/twist': TWIST, '/landmarks': CLOUD},
+                r'2 topics could be the velocity topic: /a/twist \(geometry_msgs/msg/Twist, '
+                r'1 messages\), /b/twist .*choose one with --velocity-topic',
+            ),
+            (
+                {'/twist': TWIST, '/a': CLOUD, '/b': CLOUD},
+                '2 topics could be the landmark topic: .*choose one with --landmarks-topic',
+            ),
+            ({'/landmarks': CLOUD}, 'no velocity topic: .*the recording holds /landmarks'),
+            ({'/twist': TWIST, '/lidar': LIDAR}, 'no landmark topic: .*with ids'),
+            (
+                {'/twist': TWIST, '/ground_truth/landmarks': CLOUD},
+                'no landmark topic: .*the recording holds',
+            ),
+        ],
+    )
+    def test_missing_or_ambiguous_topics_are_listed(self, tmp_path, others, reason):
+        with pytest.raises(RecordingError, match=reason):
+            self.find(tmp_path, others)
+
+    def test_choice_settles_what_is_ambiguous(self, tmp_path):
+        messages = {'/a/twist': self.TWIST, '/b/twist': self.TWIST, '/landmarks': self.CLOUD}
+        assert self.find(tmp_path, messages, velocity='b/twist')['velocity'] == '/b/twist'
+
+    def test_choice_that_is_not_there_or_of_another_type(self, tmp_path):
+        messages = {'/twist': self.TWIST, '/landmarks': self.CLOUD}
+        with pytest.raises(RecordingError, match='no topic /wheels; the recording holds /twist'):
+            self.find(tmp_path, messages, velocity='/wheels')
+        (tmp_path / 'topics.mcap').unlink()
+        with pytest.raises(RecordingError, match='can not be the velocity topic, which is one of'):
+            self.find(tmp_path, messages, velocity='/landmarks')
+
+
+def test_last_position_of_a_true_landmark_counts(tmp_path):
+    path = tmp_path / 'moved.mcap'
+    with RecordingWriter(path) as writer:
+        writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
+        writer.write_observation(ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3))))
+        for ids, x in (([7, 8], 1.0), ([8, -1], 2.0)):
+            truth = LandmarkTruth(np.array(ids), np.full((2, 3), x))
+            writer.write_landmarks(ros.STAMP_NS, truth)
+    with open_recording(path) as recording:
+        landmarks = recording.truth(recording.find_topics()).landmarks
+    assert landmarks.ids.tolist() == [7, 8]
+    assert landmarks.world_points[:, 0].tolist() == [1.0, 2.0]
+
+
+def test_bag_of_several_files_is_read_whole(tmp_path):
+    directory = recordings.write_rosbag2(tmp_path / 'split', StoragePlugin.MCAP)
+    metadata = directory / 'metadata.yaml'
+    shutil.copy(directory / 'split.mcap', directory / 'split_1.mcap')
+    metadata.write_text(
+        metadata.read_text().replace('  - split.mcap', '  - split.mcap\n  - split_1.mcap', 1)
+    )
+    with open_recording(directory) as recording:
+        assert len(list(recording.events(recording.find_topics()))) == 300
