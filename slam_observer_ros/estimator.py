@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.event_queue import EventQueue
-from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Motion
 from slam_observer_ros.geometry import se3, so3
@@ -122,6 +122,7 @@ class Estimator:
         """
         try:
             check_event(event)
+            event = flatten(event) if self.settings.two_d_mode else event
             jumped = self._queue.push(event)
         except InvalidEventError as error:
             self._drop(error)
@@ -144,9 +145,7 @@ class Estimator:
         rows = self._landmarks.indices_of(np.array([landmark_id]))
         if rows[0] < 0:
             return False
-        self._observer.remove_landmarks(rows)
-        self._gains.remove_landmarks(rows)
-        self._landmarks.remove(rows)
+        self._remove(rows)
         return True
 
     @property
@@ -257,10 +256,20 @@ class Estimator:
         self._advance(event.stamp_ns)
         rows = self._landmarks.indices_of(event.ids)
         self._last = self._innovate(_select(event, rows >= 0), rows[rows >= 0])
+        moved = self._landmarks.rejections >= self.settings.max_rejections
+        if moved.any():
+            self._remove(np.flatnonzero(moved))
+            self.counts['moved_landmark'] += int(np.sum(moved))
+            rows = self._landmarks.indices_of(event.ids)
         self._initialise(_select(event, rows < 0))
         self.counts['observation'] += 1
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _remove(self, rows: IntArray) -> None:
+        self._observer.remove_landmarks(rows)
+        self._gains.remove_landmarks(rows)
+        self._landmarks.remove(rows)
 
     def _begin(self, stamp_ns: int) -> None:
         self._stamp_ns = max(stamp_ns, self._stamp_ns or stamp_ns)
@@ -272,7 +281,8 @@ class Estimator:
         if end_ns < start_ns:
             return se3.inverse(self._motion(end_ns, start_ns))
         held = self._velocities.held(start_ns, end_ns)
-        return reduce(np.matmul, se3.exp(held.body_velocities * held.dt_s[:, None]), np.eye(4))
+        V = self._gains.calibrated(held.body_velocities)
+        return reduce(np.matmul, se3.exp(V * held.dt_s[:, None]), np.eye(4))
 
     def _carry_forward(self, event: ObservationEvent) -> ObservationEvent:
         """Return what would be seen at the state's stamp: Φ⁻¹ y(t − τ), Φ the motion since."""
@@ -293,7 +303,8 @@ class Estimator:
         start_ns = stamp_ns if self._state_ns is None else self._state_ns
         if stamp_ns > start_ns:
             held = self._velocities.held(start_ns, stamp_ns)
-            path = self._observer.propagate(held.body_velocities, held.dt_s)
+            V = self._gains.calibrated(held.body_velocities)
+            path = self._observer.propagate(V, held.dt_s)
             covariances = self._noise.motion(held)
             self._gains.predict(Motion(path, held.body_velocities, held.dt_s, covariances))
             self._velocities.forget_before(stamp_ns - _nanoseconds(self.settings.late_limit))
@@ -306,10 +317,11 @@ class Estimator:
         if len(rows):
             since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
             dt_s = (event.stamp_ns - since_ns) * 1e-9
-            correction, _ = self._gains.correct(Innovation(rows, e, r, covariances, dt_s))
+            correction, weights = self._gains.correct(Innovation(rows, e, r, covariances, dt_s))
             self._observer.correct(correction)
-            self._landmarks.see(rows, event.stamp_ns)
+            self._landmarks.see(rows, weights > 0.0, event.stamp_ns)
             self._innovation_ns = event.stamp_ns
+            self.counts['rejected_landmark'] += int(np.sum(weights == 0.0))
         level = lyapunov(self.settings.gain_k, r)
         return Update(event.stamp_ns, self._observer.pose, event.ids, r, level)
 

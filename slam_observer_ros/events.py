@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
+
+import numpy as np
 
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -95,3 +97,15 @@ class LandmarkTruth:
 
     ids: IntArray
     world_points: FloatArray
+
+
+def flatten(event: Event) -> Event:
+    """Return the event without what leaves the plane z = 0 or turns out of it."""
+    if isinstance(event, VelocityEvent):
+        return replace(event, body_velocity=event.body_velocity * _PLANAR_VELOCITY)
+    velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
+    return replace(event, points=event.points * _PLANAR_POINT, velocities=velocities)
+
+
+_PLANAR_VELOCITY = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
+_PLANAR_POINT = np.array([1.0, 1.0, 0.0])

@@ -13,15 +13,11 @@ Vector3 = tuple[float, float, float]
 class Settings:
     """Settings of the estimator; each field is a parameter."""
 
-    gains: str = parameter(
-        "constant",
-        "Gain design",
-        choices=("constant",),
-    )
+    gains: str = parameter('riccati', 'Gain design', choices=('constant', 'riccati'))
     gain_k: float = parameter(
         4.0,
         "Constant gains: k of the paper's (30), how fast the pose follows the residuals",
-        unit="1/(m² s)",
+        unit='1/(m² s)',
         minimum=1e-6,
         maximum=1e6,
         read_only=False,
@@ -29,98 +25,147 @@ class Settings:
     gain_l: float = parameter(
         1.0,
         "Constant gains: l of the paper's (31); a landmark's residual decays at the rate l/k",
-        unit="1/(m² s²)",
+        unit='1/(m² s²)',
         minimum=0.0,
         maximum=1e6,
         read_only=False,
     )
     step_mode: str = parameter(
-        "exponential",
+        'exponential',
         "Constant gains: discrete step; 'paper' converges to the paper's equation for small steps",
-        choices=("exponential", "paper"),
+        choices=('exponential', 'paper'),
         read_only=False,
     )
     velocity_timeout: float = parameter(
         0.5,
-        "How long a velocity is held; after that the pose is held and flagged as stale",
-        unit="s",
+        'How long a velocity is held; after that the pose is held and flagged as stale',
+        unit='s',
         minimum=1e-3,
     )
     reorder_window: float = parameter(
         0.05,
-        "How long events are held back to be put in stamp order",
-        unit="s",
+        'How long events are held back to be put in stamp order',
+        unit='s',
         minimum=0.0,
         maximum=10.0,
     )
     late_limit: float = parameter(
         2.0,
-        "How late an observation may come after the reorder window and still be carried forward",
-        unit="s",
+        'How late an observation may come after the reorder window and still be carried forward',
+        unit='s',
         minimum=0.0,
         maximum=60.0,
     )
     max_stamp_jump: float = parameter(
         10.0,
-        "A stamp further ahead of all others than this is refused until others confirm it",
-        unit="s",
+        'A stamp further ahead of all others than this is refused until others confirm it',
+        unit='s',
         minimum=0.1,
     )
     angular_velocity_noise: Vector3 = parameter(
         (0.03, 0.03, 0.03),
-        "White noise of the angular velocity x y z: standard deviation of the angle after 1 s",
-        unit="rad/√s",
+        'White noise of the angular velocity x y z: standard deviation of the angle after 1 s',
+        unit='rad/√s',
         minimum=0.0,
     )
     linear_velocity_noise: Vector3 = parameter(
         (0.02, 0.02, 0.02),
-        "White noise of the linear velocity x y z: standard deviation of the distance after 1 s",
-        unit="m/√s",
+        'White noise of the linear velocity x y z: standard deviation of the distance after 1 s',
+        unit='m/√s',
         minimum=0.0,
     )
     angular_scale_noise: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        "White noise of the angular velocity x y z in proportion to it, after 1 s",
-        unit="√s",
+        'White noise of the angular velocity x y z in proportion to it, after 1 s',
+        unit='√s',
         minimum=0.0,
     )
     linear_scale_noise: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        "White noise of the linear velocity x y z in proportion to it, after 1 s",
-        unit="√s",
+        'White noise of the linear velocity x y z in proportion to it, after 1 s',
+        unit='√s',
         minimum=0.0,
     )
     unknown_angular_motion: float = parameter(
         0.5,
-        "How much the robot may turn while no velocity is known: standard deviation after 1 s",
-        unit="rad/√s",
+        'How much the robot may turn while no velocity is known: standard deviation after 1 s',
+        unit='rad/√s',
         minimum=0.0,
     )
     unknown_linear_motion: float = parameter(
         0.5,
-        "How far the robot may go while no velocity is known: standard deviation after 1 s",
-        unit="m/√s",
+        'How far the robot may go while no velocity is known: standard deviation after 1 s',
+        unit='m/√s',
         minimum=0.0,
     )
     observation_model: str = parameter(
-        "range_bearing",
-        "Which noise figures apply to landmarks whose message has no covariance",
-        choices=("range_bearing", "cartesian", "stereo"),
+        'range_bearing',
+        'Which noise figures apply to landmarks whose message has no covariance',
+        choices=('range_bearing', 'cartesian', 'stereo'),
     )
     range_noise: float = parameter(
-        0.1, "Range and bearing: standard deviation of the range", unit="m", minimum=1e-6
+        0.1, 'Range and bearing: standard deviation of the range', unit='m', minimum=1e-6
     )
     bearing_noise: float = parameter(
-        0.03, "Range and bearing: standard deviation of each angle", unit="rad", minimum=1e-6
+        0.03, 'Range and bearing: standard deviation of each angle', unit='rad', minimum=1e-6
     )
     point_noise: float = parameter(
-        0.05, "Cartesian: standard deviation of each coordinate", unit="m", minimum=1e-6
+        0.05, 'Cartesian: standard deviation of each coordinate', unit='m', minimum=1e-6
     )
-    stereo_focal_length: float = parameter(500.0, "Stereo: focal length", unit="px", minimum=1.0)
-    stereo_baseline: float = parameter(0.2, "Stereo: baseline", unit="m", minimum=1e-3)
+    stereo_focal_length: float = parameter(500.0, 'Stereo: focal length', unit='px', minimum=1.0)
+    stereo_baseline: float = parameter(0.2, 'Stereo: baseline', unit='m', minimum=1e-3)
     pixel_noise: float = parameter(
-        1.0, "Stereo: standard deviation across the line of sight", unit="px", minimum=1e-6
+        1.0, 'Stereo: standard deviation across the line of sight', unit='px', minimum=1e-6
     )
     disparity_noise: float = parameter(
-        1.0, "Stereo: standard deviation of the disparity", unit="px", minimum=1e-6
+        1.0, 'Stereo: standard deviation of the disparity', unit='px', minimum=1e-6
+    )
+    angular_scale_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Scale error of the angular velocity x y z to be estimated: its standard deviation',
+        minimum=0.0,
+    )
+    linear_scale_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Scale error of the linear velocity x y z to be estimated: its standard deviation',
+        minimum=0.0,
+    )
+    angular_bias_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Bias of the angular velocity x y z to be estimated: its standard deviation',
+        unit='rad/s',
+        minimum=0.0,
+    )
+    linear_bias_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Bias of the linear velocity x y z to be estimated: its standard deviation',
+        unit='m/s',
+        minimum=0.0,
+    )
+    calibration_drift: float = parameter(
+        0.0,
+        'How fast estimated scales and biases drift, as a share of their standard deviation',
+        unit='1/√s',
+        minimum=0.0,
+    )
+    two_d_mode: bool = parameter(
+        False, 'Whether motion and map are planar: z, roll and pitch stay exactly zero'
+    )
+    gate_probability: float = parameter(
+        0.9999,
+        'Share of good observations that pass the outlier gate',
+        minimum=0.5,
+        maximum=1.0,
+        read_only=False,
+    )
+    huber_threshold: float = parameter(
+        1.345,
+        'Standard deviations of noise beyond which an observation loses weight; 0 for never',
+        minimum=0.0,
+        read_only=False,
+    )
+    max_rejections: int = parameter(
+        5,
+        'Rejections in a row after which a landmark is taken to have moved and starts anew',
+        minimum=1,
     )

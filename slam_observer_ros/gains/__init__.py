@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from slam_observer_ros.gains.base import GainDesign
 from slam_observer_ros.gains.constant import ConstantGains
+from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.settings import Settings
+
+DESIGNS: dict[str, Callable[[Settings], GainDesign]] = {
+    'constant': ConstantGains,
+    'riccati': RiccatiGains,
+}
+"""Every gain design by its name, the values of the parameter ``gains``."""
 
 
 def make_gains(settings: Settings) -> GainDesign:
     """Return the gain design that ``settings.gains`` names."""
-    return ConstantGains(settings)
+    return DESIGNS[settings.gains](settings)

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from slam_observer_ros.observer import Correction
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +18,8 @@ class Motion:
     ----------
     path : FloatArray
         (k + 1, 4, 4) Â before, between and after the pieces.
-    body_velocities : FloatArray
-        (k, 6) velocities (Ω, v), rad/s and m/s.
+    measured_velocities : FloatArray
+        (k, 6) velocities (Ω, v) as measured, rad/s and m/s.
     dt_s : FloatArray
         (k,) seconds that each velocity was held.
     covariances : FloatArray
@@ -28,7 +28,7 @@ class Motion:
     """
 
     path: FloatArray
-    body_velocities: FloatArray
+    measured_velocities: FloatArray
     dt_s: FloatArray
     covariances: FloatArray
 
@@ -74,8 +74,11 @@ class GainDesign(Protocol):
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
 
-    def correct(self, innovation: Innovation) -> tuple[Correction, BoolArray]:
-        """Return the correction, and which of the m observations took part (m,)."""
+    def calibrated(self, body_velocities: FloatArray) -> FloatArray:
+        """Return velocities (k, 6) with what is known of their scale and bias put right."""
+
+    def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
+        """Return the correction and the weights (m,) of the observations, 0 for a rejected one."""
 
     @property
     def pose_covariance(self) -> FloatArray | None:

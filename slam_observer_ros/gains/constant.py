@@ -20,7 +20,7 @@ from slam_observer_ros.gains.base import Innovation, Motion
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, lyapunov
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.types import FloatArray, IntArray
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
@@ -60,14 +60,18 @@ class ConstantGains:
     def remove_landmarks(self, indices: IntArray) -> None:
         """Do nothing: constant gains have no state."""
 
-    def correct(self, innovation: Innovation) -> tuple[Correction, BoolArray]:
+    def calibrated(self, body_velocities: FloatArray) -> FloatArray:
+        """Return the velocities as they are."""
+        return body_velocities
+
+    def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return the innovation; all observations take part."""
         k = np.full(len(innovation.r), self.gain_k)
         step = paper_step if self.step_mode == 'paper' else centroid_step
         D = safe_step(step, k, innovation.e, innovation.r, innovation.dt_s)
         remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
         d = -np.expm1(-self.gain_l / self.gain_k * innovation.dt_s) * remaining  # (31)
-        return Correction(D, innovation.indices, d), np.ones(len(k), dtype=bool)
+        return Correction(D, innovation.indices, d), np.ones(len(k))
 
 
 def centroid_step(k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float) -> FloatArray:

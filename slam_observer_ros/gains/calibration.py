@@ -1,0 +1,61 @@
+"""Scale and bias of the velocity as part of the state: V_true = (1 + s) ∘ V + b, by axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.gains.axes import Axes
+from slam_observer_ros.gains.base import Motion
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray
+
+
+class Calibration:
+    """Estimates of the scale s and the bias b, on the axes whose uncertainty is not zero.
+
+    Parameters
+    ----------
+    settings : Settings
+        Uncertainties at the start and drifts.
+    axes : Axes
+        Axes of the pose that are estimated at all.
+
+    Attributes
+    ----------
+    count : int
+        c, how many entries of s and b are estimated.
+    initial_variances, drift_variances : FloatArray
+        (c,) variances at the start, and by how much they grow per second.
+
+    """
+
+    def __init__(self, settings: Settings, axes: Axes) -> None:
+        scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
+        bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
+        self._scaled = axes.pose[scale[axes.pose] > 0.0]
+        self._biased = axes.pose[bias[axes.pose] > 0.0]
+        self._scale = np.ones(6)
+        self._bias = np.zeros(6)
+        self.count = len(self._scaled) + len(self._biased)
+        errors = np.append(scale[self._scaled], bias[self._biased])
+        self.initial_variances = errors**2
+        self.drift_variances = errors**2 * settings.calibration_drift**2
+
+    def apply(self, body_velocities: FloatArray) -> FloatArray:
+        """Return (k, 6) velocities (1 + s) ∘ V + b."""
+        return body_velocities * self._scale + self._bias
+
+    def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
+        """Return (p, c), how the pose error grows with the errors of s and b over a motion.
+
+        From ε' = Ad_Â (V ∘ s̃ + b̃); ``Ad`` (k, p, 6) holds the estimated rows of Ad_Â.
+        """
+        by_bias = np.einsum('kij,k->ij', Ad, motion.dt_s)
+        by_scale = np.einsum('kij,kj,k->ij', Ad, motion.measured_velocities, motion.dt_s)
+        return np.hstack([by_scale[:, self._scaled], by_bias[:, self._biased]])
+
+    def shift(self, change: FloatArray) -> None:
+        """Add ``change`` (c,) to the estimates."""
+        split = len(self._scaled)
+        self._scale[self._scaled] += change[:split]
+        self._bias[self._biased] += change[split:]

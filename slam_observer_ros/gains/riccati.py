@@ -1,0 +1,134 @@
+"""Riccati gains: the equivariant filter on SLAM_n(3), with a full covariance.
+
+The error E = X̂ X⁻¹ = (Ã, ã_i) (proof of Theorem 5.1) does not move while the robot does, so with
+Ã = exp(ε) the state of the filter is x = (ε, c, ã_1 … ã_n), c being the errors of the velocity's
+calibration. The residual is, by (33), r_i = Ã y_i° − ã_i − y_i° ≈ C_i x with
+
+    C_i = [ −[y]×  I  0 … −I … 0 ],     y = (e_i + y_i°)/2,
+
+where this midpoint makes the error of the approximation one of third order. Then
+
+    prediction   P ← P + Ad_Â Q Ad_Âᵀ in the pose block alone: O(1), however large the map
+    update       K = P Cᵀ (C P Cᵀ + R)⁻¹,   X̂ ← exp(−K r) · X̂
+
+at O(m n) for m landmarks seen plus O(m n²) to update the covariance of n known ones.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.gains.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.gains.base import Innovation, Motion
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.robust import block_diagonal, observation_weights
+from slam_observer_ros.geometry import se3, slam_group
+from slam_observer_ros.observer import Correction
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+class RiccatiGains:
+    """Gains from the full covariance of pose, velocity calibration and landmarks.
+
+    Parameters
+    ----------
+    settings : Settings
+        Noise, calibration, robustness and ``two_d_mode``.
+
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
+        self._calibration = Calibration(settings, self._axes)
+        self._p = len(self._axes.pose)
+        self._first = self._p + self._calibration.count
+        self._P = np.zeros((self._first, self._first))
+        calibration = np.arange(self._p, self._first)
+        self._P[calibration, calibration] = self._calibration.initial_variances
+
+    def change_settings(self, settings: Settings) -> None:
+        """Take over the robustness."""
+        self._settings = settings
+
+    def calibrated(self, body_velocities: FloatArray) -> FloatArray:
+        """Return velocities (k, 6) with the estimated scale and bias put right."""
+        return self._calibration.apply(body_velocities)
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """(6, 6) covariance of the pose error ε; zero on axes that are not estimated."""
+        covariance = np.zeros((6, 6))
+        covariance[np.ix_(self._axes.pose, self._axes.pose)] = self._P[: self._p, : self._p]
+        return covariance
+
+    @property
+    def landmark_covariances(self) -> FloatArray:
+        """(n, 3, 3) covariances of the landmark errors ã_i."""
+        k = self._axes.point
+        columns = self._columns(np.arange(self._count)).reshape(-1, k)
+        covariances = np.zeros((self._count, 3, 3))
+        covariances[:, :k, :k] = self._P[columns[:, :, None], columns[:, None, :]]
+        return covariances
+
+    def predict(self, motion: Motion) -> None:
+        """Add the motion's noise to the pose block, and what the calibration's error adds."""
+        P, p, c = self._P, self._p, slice(self._p, self._first)
+        Ad = se3.adjoint(motion.path[:-1])[:, self._axes.pose]
+        if self._calibration.count:
+            F = self._calibration.sensitivity(Ad, motion)
+            P[:p] += F @ P[c]
+            P[:, :p] += P[:, c] @ F.T
+            P[c, c] += np.diag(self._calibration.drift_variances * np.sum(motion.dt_s))
+        P[:p, :p] += np.sum(Ad @ motion.covariances @ Ad.swapaxes(1, 2), axis=0)
+
+    def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks (m, 3): ã_i = J ε + noise, with J = [−[y_i°]×, I]."""
+        n, k = len(self._P), self._axes.point
+        J = self._axes.output_matrix(y_ref).reshape(-1, self._p)
+        P = np.empty((n + len(J), n + len(J)))
+        P[:n, :n] = self._P
+        P[n:, :n] = J @ self._P[: self._p]
+        P[:n, n:] = P[n:, :n].T
+        P[n:, n:] = P[n:, : self._p] @ J.T + block_diagonal(covariances[:, :k, :k])
+        self._P = P
+
+    def remove_landmarks(self, indices: IntArray) -> None:
+        """Delete the rows and columns of the landmarks at ``indices``."""
+        columns = self._columns(indices)
+        self._P = np.delete(np.delete(self._P, columns, axis=0), columns, axis=1)
+
+    def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
+        """Return exp(−K r) and the weight that each observation was given."""
+        k, P, columns = self._axes.point, self._P, self._columns(innovation.indices)
+        lever_arms = innovation.e - innovation.r
+        C = self._axes.output_matrix(lever_arms).reshape(-1, self._p)
+        PC = P[:, : self._p] @ C.T - P[:, columns]  # P Cᵀ
+        CPC = C @ PC[: self._p] - PC[columns]  # C P Cᵀ
+        r = innovation.r[:, :k]
+        noise = innovation.covariances[:, :k, :k]
+        weights = observation_weights(r, CPC, noise, self._settings)
+        used = np.repeat(weights > 0.0, k)
+        R = block_diagonal(noise[weights > 0.0] / weights[weights > 0.0, None, None])
+        S, PC = CPC[np.ix_(used, used)] + R, PC[:, used]
+        K = np.linalg.solve(S, PC.T).T
+        half = K @ (0.5 * S @ K.T - PC.T)
+        P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
+        return self._as_correction(-K @ r.ravel()[used]), weights
+
+    @property
+    def _count(self) -> int:
+        return (len(self._P) - self._first) // self._axes.point
+
+    def _columns(self, indices: IntArray) -> IntArray:
+        """Return the columns of P that belong to landmarks (m,), as (m · point,)."""
+        k = self._axes.point
+        return (self._first + k * indices[:, None] + np.arange(k)).ravel()
+
+    def _as_correction(self, x: FloatArray) -> Correction:
+        """Return the group element exp(x); the calibration moves by its own part of x."""
+        self._calibration.shift(x[self._p : self._first])
+        Delta = self._axes.full_pose(x[: self._p])
+        X = slam_group.exp(Delta, self._axes.full_points(x[self._first :]))
+        return Correction(X.A, slice(None), X.a)

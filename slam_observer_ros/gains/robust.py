@@ -1,0 +1,76 @@
+"""How far an observation is trusted: a Mahalanobis gate, then Huber's weight on what passes."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray
+
+REWEIGHTINGS = 3
+"""Rounds of reweighted least squares; the weights hardly change after the second."""
+
+
+def observation_weights(
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
+) -> FloatArray:
+    """Return the weight (m,) of each observation, zero where the gate rejects it.
+
+    Parameters
+    ----------
+    r : FloatArray
+        (m, k) residuals, metres.
+    predicted : FloatArray
+        (m k, m k) covariance C P Cᵀ of the predicted residuals, m².
+    noise : FloatArray
+        (m, k, k) covariances of the observations, m².
+    settings : Settings
+        ``gate_probability`` and ``huber_threshold``.
+
+    """
+    m, k = r.shape
+    i = np.arange(m)
+    blocks = predicted.reshape(m, k, m, k)[i, :, i] + noise
+    passed = mahalanobis_squared(r, blocks) <= chi2.ppf(settings.gate_probability, k)
+    weights = passed.astype(np.float64)
+    if passed.any() and settings.huber_threshold > 0.0:
+        used = np.repeat(passed, k)
+        weights[passed] = _huber_weights(
+            r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
+        )
+    return weights
+
+
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """Return the block-diagonal matrix (m k, m k) of blocks (m, k, k)."""
+    m, k = blocks.shape[:2]
+    matrix = np.zeros((m, k, m, k))
+    matrix[np.arange(m), :, np.arange(m)] = blocks
+    return matrix.reshape(m * k, m * k)
+
+
+def _huber_weights(
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, threshold: float
+) -> FloatArray:
+    """Return Huber's weights (m,) of what is left of the residuals after the correction.
+
+    The residual left, R S⁻¹ r, is judged by the sensor's noise R, as in an M-estimator, and not
+    by S: where the state is uncertain a large residual says nothing against the observation.
+    """
+    weights = np.ones(len(r))
+    for _ in range(REWEIGHTINGS):
+        R = block_diagonal(noise / weights[:, None, None])
+        left = (R @ np.linalg.solve(predicted + R, r.ravel())).reshape(r.shape)
+        distance = np.sqrt(mahalanobis_squared(left, noise))
+        weights = threshold / np.maximum(distance, threshold)
+        if weights.min() == 1.0:
+            break
+    return weights
+
+
+def mahalanobis_squared(r: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return r_iᵀ Σ_i⁻¹ r_i (m,) of residuals (m, k) with covariances (m, k, k)."""
+    whitened: FloatArray = np.linalg.solve(covariances, r[:, :, None])
+    squared: FloatArray = (r[:, None, :] @ whitened)[:, 0, 0]
+    return squared
