@@ -1,7 +1,108 @@
-"""Settings for all tests."""
+"""What all tests share: recordings, a ROS domain of their own, and a check for leftovers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import shutil
+import signal
+import socket
+import tempfile
 
 from hypothesis import settings
+import pytest
 
-# No deadline: no test may depend on how busy the machine is.
-settings.register_profile('suite', deadline=None, max_examples=25)
+CHECKOUT = Path(__file__).resolve().parent.parent
+SHARED_MEMORY = Path('/dev/shm')
+SESSION_VARIABLE = 'SLAM_OBSERVER_TEST_SESSION'
+# The ports of higher domain ids overlap those that Linux hands out to clients.
+DOMAIN_IDS = range(1, 102)
+SCRATCH = Path(tempfile.mkdtemp(prefix='slam_observer_test_'))
+
+# Set at import, so that child processes and fixtures of any scope see them.
+os.environ[SESSION_VARIABLE] = str(os.getpid())
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+os.environ['ROS_LOG_DIR'] = str(SCRATCH)
+os.environ['HYPOTHESIS_STORAGE_DIRECTORY'] = str(SCRATCH)
+os.environ['MPLBACKEND'] = 'Agg'
+
+# The same examples everywhere, so that a failure can be repeated by whoever reads of it; and no
+# deadline: no test may depend on how busy the machine is.
+settings.register_profile('suite', derandomize=True, deadline=None, max_examples=25)
 settings.load_profile('suite')
+
+
+@pytest.fixture(scope='session')
+def data_directory() -> Path:
+    """Folder of the public recordings; tests that need it are skipped where there is none."""
+    path = Path(os.environ.get('SLAM_OBSERVER_DATA', CHECKOUT.parent / 'shared' / 'data'))
+    if not path.is_dir():
+        pytest.skip(f'no recordings in {path}: SLAM_OBSERVER_DATA names their folder')
+    return path
+
+
+@pytest.fixture(scope='module', autouse=True)
+def ros_domain_id() -> Iterator[int]:
+    """Give each test module a ROS_DOMAIN_ID that no other test on this machine uses."""
+    with socket.socket(socket.AF_UNIX) as reservation, pytest.MonkeyPatch.context() as patch:
+        domain_id = next(i for i in DOMAIN_IDS if reserve(reservation, i))
+        patch.setenv('ROS_DOMAIN_ID', str(domain_id))
+        yield domain_id
+
+
+def reserve(reservation: socket.socket, domain_id: int) -> bool:
+    """Bind an abstract socket, which the kernel frees even if this process is killed."""
+    try:
+        reservation.bind(f'\0slam_observer_ros_domain_{domain_id}')
+    except OSError:
+        return False
+    return True
+
+
+@pytest.fixture(scope='session', autouse=True)
+def nothing_is_left_behind() -> Iterator[None]:
+    """Fail when a process or a shared memory file outlives the tests, and remove it."""
+    shared_before = shared_memory_files()
+    yield
+    processes = processes_of_these_tests()
+    for process_id in processes:
+        os.kill(process_id, signal.SIGKILL)
+    files = shared_memory_files() - shared_before - mapped_files()
+    for file in files:
+        file.unlink(missing_ok=True)
+    shutil.rmtree(SCRATCH)
+    assert not processes, f'processes left running: {list(processes.values())}'
+    assert not files, f'files left in shared memory: {files}'
+
+
+def processes_of_these_tests() -> dict[int, str]:
+    """Command lines of all processes that the tests started, orphans too, by process id."""
+    mark = f'{SESSION_VARIABLE}={os.getpid()}\0'.encode()
+    found = {}
+    for folder in Path('/proc').glob('[0-9]*'):
+        try:
+            if mark in (folder / 'environ').read_bytes() and int(folder.name) != os.getpid():
+                command = (folder / 'cmdline').read_bytes()
+                found[int(folder.name)] = command.replace(b'\0', b' ').decode()
+        except (ProcessLookupError, FileNotFoundError, PermissionError):
+            continue  # it has ended meanwhile, or is another user's
+    return found
+
+
+def shared_memory_files() -> set[Path]:
+    """Files that Fast DDS keeps in shared memory."""
+    return set(SHARED_MEMORY.glob('*fastrtps_*'))
+
+
+def mapped_files() -> set[Path]:
+    """Shared memory files that a living process, ours or not, still uses."""
+    used = set()
+    for maps in Path('/proc').glob('[0-9]*/maps'):
+        try:
+            lines = maps.read_text().splitlines()
+        except (ProcessLookupError, FileNotFoundError, PermissionError):
+            continue  # it has ended meanwhile, or is another user's
+        used |= {Path(line.split()[-1]) for line in lines if str(SHARED_MEMORY) in line}
+    return used
