@@ -21,6 +21,7 @@ DELICATE_ANGLES = (
     1e-8,
     1e-4,
     1e-2,
+    1.0,
     np.sqrt(0.1) - 1e-9,
     np.sqrt(0.1) + 1e-9,
     np.pi / 2,
