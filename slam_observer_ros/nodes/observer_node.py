@@ -38,7 +38,8 @@ class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         forward_logging(self.get_logger())
         declare_settings(self, Settings, ObserverNodeSettings)
         settings = read_settings(self, ObserverNodeSettings)
-        self._estimator = Estimator(read_settings(self, Settings))
+        estimator_settings = read_settings(self, Settings)
+        self._estimator = Estimator(estimator_settings)
         self._outputs = Outputs(self, settings, self._estimator)
         self._twist = Input(self, 'twist', settings.velocity_type, VELOCITY_DECODERS, self._add)
         self._landmarks = Input(
@@ -49,6 +50,10 @@ class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._create_timers(settings.publish_rate)
         self.create_service(Trigger, '~/reset', self._reset)
         self.add_post_set_parameters_callback(self._apply_parameters)
+        self.get_logger().info(
+            f"estimating '{settings.base_frame}' in '{settings.map_frame}' with "
+            f'{estimator_settings.gains} gains'
+        )
 
     def _create_timers(self, publish_rate_hz: float) -> None:
         # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
@@ -69,6 +74,7 @@ class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._estimator.change_settings(read_settings(self, Settings))
 
     def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._estimator.flush()  # what has come before the reset belongs to the old run
         self._estimator.reset()
         self._outputs.forget_path()
         response.success = True

@@ -14,6 +14,8 @@ try:
 except ImportError:  # No wheel of it exists; scripts/build_tf2_msgs.py builds it.
     TFMessage = None
 
+__all__ = ['TFMessage', 'TransformPublisher']
+
 
 class TransformPublisher:
     """Publishes single transforms; without tf2_msgs it says so once and does nothing.

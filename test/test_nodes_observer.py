@@ -1,0 +1,400 @@
+"""``observer_node`` over real DDS: what comes in, what goes out, and that a replay agrees."""
+
+from __future__ import annotations
+
+import re
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry, Path
+from node_processes import client, NodeProcess, running
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import PointCloud, PointCloud2
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.nodes.conversions import (
+    header_message,
+    point_cloud2_message,
+    pose_message,
+    time_message,
+    twist_message,
+)
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
+from slam_observer_ros.recording.point_clouds import decode_point_cloud2
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.simulation import Scenario, Simulation
+
+pytestmark = pytest.mark.ros
+
+RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=1.0)
+
+
+@pytest.fixture(scope='module')
+def ros(ros_domain_id):
+    with client() as opened:
+        yield opened
+
+
+@pytest.fixture(scope='module')
+def shared_observer(ros, tmp_path_factory):
+    log = tmp_path_factory.mktemp('observer') / 'log'
+    with running('observer_node', log, max_stamp_jump=1000.0) as node:
+        yield node
+
+
+@pytest.fixture
+def observer(ros, shared_observer):
+    """Give a node that has forgotten what the test before told it."""
+    ros.call(Trigger, '/observer_node/reset', Trigger.Request())
+    return shared_observer
+
+
+class Robot:
+    """Publishes events as a robot's sensors would."""
+
+    def __init__(self, ros, twist_class=TwistStamped, cloud_class=PointCloud2, namespace=''):
+        self.ros = ros
+        self.twist_class = twist_class
+        self.cloud_class = cloud_class
+        self.twist = ros.node.create_publisher(twist_class, f'{namespace}/twist', 1000)
+        self.landmarks = ros.node.create_publisher(cloud_class, f'{namespace}/landmarks', 1000)
+
+    def __enter__(self):
+        self.ros.wait_for_subscriber(self.twist, self.landmarks)
+        return self
+
+    def __exit__(self, *_error):
+        self.ros.node.destroy_publisher(self.twist)
+        self.ros.node.destroy_publisher(self.landmarks)
+
+    def send(self, event):
+        if isinstance(event, VelocityEvent):
+            self.twist.publish(self._velocity(event))
+        elif isinstance(event, ObservationEvent):
+            self.landmarks.publish(self._observation(event))
+
+    def run(self, scenario):
+        """Publish a simulated run in real time; return its events in order of arrival."""
+        start_ns, start_s = time.time_ns(), time.monotonic()
+        deliveries = list(Simulation(scenario, start_ns).deliveries())
+        for delivery in deliveries:
+            due_s = start_s + (delivery.arrival_ns - start_ns) * 1e-9
+            self.ros.spin_for(due_s - time.monotonic())
+            self.send(delivery.event)
+        return [
+            delivery.event
+            for delivery in deliveries
+            if isinstance(delivery.event, VelocityEvent | ObservationEvent)
+        ]
+
+    def _velocity(self, event):
+        twist = twist_message(event.body_velocity)
+        header = header_message(event.stamp_ns, 'base_link')
+        if self.twist_class is Twist:
+            return twist
+        if self.twist_class is TwistStamped:
+            return TwistStamped(header=header, twist=twist)
+        message = Odometry(header=header, child_frame_id='base_link')
+        message.twist.twist = twist
+        return message
+
+    def _observation(self, event):
+        contents = (event.stamp_ns, 'base_link', event.ids, event.points)
+        if self.cloud_class is PointCloud:
+            return encode_point_cloud(*contents)
+        return point_cloud2_message(*contents, velocities=event.velocities)
+
+
+def stamp_ns(message):
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+
+
+def as_received(event):
+    """Return the event after the trip through a message: points are float32 there."""
+    if isinstance(event, VelocityEvent):
+        return event
+    raw = serialize_message(
+        point_cloud2_message(event.stamp_ns, 'base_link', event.ids, event.points)
+    )
+    return decode_point_cloud2(raw).event
+
+
+def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
+    scenario = Scenario(
+        duration=4.0,
+        velocity_rate=50.0,
+        observation_rate=25.0,
+        field_of_view=200.0,
+        landmark_count=12,
+        point_noise=0.05,
+        angular_velocity_noise=0.05,
+        linear_velocity_noise=0.1,
+        late_fraction=0.3,
+        max_lateness=0.1,
+    )
+    odometry = ros.collect(Odometry, '/replayed/odometry')
+    maps = ros.collect(PointCloud2, '/replayed/map', LATCHED_QOS)
+    parameters = {'reorder_window': 0.3, 'publish_rate': 200.0}
+    arguments = ('-r', '__ns:=/replayed')
+    with (
+        running('observer_node', tmp_path / 'log', *arguments, **parameters),
+        Robot(ros, namespace='/replayed') as robot,
+    ):
+        events = robot.run(scenario)
+        last_ns = max(event.stamp_ns for event in events) - 300_000_000
+        ros.spin_until(lambda: maps and stamp_ns(maps[-1]) >= last_ns, 'the last map')
+
+    # In order and without a window, the replay shows the state at every stamp.
+    replay = Estimator(Settings(reorder_window=0.0))
+    poses, known = {}, {}
+    for event in sorted(map(as_received, events), key=_order):
+        assert replay.add(event)
+        poses[event.stamp_ns] = pose_message(replay.pose)
+        known[event.stamp_ns] = (replay.landmark_ids, replay.world_points.astype(np.float32))
+    assert len(odometry) > 100
+    for message in odometry:
+        assert message.pose.pose == poses[stamp_ns(message)]
+    for message in maps:
+        published = decode_point_cloud2(serialize_message(message)).event
+        ids, points = known[published.stamp_ns]
+        assert_array_equal(published.ids, ids)
+        assert_array_equal(published.points, points)
+
+
+def _order(event):
+    return event.stamp_ns, isinstance(event, ObservationEvent)
+
+
+@pytest.mark.parametrize(
+    ('twist_class', 'cloud_class'),
+    [(Twist, PointCloud), (TwistStamped, PointCloud2), (Odometry, PointCloud2)],
+)
+def test_each_input_type_is_found_on_its_topic(ros, observer, twist_class, cloud_class):
+    poses = ros.collect(PoseWithCovarianceStamped, 'pose')
+    estimates = ros.collect(PointCloud, 'landmark_estimates')
+    with Robot(ros, twist_class, cloud_class) as robot:
+        robot.run(RUN)
+        ros.spin_until(lambda: estimates and len(estimates[-1].points) == 4, 'four landmarks')
+    received = re.findall(r"receiving \w+/msg/(\w+) on '/(?:twist|landmarks)'", observer.output)
+    assert {twist_class.__name__, cloud_class.__name__} <= set(received)
+    travelled = poses[-1].pose.pose.position.x - poses[0].pose.pose.position.x
+    # An unstamped Twist is only as exact as its time of reception.
+    assert travelled == pytest.approx(1.0, abs=0.3)
+
+
+def test_incompatible_type_is_reported(ros, observer):
+    publisher = ros.node.create_publisher(Float64, 'twist', 1)
+    observer.wait_for_output(r"'/twist' carries std_msgs/msg/Float64; .*Twist.* is needed")
+    ros.node.destroy_publisher(publisher)
+
+
+OUTPUTS = {
+    '/odometry': ('nav_msgs/msg/Odometry', False),
+    '/pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', False),
+    '/path': ('nav_msgs/msg/Path', False),
+    '/map': ('sensor_msgs/msg/PointCloud2', True),
+    '/landmark_estimates': ('sensor_msgs/msg/PointCloud', False),
+    '/markers': ('visualization_msgs/msg/MarkerArray', False),
+    '/lyapunov': ('std_msgs/msg/Float64', False),
+    '/diagnostics': ('diagnostic_msgs/msg/DiagnosticArray', False),
+}
+
+
+def test_each_output_has_its_type_and_quality_of_service(ros, observer):
+    ros.wait_for_publisher(*OUTPUTS)
+    for topic, (type_name, is_latched) in OUTPUTS.items():
+        (info,) = ros.node.get_publishers_info_by_topic(topic)
+        assert info.topic_type == type_name
+        assert info.qos_profile.reliability is ReliabilityPolicy.RELIABLE
+        latched = info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL
+        assert latched == is_latched, topic
+
+
+def test_outputs_carry_frames_true_stamps_and_marked_covariances(ros, tmp_path):
+    odometry = ros.collect(Odometry, '/fresh/odometry')
+    poses = ros.collect(PoseWithCovarianceStamped, '/fresh/pose')
+    lyapunov = ros.collect(Float64, '/fresh/lyapunov')
+    paths = ros.collect(Path, '/fresh/path')
+    markers = ros.collect(MarkerArray, '/fresh/markers')
+    frames = {'map_frame': 'earth', 'base_frame': 'robot'}
+    arguments = ('-r', '__ns:=/fresh')
+    with (
+        running('observer_node', tmp_path / 'log', *arguments, **frames),
+        Robot(ros, namespace='/fresh') as robot,
+    ):
+        topics = ('odometry', 'pose', 'lyapunov', 'path', 'markers')
+        ros.wait_for_publisher(*(f'/fresh/{topic}' for topic in topics))
+        assert not odometry + poses + paths + lyapunov + markers, 'published before any input'
+        events = robot.run(RUN)
+        ros.spin_for(1.0)
+
+    assert len(odometry) > 10
+    assert {m.header.frame_id for m in odometry + poses + paths} == {'earth'}
+    assert {m.child_frame_id for m in odometry} == {'robot'}
+    for messages in (odometry, poses, paths):
+        stamps = [stamp_ns(message) for message in messages]
+        assert stamps == sorted(set(stamps)), 'a stamp came twice or out of order'
+        assert set(stamps) <= {event.stamp_ns for event in events}
+    assert odometry[-1].twist.twist.linear.x == 1.0
+    assert odometry[-1].twist.twist.angular.z == 0.2
+    for field in (odometry[-1].pose.covariance, odometry[-1].twist.covariance):
+        assert field[0] == -1.0 or field[0] > 0.0
+    assert lyapunov[-1].data > 0.0
+    path = paths[-1].poses
+    assert 5 < len(path) <= 11
+    assert [m.header.stamp for m in path] != [path[0].header.stamp] * len(path)
+    by_namespace = {marker.ns: marker for marker in markers[-1].markers}
+    assert len(by_namespace['landmarks'].points) == 4
+    assert len(by_namespace['residuals'].points) == 8
+    assert {m.text for m in markers[-1].markers if m.type == Marker.TEXT_VIEW_FACING} == set(
+        '0123'
+    )
+
+
+def test_transform_is_the_pose(ros, observer):
+    messages = pytest.importorskip('tf2_msgs.msg')
+    transforms = ros.collect(messages.TFMessage, '/tf')
+    poses = ros.collect(PoseWithCovarianceStamped, 'pose')
+    with Robot(ros) as robot:
+        ros.wait_for_publisher('/tf', 'pose')
+        robot.run(RUN)
+        ros.spin_for(0.5)
+    published = {stamp_ns(m): m.pose.pose for m in poses}
+    assert len(transforms) > 10
+    for message in transforms:
+        (transform,) = message.transforms
+        assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'base_link')
+        pose = published[stamp_ns(transform)]
+        assert transform.transform.rotation == pose.orientation
+        assert transform.transform.translation.x == pose.position.x
+
+
+def test_transform_can_be_switched_off_and_a_type_be_given(ros, tmp_path):
+    parameters = {'publish_tf': False, 'landmarks_type': 'PointCloud'}
+    arguments = ('-r', '__ns:=/quiet')
+    with running('observer_node', tmp_path / 'log', *arguments, **parameters) as quiet:
+        ros.wait_for_publisher('/quiet/odometry')
+        quiet.wait_for_output("receiving sensor_msgs/msg/PointCloud on '/quiet/landmarks'")
+        senders = ros.node.get_publishers_info_by_topic('/tf')
+        assert '/quiet' not in {sender.node_namespace for sender in senders}
+
+
+def test_late_subscriber_gets_the_latched_map(ros, observer):
+    with Robot(ros) as robot:
+        robot.run(RUN)
+        ros.spin_for(0.6)
+        maps = ros.collect(PointCloud2, 'map', LATCHED_QOS)
+        ros.spin_until(lambda: maps, 'the latched map')
+    assert sorted(decode_point_cloud2(serialize_message(maps[-1])).event.ids) == [0, 1, 2, 3]
+
+
+def test_malformed_and_impossible_messages_are_counted_and_do_no_harm(ros, observer):
+    poses = ros.collect(PoseWithCovarianceStamped, 'pose')
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    ros.spin_until(lambda: diagnostics, 'diagnostics')
+    malformed, dropped = _malformed(diagnostics[-1]), _dropped(diagnostics[-1])
+    with Robot(ros) as robot:
+        robot.run(RUN)
+        no_fields = PointCloud2(header=header_message(time.time_ns(), 'base_link'), width=1)
+        no_fields.height = 1
+        robot.landmarks.publish(no_fields)
+        robot.send(VelocityEvent(time.time_ns(), np.full(6, np.nan)))
+        robot.run(RUN)
+        ros.spin_until(lambda: _malformed(diagnostics[-1]) == malformed + 1, 'the count')
+    assert _dropped(diagnostics[-1]) == dropped + 1
+    assert all(np.isfinite(m.pose.pose.position.x) for m in poses)
+
+
+def _malformed(diagnostics):
+    return _sum(diagnostics, ' malformed')
+
+
+def _dropped(diagnostics):
+    return _sum(diagnostics, 'dropped: ')
+
+
+def _sum(diagnostics, key):
+    return sum(int(v.value) for v in diagnostics.status[0].values if key in v.key)
+
+
+def test_diagnostics_warn_when_nothing_comes_in(ros, observer):
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    ros.spin_until(
+        lambda: (
+            diagnostics and "nothing publishes on '/twist'" in diagnostics[-1].status[0].message
+        ),
+        'the warning',
+    )
+    assert diagnostics[-1].status[0].level == DiagnosticStatus.WARN
+
+
+def _set(ros, name, **value):
+    kind = {'double_value': ParameterType.PARAMETER_DOUBLE}.get(
+        next(iter(value)), ParameterType.PARAMETER_STRING
+    )
+    parameter = Parameter(name=name, value=ParameterValue(type=kind, **value))
+    request = SetParameters.Request(parameters=[parameter])
+    (result,) = ros.call(SetParameters, '/observer_node/set_parameters', request).results
+    return result
+
+
+def test_parameters_can_be_set_within_their_range_only(ros, observer):
+    assert _set(ros, 'gain_k', double_value=2.5).successful
+    refused = _set(ros, 'gain_k', double_value=-1.0)
+    assert not refused.successful
+    assert 'gain_k' in refused.reason
+    wrong_type = _set(ros, 'gain_k', string_value='high')
+    assert wrong_type.reason == "parameter 'gain_k' takes a number, not 'high'"
+    read_only = _set(ros, 'map_frame', string_value='moon')
+    assert 'read-only' in read_only.reason
+
+
+def test_parameters_describe_themselves(ros, observer):
+    request = DescribeParameters.Request(names=['publish_rate', 'gain_k'])
+    rate, gain = ros.call(
+        DescribeParameters, '/observer_node/describe_parameters', request
+    ).descriptors
+    assert rate.read_only
+    assert rate.description.endswith('[Hz]')
+    assert rate.floating_point_range[0].to_value == 1000.0
+    assert not gain.read_only
+
+
+def test_bad_parameter_at_the_start_is_refused_with_the_reason(ros, tmp_path):
+    node = NodeProcess('observer_node', tmp_path / 'log', publish_rate=0)
+    assert node.wait() == 2
+    assert 'publish_rate' in node.output
+    assert '≥ 0.1' in node.output
+    assert 'Traceback' not in node.output
+
+
+def test_reset_forgets_pose_and_map(ros, observer):
+    estimates = ros.collect(PointCloud, 'landmark_estimates')
+    poses = ros.collect(PoseWithCovarianceStamped, 'pose')
+    with Robot(ros) as robot:
+        robot.run(RUN)
+        ros.spin_until(lambda: estimates and len(estimates[-1].points) == 4, 'four landmarks')
+        response = ros.call(Trigger, '/observer_node/reset', Trigger.Request())
+        assert response.success
+        ros.spin_for(0.2)
+        poses.clear()
+        robot.send(VelocityEvent(time.time_ns(), np.zeros(6)))
+        robot.send(ObservationEvent(time.time_ns(), np.array([7]), np.array([[1.0, 0.0, 0.0]])))
+        ros.spin_for(0.1)
+        robot.send(VelocityEvent(time.time_ns(), np.zeros(6)))
+        ros.spin_until(lambda: len(estimates[-1].points) == 1, 'the only landmark')
+    assert_allclose(poses[-1].pose.pose.position.x, 0.0, atol=1e-9)
+    assert list(estimates[-1].channels[0].values) == [7.0]
+    assert time_message(stamp_ns(poses[-1])) == poses[-1].header.stamp
