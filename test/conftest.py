@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Iterator
 import os
 from pathlib import Path
@@ -19,6 +20,7 @@ SESSION_VARIABLE = 'SLAM_OBSERVER_TEST_SESSION'
 # The ports of higher domain ids overlap those that Linux hands out to clients.
 DOMAIN_IDS = range(1, 102)
 SCRATCH = Path(tempfile.mkdtemp(prefix='slam_observer_test_'))
+atexit.register(shutil.rmtree, SCRATCH)
 
 # Set at import, so that child processes and fixtures of any scope see them.
 os.environ[SESSION_VARIABLE] = str(os.getpid())
@@ -35,7 +37,7 @@ settings.load_profile('suite')
 
 
 @pytest.fixture(scope='session')
-def data_directory() -> Path:
+def data_dir() -> Path:
     """Folder of the public recordings; tests that need it are skipped where there is none."""
     path = Path(os.environ.get('SLAM_OBSERVER_DATA', CHECKOUT.parent / 'shared' / 'data'))
     if not path.is_dir():
@@ -72,7 +74,6 @@ def nothing_is_left_behind() -> Iterator[None]:
     files = shared_memory_files() - shared_before - mapped_files()
     for file in files:
         file.unlink(missing_ok=True)
-    shutil.rmtree(SCRATCH)
     assert not processes, f'processes left running: {list(processes.values())}'
     assert not files, f'files left in shared memory: {files}'
 
