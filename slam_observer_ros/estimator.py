@@ -14,7 +14,7 @@ from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.gains import make_gains
-from slam_observer_ros.gains.base import Innovation, Motion
+from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.noise import NoiseModel
@@ -255,16 +255,28 @@ class Estimator:
             event = self._carry_forward(event)
         self._advance(event.stamp_ns)
         rows = self._landmarks.indices_of(event.ids)
-        self._last = self._innovate(_select(event, rows >= 0), rows[rows >= 0])
-        moved = self._landmarks.rejections >= self.settings.max_rejections
-        if moved.any():
-            self._remove(np.flatnonzero(moved))
-            self.counts['moved_landmark'] += int(np.sum(moved))
-            rows = self._landmarks.indices_of(event.ids)
+        ids, residuals = (
+            event.ids[rows >= 0],
+            self._innovate(_select(event, rows >= 0), rows[rows >= 0]),
+        )
+        self._drop_moved()
+        rows = self._landmarks.indices_of(event.ids)
         self._initialise(_select(event, rows < 0))
+        rows = self._landmarks.indices_of(event.ids)
+        seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
+        self._gains.look_back(self._observer, seen)
         self.counts['observation'] += 1
+        level = lyapunov(self.settings.gain_k, residuals)
+        self._last = Update(event.stamp_ns, self._observer.pose, ids, residuals, level)
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _drop_moved(self) -> None:
+        """Forget landmarks that were rejected so often that they must have moved."""
+        moved = np.flatnonzero(self._landmarks.rejections >= self.settings.max_rejections)
+        if len(moved):
+            self.counts['moved_landmark'] += len(moved)
+            self._remove(moved)
 
     def _remove(self, rows: IntArray) -> None:
         self._observer.remove_landmarks(rows)
@@ -310,20 +322,21 @@ class Estimator:
             self._velocities.forget_before(stamp_ns - _nanoseconds(self.settings.late_limit))
         self._state_ns = stamp_ns
 
-    def _innovate(self, event: ObservationEvent, rows: IntArray) -> Update:
+    def _innovate(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+        """Correct the state by m known landmarks; return their residuals (m, 3)."""
         e, r = self._observer.errors(rows, event.points)
+        if not len(rows):
+            return r
         R = self._observer.A[:3, :3]
         covariances = R @ self._noise.observation(event) @ R.T
-        if len(rows):
-            since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
-            dt_s = (event.stamp_ns - since_ns) * 1e-9
-            correction, weights = self._gains.correct(Innovation(rows, e, r, covariances, dt_s))
-            self._observer.correct(correction)
-            self._landmarks.see(rows, weights > 0.0, event.stamp_ns)
-            self._innovation_ns = event.stamp_ns
-            self.counts['rejected_landmark'] += int(np.sum(weights == 0.0))
-        level = lyapunov(self.settings.gain_k, r)
-        return Update(event.stamp_ns, self._observer.pose, event.ids, r, level)
+        since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
+        dt_s = (event.stamp_ns - since_ns) * 1e-9
+        correction, weights = self._gains.correct(Innovation(rows, e, r, covariances, dt_s))
+        self._observer.correct(correction)
+        self._landmarks.see(rows, weights > 0.0, event.stamp_ns)
+        self._innovation_ns = event.stamp_ns
+        self.counts['rejected_landmark'] += int(np.sum(weights == 0.0))
+        return r
 
     def _initialise(self, event: ObservationEvent) -> None:
         if not len(event.ids):

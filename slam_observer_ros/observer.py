@@ -96,6 +96,12 @@ class Observer:
         self.y_ref = np.concatenate([self.y_ref, y_ref])
         self.a = np.concatenate([self.a, np.zeros_like(y_ref)])
 
+    def rebase(self, A: FloatArray, y_ref: FloatArray) -> None:
+        """Take Â (4, 4) and the landmarks (n, 3) as they are for the reference, with â_i = 0."""
+        self.A = A
+        self.y_ref = y_ref
+        self.a = np.zeros_like(y_ref)
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Delete the landmarks at ``indices``; those behind move up."""
         self.y_ref = np.delete(self.y_ref, indices, axis=0)
@@ -210,6 +216,6 @@ def paper_innovation(
 def _outer_sum(k: FloatArray, e: FloatArray, r: FloatArray) -> FloatArray:
     """Return Σ k_i r_i ē_iᵀ (4, 4), with r_i a direction and ē_i = (e_i, 1) a point."""
     M = np.zeros((4, 4))
-    M[:3, :3] = np.einsum("i,ij,ik->jk", k, r, e)
+    M[:3, :3] = np.einsum('i,ij,ik->jk', k, r, e)
     M[:3, 3] = k @ r
     return M

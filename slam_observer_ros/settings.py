@@ -37,7 +37,7 @@ class Settings:
         read_only=False,
     )
     velocity_timeout: float = parameter(
-        0.5,
+        1.0,
         'How long a velocity is held; after that the pose is held and flagged as stale',
         unit='s',
         minimum=1e-3,
@@ -168,4 +168,14 @@ class Settings:
         5,
         'Rejections in a row after which a landmark is taken to have moved and starts anew',
         minimum=1,
+    )
+    hindsight_interval: int = parameter(
+        100,
+        'Riccati gains: observations after which all that was seen is linearised anew; 0 for never',
+        minimum=0,
+    )
+    hindsight_window: int = parameter(
+        3000,
+        'Riccati gains: observations after which older ones are only kept as a summary; 0 for all',
+        minimum=0,
     )

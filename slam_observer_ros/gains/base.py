@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from slam_observer_ros.observer import Correction
+from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -59,6 +59,29 @@ class Innovation:
     dt_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """All m landmarks of one observation, after the innovation and with the new ones.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the observation, nanoseconds.
+    indices : IntArray
+        (m,) which landmarks were seen.
+    points : FloatArray
+        (m, 3) where, metres, body frame.
+    covariances : FloatArray
+        (m, 3, 3) covariance of the points, body frame, m².
+
+    """
+
+    stamp_ns: int
+    indices: IntArray
+    points: FloatArray
+    covariances: FloatArray
+
+
 class GainDesign(Protocol):
     """Strategy that turns residuals into the innovation (D, d_i)."""
 
@@ -79,6 +102,9 @@ class GainDesign(Protocol):
 
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return the correction and the weights (m,) of the observations, 0 for a rejected one."""
+
+    def look_back(self, observer: Observer, seen: Seen) -> None:
+        """Note what was seen; where the design looks back, move the observer's reference."""
 
     @property
     def pose_covariance(self) -> FloatArray | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.axes import Axes
+from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Motion
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
@@ -40,6 +40,11 @@ class Calibration:
         errors = np.append(scale[self._scaled], bias[self._biased])
         self.initial_variances = errors**2
         self.drift_variances = errors**2 * settings.calibration_drift**2
+
+    @property
+    def values(self) -> FloatArray:
+        """(c,) estimates: scale factors 1 + s, then biases b."""
+        return np.append(self._scale[self._scaled], self._bias[self._biased])
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return (k, 6) velocities (1 + s) ∘ V + b."""

@@ -16,9 +16,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slam_observer_ros.gains.base import Innovation, Motion
+from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.observer import Correction, lyapunov
+from slam_observer_ros.observer import Correction, lyapunov, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -72,6 +72,9 @@ class ConstantGains:
         remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
         d = -np.expm1(-self.gain_l / self.gain_k * innovation.dt_s) * remaining  # (31)
         return Correction(D, innovation.indices, d), np.ones(len(k))
+
+    def look_back(self, observer: Observer, seen: Seen) -> None:
+        """Do nothing: constant gains have no memory."""
 
 
 def centroid_step(k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float) -> FloatArray:

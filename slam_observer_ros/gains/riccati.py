@@ -18,14 +18,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.axes import Axes, PLANAR, SPATIAL
-from slam_observer_ros.gains.base import Innovation, Motion
+from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.robust import block_diagonal, observation_weights
 from slam_observer_ros.geometry import se3, slam_group
-from slam_observer_ros.observer import Correction
+from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.smoothing import Prior, Smoother, Solution
 from slam_observer_ros.types import FloatArray, IntArray
+
+ITERATIONS = 6
+TOLERANCE = 1e-3
 
 
 class RiccatiGains:
@@ -47,6 +52,8 @@ class RiccatiGains:
         self._P = np.zeros((self._first, self._first))
         calibration = np.arange(self._p, self._first)
         self._P[calibration, calibration] = self._calibration.initial_variances
+        start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P)
+        self._history = History(self._axes, start)
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
@@ -81,6 +88,7 @@ class RiccatiGains:
             P[:p] += F @ P[c]
             P[:, :p] += P[:, c] @ F.T
             P[c, c] += np.diag(self._calibration.drift_variances * np.sum(motion.dt_s))
+        self._history.move(motion, self._calibration)
         P[:p, :p] += np.sum(Ad @ motion.covariances @ Ad.swapaxes(1, 2), axis=0)
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
@@ -97,6 +105,7 @@ class RiccatiGains:
     def remove_landmarks(self, indices: IntArray) -> None:
         """Delete the rows and columns of the landmarks at ``indices``."""
         columns = self._columns(indices)
+        self._history.remove_landmarks(indices)
         self._P = np.delete(np.delete(self._P, columns, axis=0), columns, axis=1)
 
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
@@ -116,6 +125,53 @@ class RiccatiGains:
         half = K @ (0.5 * S @ K.T - PC.T)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
         return self._as_correction(-K @ r.ravel()[used]), weights
+
+    def look_back(self, observer: Observer, seen: Seen) -> None:
+        """Note what was seen, and every so often linearise all of it anew.
+
+        Covariances that were computed around a poor early estimate stay wrong, so after a long
+        blind stretch a plain filter closes its loop badly. The smoother's marginal becomes the
+        filter's covariance, and its solution the observer's new reference ξ°, with â_i = 0.
+        """
+        interval = self._settings.hindsight_interval
+        if interval == 0:
+            return
+        self._history.see(seen, observer.A)
+        if len(self._history.stamps_ns) % interval == 0:
+            self._rebase(observer)
+
+    def smooth(self, observer: Observer) -> Solution:
+        """Return the estimates in hindsight of everything since the history's prior."""
+        return self._smoother().smooth(self._in_hindsight(observer), 50, 1e-6)
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Stamps of the frames that :meth:`smooth` returns, nanoseconds."""
+        return self._history.stamps_ns
+
+    def _smoother(self) -> Smoother:
+        history, threshold = self._history, self._settings.huber_threshold
+        return Smoother(self._axes, history.prior, history.frames(), threshold)
+
+    def _in_hindsight(self, observer: Observer) -> Solution:
+        """Return the estimates as they are, for the smoother to start from."""
+        points = observer.y_ref + observer.a
+        return Solution(np.array(self._history.poses), self._calibration.values, points)
+
+    def _rebase(self, observer: Observer) -> None:
+        smoother = self._smoother()
+        solution = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
+        covariance = smoother.marginal(solution)
+        observer.rebase(solution.poses[-1], solution.points)
+        self._calibration.shift(solution.calibration - self._calibration.values)
+        J = np.eye(len(covariance))
+        J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(self._axes.pose, self._axes.pose)]
+        self._P = J @ covariance @ J.T
+        self._history.poses = list(solution.poses)
+        window = self._settings.hindsight_window
+        if window and len(self._history.stamps_ns) >= window:
+            prior = Prior(observer.A, solution.calibration, solution.points, covariance)
+            self._history = History(self._axes, prior)
 
     @property
     def _count(self) -> int:

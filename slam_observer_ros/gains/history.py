@@ -1,0 +1,108 @@
+"""What a filter has seen since its prior, kept so that it can look back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.axes import Axes
+from slam_observer_ros.gains.base import Motion, Seen
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.smoothing import Frames, Prior
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+class History:
+    """Motions and observations, frame by frame.
+
+    Parameters
+    ----------
+    axes : Axes
+        Which axes are estimated.
+    prior : Prior
+        What was known before the first frame.
+
+    Attributes
+    ----------
+    stamps_ns : list of int
+        Stamps of the frames, nanoseconds.
+    poses : list of FloatArray
+        Current estimates (4, 4) of the prior's pose and of each frame's.
+
+    """
+
+    def __init__(self, axes: Axes, prior: Prior) -> None:
+        self._axes = axes
+        self.prior = prior
+        self.stamps_ns: list[int] = []
+        self.poses: list[FloatArray] = [prior.pose]
+        self._motions: list[FloatArray] = []
+        self._covariances: list[FloatArray] = []
+        self._sensitivities: list[FloatArray] = []
+        self._calibrations: list[FloatArray] = []
+        self._landmarks: list[IntArray] = []
+        self._points: list[FloatArray] = []
+        self._information: list[FloatArray] = []
+        self._rest(prior.calibration)
+
+    def move(self, motion: Motion, calibration: Calibration) -> None:
+        """Append a motion to the one that leads to the next frame."""
+        end = se3.inverse(motion.path[-1])
+        Ad = se3.adjoint(end @ motion.path[:-1])[:, self._axes.pose]
+        step = se3.inverse(motion.path[0]) @ motion.path[-1]
+        carry = se3.adjoint(se3.inverse(step))[np.ix_(self._axes.pose, self._axes.pose)]
+        noise = np.sum(Ad @ motion.covariances @ Ad.swapaxes(1, 2), axis=0)
+        self._motion = self._motion @ step
+        self._covariance = carry @ self._covariance @ carry.T + noise
+        self._sensitivity = carry @ self._sensitivity + calibration.sensitivity(Ad, motion)
+        self._calibration = calibration.values
+
+    def see(self, seen: Seen, pose: FloatArray) -> None:
+        """Close a frame: the observation ``seen``, made at ``pose`` (4, 4)."""
+        k = self._axes.point
+        self.stamps_ns.append(seen.stamp_ns)
+        self.poses.append(pose)
+        self._motions.append(self._motion)
+        self._covariances.append(self._covariance)
+        self._sensitivities.append(self._sensitivity)
+        self._calibrations.append(self._calibration)
+        self._landmarks.append(seen.indices)
+        self._points.append(seen.points)
+        self._information.append(np.linalg.inv(seen.covariances[:, :k, :k]))
+        self._rest(self._calibration)
+
+    def remove_landmarks(self, indices: IntArray) -> None:
+        """Forget the landmarks at ``indices`` and all observations of them."""
+        for s, landmarks in enumerate(self._landmarks):
+            kept = ~np.isin(landmarks, indices)
+            self._landmarks[s] = landmarks[kept] - np.searchsorted(indices, landmarks[kept])
+            self._points[s] = self._points[s][kept]
+            self._information[s] = self._information[s][kept]
+        known = indices[indices < len(self.prior.points)]
+        first = len(self.prior.covariance) - self._axes.point * len(self.prior.points)
+        columns = (first + self._axes.point * known[:, None] + np.arange(self._axes.point)).ravel()
+        covariance = np.delete(np.delete(self.prior.covariance, columns, 0), columns, 1)
+        points = np.delete(self.prior.points, known, axis=0)
+        self.prior = Prior(self.prior.pose, self.prior.calibration, points, covariance)
+
+    def frames(self) -> Frames:
+        """Return all frames as arrays."""
+        counts = [len(landmarks) for landmarks in self._landmarks]
+        return Frames(
+            np.array(self._motions),
+            np.array(self._covariances),
+            np.array(self._sensitivities),
+            np.array(self._calibrations),
+            np.repeat(np.arange(len(counts)), counts),
+            np.concatenate(self._landmarks),
+            np.concatenate(self._points),
+            np.concatenate(self._information),
+        )
+
+    def _rest(self, calibration: FloatArray) -> None:
+        """Begin the motion to the next frame: none yet."""
+        d = len(self._axes.pose)
+        self._motion: FloatArray = np.eye(4)
+        self._covariance: FloatArray = np.zeros((d, d))
+        self._sensitivity: FloatArray = np.zeros((d, len(calibration)))
+        self._calibration = calibration
