@@ -4,7 +4,10 @@ VENV := .venv
 PYTHON_IN_VENV := $(VENV)/bin/python
 READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),wheels)
 
-ifndef ROS_DISTRO
+ifdef ROS_DISTRO
+PIP_LIMITS := 'numpy<2'
+else
+PIP_LIMITS := --constraint constraints.txt
 # where ament_index finds the wheels' packages
 export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 endif
@@ -14,7 +17,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon benchmark-accuracy docs venv clean
+.PHONY: help demo test lint format pytest colcon benchmark-accuracy venv clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
@@ -41,11 +44,8 @@ colcon: $(READY)  ## build, install and test as a ROS workspace does
 	scripts/colcon_check.sh $(VENV)
 
 benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
-	$(PYTHON_IN_VENV) -m pip install --quiet --constraint constraints.txt '.[benchmark]'
+	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
-
-docs: $(READY)  ## write the README's tables anew from the parameter table
-	$(PYTHON_IN_VENV) scripts/write_tables.py
 
 venv: $(READY)  ## only set up .venv
 
