@@ -1,0 +1,167 @@
+"""The observer with its gains, its noise and its landmark table: one state that moves on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from functools import reduce
+
+import numpy as np
+
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.gains import make_gains
+from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.landmark_table import LandmarkTable
+from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.observer import Observer
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.velocity_history import HeldVelocities
+
+
+class Slam:
+    """Pose and map as of one instant, with the life cycle of the landmarks.
+
+    Parameters
+    ----------
+    settings : Settings
+        All settings.
+    initial_pose : FloatArray
+        (4, 4) pose at the start, body to world; also the reference P°.
+
+    Attributes
+    ----------
+    observer : Observer
+        State X̂ and reference ξ°.
+    gains : GainDesign
+        What turns residuals into innovations.
+    landmarks : LandmarkTable
+        Ids and counts of the n known landmarks.
+    counts : Counter
+        Rejected and moved landmarks.
+
+    """
+
+    def __init__(self, settings: Settings, initial_pose: FloatArray) -> None:
+        self.settings = settings
+        self.observer = Observer(initial_pose)
+        self.gains = make_gains(settings)
+        self.landmarks = LandmarkTable()
+        self.counts: Counter[str] = Counter()
+        self._noise = NoiseModel(settings)
+        self._innovation_ns: int | None = None
+
+    @property
+    def landmark_covariances(self) -> FloatArray | None:
+        """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
+        covariances = self.gains.landmark_covariances
+        if covariances is None:
+            return None
+        R = self.observer.reference_pose[:3, :3]
+        world: FloatArray = R @ covariances @ R.T
+        return world
+
+    @property
+    def pose_covariance(self) -> FloatArray | None:
+        """(6, 6) covariance of rotation vector and position along the world's axes, rad² and m².
+
+        The gains know that of ε in Â = exp(ε) A; None where they know none.
+        """
+        covariance = self.gains.pose_covariance
+        if covariance is None:
+            return None
+        J = np.eye(6)
+        J[3:, :3] = -so3.hat(self.observer.A[:3, 3])
+        turn = np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
+        world: FloatArray = turn @ covariance @ turn.T
+        return world
+
+    def change_settings(self, settings: Settings) -> None:
+        """Use other gains from now on."""
+        self.settings = settings
+        self.gains.change_settings(settings)
+
+    def motion(self, held: HeldVelocities) -> FloatArray:
+        """Return exp(V_1 dt_1) … exp(V_k dt_k) (4, 4), how the body moves along ``held``."""
+        V = self.gains.calibrated(held.body_velocities)
+        return reduce(np.matmul, se3.exp(V * held.dt_s[:, None]), np.eye(4))
+
+    def advance(self, held: HeldVelocities) -> None:
+        """Move the state on along ``held``."""
+        path = self.observer.propagate(self.gains.calibrated(held.body_velocities), held.dt_s)
+        covariances = self._noise.motion(held)
+        self.gains.predict(Motion(path, held.body_velocities, held.dt_s, covariances))
+
+    def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
+        """Use an observation made at the state's instant.
+
+        Returns
+        -------
+        ids : IntArray
+            (m,) ids of the landmarks seen that were known before.
+        residuals : FloatArray
+            (m, 3) their residuals before the correction, metres, reference frame.
+
+        """
+        rows = self.landmarks.indices_of(event.ids)
+        known = rows >= 0
+        residuals = self._innovate(_select(event, known), rows[known])
+        self._drop_moved()
+        self._initialise(_select(event, self.landmarks.indices_of(event.ids) < 0))
+        rows = self.landmarks.indices_of(event.ids)
+        seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
+        self.gains.look_back(self.observer, seen)
+        return event.ids[known], residuals
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        self.observer.remove_landmarks(rows)
+        self.gains.remove_landmarks(rows)
+        self.landmarks.remove(rows)
+
+    def _innovate(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+        """Correct the state by m known landmarks; return their residuals (m, 3)."""
+        e, r = self.observer.errors(rows, event.points)
+        if not len(rows):
+            return r
+        R = self.observer.A[:3, :3]
+        covariances = R @ self._noise.observation(event) @ R.T
+        since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
+        dt_s = (event.stamp_ns - since_ns) * 1e-9
+        correction, weights = self.gains.correct(Innovation(rows, e, r, covariances, dt_s))
+        self.observer.correct(correction)
+        self.landmarks.see(rows, weights > 0.0, event.stamp_ns)
+        self._innovation_ns = event.stamp_ns
+        self.counts['rejected_landmark'] += int(np.sum(weights == 0.0))
+        return r
+
+    def _drop_moved(self) -> None:
+        """Forget landmarks that were rejected so often that they must have moved."""
+        moved = np.flatnonzero(self.landmarks.rejections >= self.settings.max_rejections)
+        if len(moved):
+            self.counts['moved_landmark'] += len(moved)
+            self.remove(moved)
+
+    def _initialise(self, event: ObservationEvent) -> None:
+        """Add landmarks where they were seen."""
+        if not len(event.ids):
+            return
+        R = self.observer.A[:3, :3]
+        self.observer.add_landmarks(event.points)
+        y_ref = self.observer.y_ref[-len(event.ids) :]
+        self.gains.add_landmarks(y_ref, R @ self._noise.observation(event) @ R.T)
+        self.landmarks.add(event.ids, event.stamp_ns)
+        if self._innovation_ns is None:
+            self._innovation_ns = event.stamp_ns
+
+
+def _select(event: ObservationEvent, mask: BoolArray) -> ObservationEvent:
+    """Return the part of an observation that ``mask`` (m,) picks."""
+    return replace(
+        event,
+        ids=event.ids[mask],
+        points=event.points[mask],
+        covariances=None if event.covariances is None else event.covariances[mask],
+        velocities=None if event.velocities is None else event.velocities[mask],
+    )
