@@ -70,7 +70,8 @@ class Estimator:
     Attributes
     ----------
     counts : Counter
-        Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``).
+        Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``), and
+        what became of landmarks (``'rejected_landmark'``, ``'moved_landmark'``).
     dropped : Counter
         Events refused, by reason.
 
@@ -95,7 +96,7 @@ class Estimator:
 
     def reset(self, pose: FloatArray | None = None) -> None:
         """Forget the map and the motion, and start again at ``pose`` (4, 4), default identity."""
-        self._slam = Slam(self.settings, np.eye(4) if pose is None else pose)
+        self._slam = Slam(self.settings, np.eye(4) if pose is None else pose, self.counts)
         self._velocities = VelocityHistory(_nanoseconds(self.settings.velocity_timeout))
         self._state_ns: int | None = None
         self._stamp_ns: int | None = None

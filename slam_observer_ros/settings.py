@@ -171,7 +171,7 @@ class Settings:
     )
     hindsight_interval: int = parameter(
         100,
-        'Riccati gains: observations after which all that was seen is linearised anew; 0 for never',
+        'Riccati gains: observations after which all of them are linearised anew; 0 for never',
         minimum=0,
     )
     hindsight_window: int = parameter(

@@ -29,6 +29,8 @@ class Slam:
         All settings.
     initial_pose : FloatArray
         (4, 4) pose at the start, body to world; also the reference P°.
+    counts : Counter
+        Where rejected and moved landmarks are counted.
 
     Attributes
     ----------
@@ -38,17 +40,15 @@ class Slam:
         What turns residuals into innovations.
     landmarks : LandmarkTable
         Ids and counts of the n known landmarks.
-    counts : Counter
-        Rejected and moved landmarks.
 
     """
 
-    def __init__(self, settings: Settings, initial_pose: FloatArray) -> None:
+    def __init__(self, settings: Settings, initial_pose: FloatArray, counts: Counter[str]) -> None:
         self.settings = settings
         self.observer = Observer(initial_pose)
         self.gains = make_gains(settings)
         self.landmarks = LandmarkTable()
-        self.counts: Counter[str] = Counter()
+        self._counts = counts
         self._noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
 
@@ -133,14 +133,14 @@ class Slam:
         self.observer.correct(correction)
         self.landmarks.see(rows, weights > 0.0, event.stamp_ns)
         self._innovation_ns = event.stamp_ns
-        self.counts['rejected_landmark'] += int(np.sum(weights == 0.0))
+        self._counts['rejected_landmark'] += int(np.sum(weights == 0.0))
         return r
 
     def _drop_moved(self) -> None:
         """Forget landmarks that were rejected so often that they must have moved."""
         moved = np.flatnonzero(self.landmarks.rejections >= self.settings.max_rejections)
         if len(moved):
-            self.counts['moved_landmark'] += len(moved)
+            self._counts['moved_landmark'] += len(moved)
             self.remove(moved)
 
     def _initialise(self, event: ObservationEvent) -> None:

@@ -1,8 +1,8 @@
 """The whole trajectory and map in hindsight: Gauss–Newton on the group over all that was seen.
 
-The unknowns are a first pose and the S poses at which landmarks were observed, the n landmarks and
-the velocity's calibration c. They are moved by Â_s ← Â_s exp(η_s), p_i ← p_i + dp_i, c ← c + dc. Landmarks and
-calibration together are called the border. The normal equations
+The unknowns are a first pose and the S poses at which landmarks were observed, the n landmarks
+and the velocity's calibration c. They are moved by Â_s ← Â_s exp(η_s), p_i ← p_i + dp_i and
+c ← c + dc. Landmarks and calibration together are called the border. The normal equations
 
     [ T   B ] [ η      ]     [ g ]
     [ Bᵀ  D ] [ dc, dp ] = − [ h ]
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from slam_observer_ros.axes import Axes
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import FloatArray, IntArray
 
 
@@ -206,15 +206,15 @@ class Smoother:
         F = -se3.left_jacobian_inverse(error)[:, pose][:, :, pose] @ frames.sensitivities
         W = self._motion_information
         We = W @ error[:, pose, None]
-        equations.diagonal[1:] += _transposed(J_to) @ W @ J_to
-        equations.diagonal[:-1] += _transposed(J_from) @ W @ J_from
-        equations.above += _transposed(J_from) @ W @ J_to
-        equations.border[1:, :, :c] += _transposed(J_to) @ W @ F
-        equations.border[:-1, :, :c] += _transposed(J_from) @ W @ F
-        equations.corner[:c, :c] += np.sum(_transposed(F) @ W @ F, axis=0)
-        equations.gradient[1:] += (_transposed(J_to) @ We)[:, :, 0]
-        equations.gradient[:-1] += (_transposed(J_from) @ We)[:, :, 0]
-        equations.border_gradient[:c] += np.sum(_transposed(F) @ We, axis=0)[:, 0]
+        equations.diagonal[1:] += so3.transpose(J_to) @ W @ J_to
+        equations.diagonal[:-1] += so3.transpose(J_from) @ W @ J_from
+        equations.above += so3.transpose(J_from) @ W @ J_to
+        equations.border[1:, :, :c] += so3.transpose(J_to) @ W @ F
+        equations.border[:-1, :, :c] += so3.transpose(J_from) @ W @ F
+        equations.corner[:c, :c] += np.sum(so3.transpose(F) @ W @ F, axis=0)
+        equations.gradient[1:] += (so3.transpose(J_to) @ We)[:, :, 0]
+        equations.gradient[:-1] += (so3.transpose(J_from) @ We)[:, :, 0]
+        equations.border_gradient[:c] += np.sum(so3.transpose(F) @ We, axis=0)[:, 0]
 
     def _add_observations(self, equations: _Equations, solution: Solution) -> None:
         """Add R_Âᵀ (p_i − x_Â) − y of each observed point, with Huber's weight."""
@@ -222,28 +222,28 @@ class Smoother:
         poses = solution.poses[frames.frames + 1]
         R = poses[:, :3, :3]
         arms = solution.points[frames.landmarks] - poses[:, :3, 3]
-        predicted = (_transposed(R) @ arms[:, :, None])[:, :, 0]
+        predicted = (so3.transpose(R) @ arms[:, :, None])[:, :, 0]
         error = (predicted - frames.points)[:, :k]
         J_pose = -self._axes.output_matrix(predicted)
-        J_point = _transposed(R)[:, :k, :k]
+        J_point = so3.transpose(R)[:, :k, :k]
         W = frames.information * self._weights(error)[:, None, None]
         We = W @ error[:, :, None]
         rows = frames.frames + 1
         columns = len(solution.calibration) + k * frames.landmarks[:, None] + np.arange(k)
         axes = np.arange(len(self._axes.pose))
-        np.add.at(equations.diagonal, rows, _transposed(J_pose) @ W @ J_pose)
-        np.add.at(equations.gradient, rows, (_transposed(J_pose) @ We)[:, :, 0])
+        np.add.at(equations.diagonal, rows, so3.transpose(J_pose) @ W @ J_pose)
+        np.add.at(equations.gradient, rows, (so3.transpose(J_pose) @ We)[:, :, 0])
         np.add.at(
             equations.border,
             (rows[:, None, None], axes[:, None], columns[:, None, :]),
-            _transposed(J_pose) @ W @ J_point,
+            so3.transpose(J_pose) @ W @ J_point,
         )
         np.add.at(
             equations.corner,
             (columns[:, :, None], columns[:, None, :]),
-            _transposed(J_point) @ W @ J_point,
+            so3.transpose(J_point) @ W @ J_point,
         )
-        np.add.at(equations.border_gradient, columns, (_transposed(J_point) @ We)[:, :, 0])
+        np.add.at(equations.border_gradient, columns, (so3.transpose(J_point) @ We)[:, :, 0])
 
     def _weights(self, error: FloatArray) -> FloatArray:
         if self._huber_threshold == 0.0:
@@ -292,8 +292,7 @@ class _Factors:
         return covariance
 
     def _solve_chain(self, right: FloatArray) -> FloatArray:
-        solution: FloatArray = cho_solve_banded((self._chain, False), right)
-        return solution
+        return np.asarray(cho_solve_banded((self._chain, False), right), dtype=np.float64)
 
 
 def _banded(diagonal: FloatArray, above: FloatArray) -> FloatArray:
@@ -310,8 +309,5 @@ def _banded(diagonal: FloatArray, above: FloatArray) -> FloatArray:
 
 def _inverse(covariances: FloatArray) -> FloatArray:
     """Return inverses of covariances (…, d, d), taking what is exact to be known to 1e-6."""
-    return np.linalg.inv(covariances + 1e-12 * np.eye(covariances.shape[-1]))
-
-
-def _transposed(matrices: FloatArray) -> FloatArray:
-    return matrices.swapaxes(-1, -2)
+    jitter = 1e-12 * np.eye(covariances.shape[-1])
+    return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)

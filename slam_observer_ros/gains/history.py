@@ -43,7 +43,8 @@ class History:
         self._landmarks: list[IntArray] = []
         self._points: list[FloatArray] = []
         self._information: list[FloatArray] = []
-        self._rest(prior.calibration)
+        self._calibration = prior.calibration
+        self._motion, self._covariance, self._sensitivity = self._at_rest()
 
     def move(self, motion: Motion, calibration: Calibration) -> None:
         """Append a motion to the one that leads to the next frame."""
@@ -68,8 +69,9 @@ class History:
         self._calibrations.append(self._calibration)
         self._landmarks.append(seen.indices)
         self._points.append(seen.points)
-        self._information.append(np.linalg.inv(seen.covariances[:, :k, :k]))
-        self._rest(self._calibration)
+        information = np.linalg.inv(seen.covariances[:, :k, :k])
+        self._information.append(np.asarray(information, dtype=np.float64))
+        self._motion, self._covariance, self._sensitivity = self._at_rest()
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices`` and all observations of them."""
@@ -99,10 +101,7 @@ class History:
             np.concatenate(self._information),
         )
 
-    def _rest(self, calibration: FloatArray) -> None:
-        """Begin the motion to the next frame: none yet."""
+    def _at_rest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return no motion, its covariance and its sensitivity to the calibration."""
         d = len(self._axes.pose)
-        self._motion: FloatArray = np.eye(4)
-        self._covariance: FloatArray = np.zeros((d, d))
-        self._sensitivity: FloatArray = np.zeros((d, len(calibration)))
-        self._calibration = calibration
+        return np.eye(4), np.zeros((d, d)), np.zeros((d, len(self._calibration)))
