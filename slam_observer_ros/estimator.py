@@ -52,6 +52,29 @@ class Update:
     lyapunov: float
 
 
+@dataclass(frozen=True, slots=True)
+class Hindsight:
+    """Trajectory and map, each pose estimated from all that was seen before and after.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (s,) stamps of the observations, nanoseconds.
+    poses : FloatArray
+        (s, 4, 4) poses at these stamps, body to world.
+    world_points : FloatArray
+        (n, 3) landmarks, metres, world.
+    ids : IntArray
+        (n,) their ids.
+
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+    world_points: FloatArray
+    ids: IntArray
+
+
 class Estimator:
     """Pose and landmark map from time-stamped velocities and observations.
 
@@ -132,6 +155,20 @@ class Estimator:
         """Use the events that are still held back, as at the end of a recording."""
         for ready in self._queue.pop_all():
             self._process(ready)
+
+    def smooth(self) -> Hindsight:
+        """Return trajectory and map in hindsight; the state is not changed.
+
+        They cover the observations since the history began: all of them with the setting
+        ``hindsight_window`` 0.
+
+        Raises
+        ------
+        ParameterError
+            If the gain design keeps no history.
+
+        """
+        return Hindsight(*self._slam.smooth(), self._slam.landmarks.ids)
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""

@@ -8,9 +8,11 @@ from functools import reduce
 
 import numpy as np
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.noise import NoiseModel
@@ -113,6 +115,22 @@ class Slam:
         seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
         self.gains.look_back(self.observer, seen)
         return event.ids[known], residuals
+
+    def smooth(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return stamps (s,), poses (s, 4, 4) and points (n, 3), all in the world, in hindsight.
+
+        Raises
+        ------
+        ParameterError
+            If the gain design keeps no history.
+
+        """
+        if not isinstance(self.gains, RiccatiGains) or self.settings.hindsight_interval == 0:
+            raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
+        solution = self.gains.smooth(self.observer)
+        P = self.observer.reference_pose
+        stamps_ns = np.array(self.gains.stamps_ns, dtype=np.int64)
+        return stamps_ns, P @ solution.poses[1:], se3.transform(P, solution.points)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
