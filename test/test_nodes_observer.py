@@ -27,7 +27,6 @@ from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
     pose_message,
-    time_message,
     twist_message,
 )
 from slam_observer_ros.nodes.qos import LATCHED_QOS
@@ -133,7 +132,7 @@ def as_received(event):
 
 def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
     scenario = Scenario(
-        duration=4.0,
+        duration=3.0,
         velocity_rate=50.0,
         observation_rate=25.0,
         field_of_view=200.0,
@@ -163,7 +162,7 @@ def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
         assert replay.add(event)
         poses[event.stamp_ns] = pose_message(replay.pose)
         known[event.stamp_ns] = (replay.landmark_ids, replay.world_points.astype(np.float32))
-    assert len(odometry) > 100
+    assert len(odometry) > 50
     for message in odometry:
         assert message.pose.pose == poses[stamp_ns(message)]
     for message in maps:
@@ -222,23 +221,30 @@ def test_each_output_has_its_type_and_quality_of_service(ros, observer):
         assert latched == is_latched, topic
 
 
-def test_outputs_carry_frames_true_stamps_and_marked_covariances(ros, tmp_path):
+def test_outputs_follow_the_parameters_and_carry_true_stamps(ros, tmp_path):
     odometry = ros.collect(Odometry, '/fresh/odometry')
     poses = ros.collect(PoseWithCovarianceStamped, '/fresh/pose')
     lyapunov = ros.collect(Float64, '/fresh/lyapunov')
     paths = ros.collect(Path, '/fresh/path')
     markers = ros.collect(MarkerArray, '/fresh/markers')
-    frames = {'map_frame': 'earth', 'base_frame': 'robot'}
+    parameters = {
+        'map_frame': 'earth',
+        'base_frame': 'robot',
+        'publish_tf': False,
+        'landmarks_type': 'PointCloud',
+    }
     arguments = ('-r', '__ns:=/fresh')
     with (
-        running('observer_node', tmp_path / 'log', *arguments, **frames),
-        Robot(ros, namespace='/fresh') as robot,
+        running('observer_node', tmp_path / 'log', *arguments, **parameters),
+        Robot(ros, cloud_class=PointCloud, namespace='/fresh') as robot,
     ):
         topics = ('odometry', 'pose', 'lyapunov', 'path', 'markers')
         ros.wait_for_publisher(*(f'/fresh/{topic}' for topic in topics))
         assert not odometry + poses + paths + lyapunov + markers, 'published before any input'
         events = robot.run(RUN)
-        ros.spin_for(1.0)
+        ros.spin_for(0.6)
+        senders = ros.node.get_publishers_info_by_topic('/tf')
+        assert '/fresh' not in {sender.node_namespace for sender in senders}
 
     assert len(odometry) > 10
     assert {m.header.frame_id for m in odometry + poses + paths} == {'earth'}
@@ -279,16 +285,6 @@ def test_transform_is_the_pose(ros, observer):
         pose = published[stamp_ns(transform)]
         assert transform.transform.rotation == pose.orientation
         assert transform.transform.translation.x == pose.position.x
-
-
-def test_transform_can_be_switched_off_and_a_type_be_given(ros, tmp_path):
-    parameters = {'publish_tf': False, 'landmarks_type': 'PointCloud'}
-    arguments = ('-r', '__ns:=/quiet')
-    with running('observer_node', tmp_path / 'log', *arguments, **parameters) as quiet:
-        ros.wait_for_publisher('/quiet/odometry')
-        quiet.wait_for_output("receiving sensor_msgs/msg/PointCloud on '/quiet/landmarks'")
-        senders = ros.node.get_publishers_info_by_topic('/tf')
-        assert '/quiet' not in {sender.node_namespace for sender in senders}
 
 
 def test_late_subscriber_gets_the_latched_map(ros, observer):
@@ -394,7 +390,6 @@ def test_reset_forgets_pose_and_map(ros, observer):
         robot.send(ObservationEvent(time.time_ns(), np.array([7]), np.array([[1.0, 0.0, 0.0]])))
         ros.spin_for(0.1)
         robot.send(VelocityEvent(time.time_ns(), np.zeros(6)))
-        ros.spin_until(lambda: len(estimates[-1].points) == 1, 'the only landmark')
+        ros.spin_until(lambda: poses and len(estimates[-1].points) == 1, 'the only landmark')
     assert_allclose(poses[-1].pose.pose.position.x, 0.0, atol=1e-9)
     assert list(estimates[-1].channels[0].values) == [7.0]
-    assert time_message(stamp_ns(poses[-1])) == poses[-1].header.stamp

@@ -9,36 +9,34 @@ import pytest
 
 pytestmark = pytest.mark.ros
 
-STOPS = {
-    'interrupt': (signal.SIGINT,),
-    'terminate': (signal.SIGTERM,),
-    'interrupt twice': (signal.SIGINT, signal.SIGINT),
-    'interrupt and terminate': (signal.SIGINT, signal.SIGTERM, signal.SIGINT),
-}
 READY = {'observer_node': 'estimating', 'simulator_node': 'waiting|starts'}
+CASES = {
+    'interrupt observer': ('observer_node', signal.SIGINT),
+    'terminate observer': ('observer_node', signal.SIGTERM),
+    'interrupt observer twice': ('observer_node', signal.SIGINT, signal.SIGINT),
+    'interrupt simulator': ('simulator_node', signal.SIGINT),
+    'insist on simulator': ('simulator_node', signal.SIGTERM, signal.SIGINT, signal.SIGTERM),
+}
 
 
 @pytest.fixture(scope='module')
 def processes(tmp_path_factory):
+    """Start all nodes at once: each takes a second to start."""
     folder = tmp_path_factory.mktemp('logs')
-    started = {
-        (name, stop): NodeProcess(name, folder / f'{name} {stop}.log')
-        for name in READY
-        for stop in STOPS
-    }
+    started = {case: NodeProcess(CASES[case][0], folder / case) for case in CASES}
     yield started
     for node in started.values():
         node.process.kill()
         node.process.wait()
 
 
-@pytest.mark.parametrize('stop', STOPS)
-@pytest.mark.parametrize('name', READY)
-def test_signals_stop_a_node_cleanly(processes, name, stop):
-    node = processes[name, stop]
+@pytest.mark.parametrize('case', CASES)
+def test_signals_stop_a_node_cleanly(processes, case):
+    name, *signals = CASES[case]
+    node = processes[case]
     node.wait_for_output(READY[name])
 
-    code = node.stop(*STOPS[stop])
+    code = node.stop(*signals)
 
     assert code == 0, node.output
     assert 'Traceback' not in node.output

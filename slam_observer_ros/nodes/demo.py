@@ -35,8 +35,7 @@ PUBLISH_RATE_HZ = 100.0
 INITIAL_BIAS_M = 1.5
 """Large, so that the transient can be seen in the picture."""
 
-DISCOVERY_S = 1.5
-START_LIMIT_S = 30.0
+STALL_LIMIT_S = 30.0
 LAST_MESSAGES_S = 0.5
 STOP_LIMIT_S = 10.0
 
@@ -113,13 +112,12 @@ def _run(
         executor = SingleThreadedExecutor()
         executor.add_node(listener)
         cleanup.callback(executor.shutdown)
-        _spin_for(executor, DISCOVERY_S)
-        if listener.is_disturbed():
-            raise DemoError('other nodes use the same topics; set ROS_DOMAIN_ID to a free number')
         cleanup.enter_context(
             _node('observer_node', folder, gains='constant', use_sim_time=is_simulated_time)
         )
         _wait_for_observer(executor, listener, stop)
+        if listener.is_disturbed():
+            raise DemoError('other nodes use the same topics; set ROS_DOMAIN_ID to a free number')
         simulator = cleanup.enter_context(
             _node(
                 'simulator_node',
@@ -163,12 +161,9 @@ def _node(name: str, folder: Path, **parameters: object) -> Iterator[subprocess.
 def _wait_for_observer(
     executor: SingleThreadedExecutor, listener: DemoListener, stop: StopSignal
 ) -> None:
-    limit_s = time.monotonic() + START_LIMIT_S
+    limit_s = time.monotonic() + STALL_LIMIT_S
     while not listener.hears_observer():
-        if stop.is_set:
-            raise DemoError('interrupted')
-        if time.monotonic() > limit_s:
-            raise DemoError(f'observer_node was not heard of within {START_LIMIT_S:g} s')
+        _check(stop, limit_s)
         executor.spin_once(timeout_sec=0.1)
 
 
@@ -190,16 +185,23 @@ def _listen(
     )
     with Progress(*columns, console=console) as progress:
         task = progress.add_task('observing', total=duration_s, level='…')
+        heard, limit_s = 0, time.monotonic() + STALL_LIMIT_S
         while simulator.poll() is None:
-            if stop.is_set:
-                raise DemoError('interrupted')
             executor.spin_once(timeout_sec=0.1)
-            if listener.lyapunov:
-                progress.update(
-                    task, completed=listener.elapsed_s, level=_level(listener.lyapunov[-1])
-                )
+            _check(stop, limit_s)
+            if len(listener.lyapunov) > heard:
+                heard, limit_s = len(listener.lyapunov), time.monotonic() + STALL_LIMIT_S
+                level = _level(listener.lyapunov[-1])
+                progress.update(task, completed=listener.elapsed_s, level=level)
         _spin_for(executor, LAST_MESSAGES_S)
         progress.update(task, completed=listener.elapsed_s)
+
+
+def _check(stop: StopSignal, limit_s: float) -> None:
+    if stop.is_set:
+        raise DemoError('interrupted')
+    if time.monotonic() > limit_s:
+        raise DemoError(f'nothing was heard for {STALL_LIMIT_S:g} s; see the log files')
 
 
 def _level(lyapunov: float) -> str:
