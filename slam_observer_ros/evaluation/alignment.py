@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.types import FloatArray
-
-_RANK_TOLERANCE = 1e-12
-"""Singular values (m²) below this part of the largest carry no direction, only rounding."""
-
-_ROUNDING = 1e-14
-"""Offsets from the mean below this part of the largest coordinate are rounding."""
 
 
 def align(source: FloatArray, target: FloatArray) -> FloatArray:
@@ -42,13 +37,9 @@ def align(source: FloatArray, target: FloatArray) -> FloatArray:
 
     """
     _check_points(source, target)
-    transform = np.eye(4)
     if len(source) == 0:
-        return transform
-    correlation = _centred(target).T @ _centred(source)
-    transform[:3, :3] = _closest_rotation(correlation)
-    transform[:3, 3] = target.mean(axis=0) - transform[:3, :3] @ source.mean(axis=0)
-    return transform
+        return np.eye(4)
+    return rigid_alignment(source, target, np.ones(len(source)))
 
 
 def _check_points(source: FloatArray, target: FloatArray) -> None:
@@ -58,34 +49,3 @@ def _check_points(source: FloatArray, target: FloatArray) -> None:
         )
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise EvaluationError('alignment needs finite points')
-
-
-def _centred(points: FloatArray) -> FloatArray:
-    """Subtract the mean; offsets that are only its rounding become zero, lest they turn R."""
-    offsets = points - points.mean(axis=0)
-    return np.where(np.abs(offsets) > _ROUNDING * np.abs(points).max(), offsets, 0.0)
-
-
-def _closest_rotation(correlation: FloatArray) -> FloatArray:
-    """Maximise tr(Rᵀ C) over rotations R; among equals, take the one nearest to the identity."""
-    if not (correlation[2].any() or correlation[:, 2].any()):  # both sets are flat in z
-        rotation = np.eye(3)
-        rotation[:2, :2] = _procrustes(correlation[:2, :2], handedness=1.0)
-        return rotation
-    U, sizes, Vt = np.linalg.svd(correlation)
-    rank = int(np.sum(sizes > _RANK_TOLERANCE * sizes[0]))
-    # R = U diag(1, Q) Vᵀ is optimal for each orthogonal Q that makes det R = 1: one sign where
-    # the points span a plane or more, a whole circle of choices about a line.
-    fixed = min(rank, 2)
-    middle = np.eye(3)
-    middle[fixed:, fixed:] = _procrustes(
-        (Vt @ U)[fixed:, fixed:].T, handedness=np.linalg.det(U) * np.linalg.det(Vt)
-    )
-    return np.asarray(U @ middle @ Vt)
-
-
-def _procrustes(matrix: FloatArray, handedness: float) -> FloatArray:
-    """Maximise tr(Qᵀ M) over orthogonal Q whose determinant has the sign of ``handedness``."""
-    U, _, Vt = np.linalg.svd(matrix)
-    U[:, -1] *= np.sign(handedness * np.linalg.det(U) * np.linalg.det(Vt))
-    return np.asarray(U @ Vt)
