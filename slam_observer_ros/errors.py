@@ -38,3 +38,7 @@ class RecordingError(SlamObserverError):
 
 class DataSetError(SlamObserverError):
     """A public data set's files are missing or not in their published format."""
+
+
+class MapError(SlamObserverError):
+    """A map file can't be read or written, or its content can't be right."""
