@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.types import BoolArray, IntArray
+from slam_observer_ros.types import FloatArray, IntArray
 
 
 class LandmarkTable:
@@ -17,7 +17,7 @@ class LandmarkTable:
     counts : IntArray
         (n,) in how many observations each was seen and accepted.
     rejections : IntArray
-        (n,) how many observations in a row were rejected, up to now.
+        (n,) how many observations in a row were rejected at one place, up to now.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds.
 
@@ -28,6 +28,7 @@ class LandmarkTable:
         self.counts: IntArray = np.empty(0, dtype=np.int64)
         self.rejections: IntArray = np.empty(0, dtype=np.int64)
         self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
+        self._rejected_at: FloatArray = np.empty((0, 3))
         self._order: IntArray = np.empty(0, dtype=np.int64)
 
     def __len__(self) -> int:
@@ -47,19 +48,39 @@ class LandmarkTable:
         self.ids = np.concatenate([self.ids, ids])
         self.counts = np.concatenate([self.counts, np.ones(len(ids), dtype=np.int64)])
         self.rejections = np.concatenate([self.rejections, np.zeros(len(ids), dtype=np.int64)])
+        self._rejected_at = np.concatenate([self._rejected_at, np.zeros((len(ids), 3))])
         self.last_seen_ns = np.concatenate([self.last_seen_ns, np.full(len(ids), stamp_ns)])
         self._order = np.argsort(self.ids)
 
-    def see(self, indices: IntArray, accepted: BoolArray, stamp_ns: int) -> None:
-        """Count one more observation of the rows ``indices`` (m,), accepted or rejected."""
-        self.counts[indices] += accepted
-        self.rejections[indices] = np.where(accepted, 0, self.rejections[indices] + 1)
+    def see(self, indices: IntArray, stamp_ns: int) -> None:
+        """Count one more accepted observation of the rows ``indices`` (m,)."""
+        self.counts[indices] += 1
+        self.rejections[indices] = 0
         self.last_seen_ns[indices] = np.maximum(self.last_seen_ns[indices], stamp_ns)
+
+    def reject(
+        self, indices: IntArray, world_points: FloatArray, tolerances_m: FloatArray
+    ) -> None:
+        """Count one more rejected observation of the rows ``indices`` (m,).
+
+        Only rejections in a row and at one place add up: ``world_points`` (m, 3) within
+        ``tolerances_m`` (m,) of where the first of them was, metres.
+        """
+        shift = np.linalg.norm(world_points - self._rejected_at[indices], axis=1)
+        same_place = (self.rejections[indices] > 0) & (shift <= tolerances_m)
+        self.rejections[indices] = np.where(same_place, self.rejections[indices] + 1, 1)
+        self._rejected_at[indices[~same_place]] = world_points[~same_place]
+
+    def restart(self, indices: IntArray) -> None:
+        """Take the rows ``indices`` as seen for the first time."""
+        self.counts[indices] = 1
+        self.rejections[indices] = 0
 
     def remove(self, indices: IntArray) -> None:
         """Delete rows; those behind move up."""
         self.ids = np.delete(self.ids, indices)
         self.counts = np.delete(self.counts, indices)
         self.rejections = np.delete(self.rejections, indices)
+        self._rejected_at = np.delete(self._rejected_at, indices, axis=0)
         self.last_seen_ns = np.delete(self.last_seen_ns, indices)
         self._order = np.argsort(self.ids)

@@ -55,7 +55,8 @@ class NoiseModel:
             along = range_m**2 * s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
             across = range_m * s.pixel_noise / s.stereo_focal_length
         else:
-            along, across = np.full_like(range_m, s.range_noise), range_m * s.bearing_noise
+            along = np.hypot(s.range_noise, range_m * s.range_scale_noise)
+            across = range_m * s.bearing_noise
         return _along_and_across(event.points, range_m, along, across)
 
 

@@ -96,6 +96,11 @@ class Observer:
         self.y_ref = np.concatenate([self.y_ref, y_ref])
         self.a = np.concatenate([self.a, np.zeros_like(y_ref)])
 
+    def relocate_landmarks(self, indices: IntArray, points: FloatArray) -> None:
+        """Give landmarks a new reference y_i° = Â y_i where seen now, ``points`` (m, 3)."""
+        self.y_ref[indices] = se3.transform(self.A, points)
+        self.a[indices] = 0.0
+
     def rebase(self, A: FloatArray, y_ref: FloatArray) -> None:
         """Take Â (4, 4) and the landmarks (n, 3) as they are for the reference, with â_i = 0."""
         self.A = A

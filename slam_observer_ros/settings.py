@@ -106,6 +106,11 @@ class Settings:
     range_noise: float = parameter(
         0.1, 'Range and bearing: standard deviation of the range', unit='m', minimum=1e-6
     )
+    range_scale_noise: float = parameter(
+        0.0,
+        'Range and bearing: part of the standard deviation of the range in proportion to it',
+        minimum=0.0,
+    )
     bearing_noise: float = parameter(
         0.03, 'Range and bearing: standard deviation of each angle', unit='rad', minimum=1e-6
     )
@@ -164,15 +169,33 @@ class Settings:
         minimum=0.0,
         read_only=False,
     )
+    rejection_distance: float = parameter(
+        6.0,
+        'Standard deviations of the residual beyond which an observation is rejected',
+        unit='σ',
+        minimum=1.0,
+        read_only=False,
+    )
+    confirmations: int = parameter(
+        3,
+        'Observations that must agree before a landmark outweighs one that contradicts it',
+        minimum=1,
+    )
     max_rejections: int = parameter(
         5,
-        'Rejections in a row after which a landmark is taken to have moved and starts anew',
+        'Rejections in a row, all at one place, after which a landmark is taken to have moved',
         minimum=1,
     )
     hindsight_interval: int = parameter(
-        100,
-        'Riccati gains: observations after which all of them are linearised anew; 0 for never',
+        50,
+        'Riccati gains: least observations between looking back over all of them; 0 for never',
         minimum=0,
+    )
+    hindsight_turn: float = parameter(
+        0.3,
+        'Riccati gains: sum of the corrections of the attitude after which to look back',
+        unit='rad',
+        minimum=0.0,
     )
     hindsight_window: int = parameter(
         3000,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from functools import reduce
+import logging
 
 import numpy as np
 
@@ -20,6 +21,11 @@ from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.velocity_history import HeldVelocities
+
+logger = logging.getLogger(__name__)
+
+SAME_PLACE = 4.0
+"""Rejections within this many standard deviations of each other are at one place."""
 
 
 class Slam:
@@ -109,11 +115,12 @@ class Slam:
         rows = self.landmarks.indices_of(event.ids)
         known = rows >= 0
         residuals = self._innovate(_select(event, known), rows[known])
-        self._drop_moved()
-        self._initialise(_select(event, self.landmarks.indices_of(event.ids) < 0))
+        self._initialise(_select(event, ~known))
         rows = self.landmarks.indices_of(event.ids)
+        in_doubt = self._in_doubt(rows)
         seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
-        self.gains.look_back(self.observer, seen)
+        self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
+        self._relocate(_select(event, in_doubt), rows[in_doubt])
         return event.ids[known], residuals
 
     def smooth(self) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -140,26 +147,57 @@ class Slam:
 
     def _innovate(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Correct the state by m known landmarks; return their residuals (m, 3)."""
-        e, r = self.observer.errors(rows, event.points)
         if not len(rows):
-            return r
-        R = self.observer.A[:3, :3]
-        covariances = R @ self._noise.observation(event) @ R.T
-        since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
-        dt_s = (event.stamp_ns - since_ns) * 1e-9
-        correction, weights = self.gains.correct(Innovation(rows, e, r, covariances, dt_s))
+            return np.empty((0, 3))
+        innovation = self._innovation(event, rows)
+        correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
-        self.landmarks.see(rows, weights > 0.0, event.stamp_ns)
         self._innovation_ns = event.stamp_ns
-        self._counts['rejected_landmark'] += int(np.sum(weights == 0.0))
-        return r
+        rejected = weights == 0.0
+        self.landmarks.see(rows[~rejected], event.stamp_ns)
+        if rejected.any():
+            spread_m = np.sqrt(np.trace(innovation.covariances[rejected], axis1=1, axis2=2))
+            places = se3.transform(self.observer.pose, event.points[rejected])
+            self.landmarks.reject(rows[rejected], places, SAME_PLACE * spread_m)
+            self._counts['rejected_landmark'] += int(np.sum(rejected))
+        return innovation.r
 
-    def _drop_moved(self) -> None:
-        """Forget landmarks that were rejected so often that they must have moved."""
-        moved = np.flatnonzero(self.landmarks.rejections >= self.settings.max_rejections)
-        if len(moved):
-            self._counts['moved_landmark'] += len(moved)
-            self.remove(moved)
+    def _innovation(self, event: ObservationEvent, rows: IntArray) -> Innovation:
+        e, r = self.observer.errors(rows, event.points)
+        R = self.observer.A[:3, :3]
+        since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
+        covariances = R @ self._noise.observation(event) @ R.T
+        return Innovation(rows, e, r, covariances, (event.stamp_ns - since_ns) * 1e-9)
+
+    def _in_doubt(self, rows: IntArray) -> BoolArray:
+        """Return which of the landmarks seen (m,) have been rejected too often to be trusted."""
+        counts, rejections = self.landmarks.counts[rows], self.landmarks.rejections[rows]
+        needed = np.where(
+            counts < self.settings.confirmations,
+            1,
+            np.minimum(counts, self.settings.max_rejections),
+        )
+        in_doubt: BoolArray = rejections >= needed
+        return in_doubt
+
+    def _relocate(self, event: ObservationEvent, rows: IntArray) -> None:
+        """Start landmarks anew that are still far from where they were expected."""
+        if not len(rows):
+            return
+        far = (
+            self.gains.distances(self._innovation(event, rows)) > self.settings.rejection_distance
+        )
+        if far.any():
+            self._counts['moved_landmark'] += int(np.sum(far))
+            logger.warning('Landmarks %s have moved; starting them anew.', event.ids[far].tolist())
+            self._restart(_select(event, far), rows[far])
+
+    def _restart(self, event: ObservationEvent, rows: IntArray) -> None:
+        R = self.observer.A[:3, :3]
+        self.observer.relocate_landmarks(rows, event.points)
+        covariances = R @ self._noise.observation(event) @ R.T
+        self.gains.relocate_landmarks(rows, self.observer.y_ref[rows], covariances)
+        self.landmarks.restart(rows)
 
     def _initialise(self, event: ObservationEvent) -> None:
         """Add landmarks where they were seen."""

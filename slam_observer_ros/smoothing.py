@@ -20,6 +20,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
 
@@ -124,16 +125,16 @@ class Smoother:
         What was known before the first frame.
     frames : Frames
         What happened since.
-    huber_threshold : float
-        Standard deviations of noise beyond which an observation loses weight; 0 for never.
+    settings : Settings
+        ``huber_threshold`` and ``rejection_distance``.
 
     """
 
-    def __init__(self, axes: Axes, prior: Prior, frames: Frames, huber_threshold: float) -> None:
+    def __init__(self, axes: Axes, prior: Prior, frames: Frames, settings: Settings) -> None:
         self._axes = axes
         self._prior = prior
         self._frames = frames
-        self._huber_threshold = huber_threshold
+        self._settings = settings
         self._motion_information = _inverse(frames.motion_covariances)
         self._prior_information = _inverse(prior.covariance)
 
@@ -246,12 +247,12 @@ class Smoother:
         np.add.at(equations.border_gradient, columns, (so3.transpose(J_point) @ We)[:, :, 0])
 
     def _weights(self, error: FloatArray) -> FloatArray:
-        if self._huber_threshold == 0.0:
-            return np.ones(len(error))
+        """Return Huber's weights (M,), which fall off faster where a filter would reject."""
+        huber, rejection = self._settings.huber_threshold, self._settings.rejection_distance
         squared = (error[:, None, :] @ self._frames.information @ error[:, :, None])[:, 0, 0]
-        weights: FloatArray = self._huber_threshold / np.sqrt(
-            np.maximum(squared, self._huber_threshold**2)
-        )
+        weights: FloatArray = np.minimum(1.0, rejection**2 / np.maximum(squared, rejection**2))
+        if huber > 0.0:
+            weights = weights * huber / np.sqrt(np.maximum(squared, huber**2))
         return weights
 
 

@@ -94,6 +94,11 @@ class GainDesign(Protocol):
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Account for landmarks (m, 3) whose first observation has ``covariances`` (m, 3, 3)."""
 
+    def relocate_landmarks(
+        self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
+    ) -> None:
+        """Take landmarks (m,) for new ones at ``y_ref`` (m, 3), seen for the first time."""
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
 
@@ -103,8 +108,14 @@ class GainDesign(Protocol):
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return the correction and the weights (m,) of the observations, 0 for a rejected one."""
 
-    def look_back(self, observer: Observer, seen: Seen) -> None:
-        """Note what was seen; where the design looks back, move the observer's reference."""
+    def distances(self, innovation: Innovation) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
+
+    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
+        """Note what was seen; where the design looks back, move the observer's reference.
+
+        ``in_doubt`` asks it to look back now, as a landmark seems to have moved.
+        """
 
     @property
     def pose_covariance(self) -> FloatArray | None:

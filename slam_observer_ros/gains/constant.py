@@ -57,6 +57,11 @@ class ConstantGains:
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Do nothing: constant gains know no noise."""
 
+    def relocate_landmarks(
+        self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
+    ) -> None:
+        """Do nothing: constant gains have no state."""
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Do nothing: constant gains have no state."""
 
@@ -73,7 +78,11 @@ class ConstantGains:
         d = -np.expm1(-self.gain_l / self.gain_k * innovation.dt_s) * remaining  # (31)
         return Correction(D, innovation.indices, d), np.ones(len(k))
 
-    def look_back(self, observer: Observer, seen: Seen) -> None:
+    def distances(self, innovation: Innovation) -> FloatArray:
+        """Return zeros: constant gains know no noise to measure residuals by."""
+        return np.zeros(len(innovation.r))
+
+    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Do nothing: constant gains have no memory."""
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slam_observer_ros.axes import Axes
@@ -9,7 +11,10 @@ from slam_observer_ros.gains.base import Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.smoothing import Frames, Prior
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+ANYWHERE_M = 1e3
+"""Standard deviation of a prior that says nothing, metres."""
 
 
 class History:
@@ -73,19 +78,29 @@ class History:
         self._information.append(np.asarray(information, dtype=np.float64))
         self._motion, self._covariance, self._sensitivity = self._at_rest()
 
+    def relocate_landmarks(self, indices: IntArray) -> None:
+        """Forget all about the landmarks at ``indices`` but their latest observation."""
+        for s in range(len(self._landmarks) - 1):
+            kept = ~np.isin(self._landmarks[s], indices)
+            if not kept.all():
+                self._keep(s, kept)
+        known = indices[indices < len(self.prior.points)]
+        columns = self._prior_columns(known)
+        covariance = self.prior.covariance.copy()
+        covariance[columns] = covariance[:, columns] = 0.0
+        covariance[columns, columns] = ANYWHERE_M**2
+        self.prior = replace(self.prior, covariance=covariance)
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices`` and all observations of them."""
         for s, landmarks in enumerate(self._landmarks):
-            kept = ~np.isin(landmarks, indices)
-            self._landmarks[s] = landmarks[kept] - np.searchsorted(indices, landmarks[kept])
-            self._points[s] = self._points[s][kept]
-            self._information[s] = self._information[s][kept]
+            self._keep(s, ~np.isin(landmarks, indices))
+            self._landmarks[s] -= np.searchsorted(np.sort(indices), self._landmarks[s])
         known = indices[indices < len(self.prior.points)]
-        first = len(self.prior.covariance) - self._axes.point * len(self.prior.points)
-        columns = (first + self._axes.point * known[:, None] + np.arange(self._axes.point)).ravel()
+        columns = self._prior_columns(known)
         covariance = np.delete(np.delete(self.prior.covariance, columns, 0), columns, 1)
         points = np.delete(self.prior.points, known, axis=0)
-        self.prior = Prior(self.prior.pose, self.prior.calibration, points, covariance)
+        self.prior = replace(self.prior, points=points, covariance=covariance)
 
     def frames(self) -> Frames:
         """Return all frames as arrays."""
@@ -100,6 +115,17 @@ class History:
             np.concatenate(self._points),
             np.concatenate(self._information),
         )
+
+    def _keep(self, s: int, kept: BoolArray) -> None:
+        """Keep only some of the points of frame ``s``."""
+        self._landmarks[s] = self._landmarks[s][kept]
+        self._points[s] = self._points[s][kept]
+        self._information[s] = self._information[s][kept]
+
+    def _prior_columns(self, indices: IntArray) -> IntArray:
+        k = self._axes.point
+        first = len(self.prior.covariance) - k * len(self.prior.points)
+        return (first + k * indices[:, None] + np.arange(k)).ravel()
 
     def _at_rest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return no motion, its covariance and its sensitivity to the calibration."""

@@ -4,9 +4,10 @@ The error E = X̂ X⁻¹ = (Ã, ã_i) (proof of Theorem 5.1) does not move while
 Ã = exp(ε) the state of the filter is x = (ε, c, ã_1 … ã_n), c being the errors of the velocity's
 calibration. The residual is, by (33), r_i = Ã y_i° − ã_i − y_i° ≈ C_i x with
 
-    C_i = [ −[y]×  I  0 … −I … 0 ],     y = (e_i + y_i°)/2,
+    C_i = [ −[y_i°]×  I  0 … −I … 0 ].
 
-where this midpoint makes the error of the approximation one of third order. Then
+This C does not depend on the estimate, so what no observation can tell, the choice of the world's
+frame, stays exactly in its null space and the covariance stays honest. Then
 
     prediction   P ← P + Ad_Â Q Ad_Âᵀ in the pose block alone: O(1), however large the map
     update       K = P Cᵀ (C P Cᵀ + R)⁻¹,   X̂ ← exp(−K r) · X̂
@@ -22,15 +23,15 @@ from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.history import History
-from slam_observer_ros.gains.robust import block_diagonal, observation_weights
+from slam_observer_ros.gains.robust import block_diagonal, distances, observation_weights
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Prior, Smoother, Solution
 from slam_observer_ros.types import FloatArray, IntArray
 
-ITERATIONS = 6
-TOLERANCE = 1e-3
+ITERATIONS = 3
+TOLERANCE = 1e-2
 
 
 class RiccatiGains:
@@ -54,6 +55,7 @@ class RiccatiGains:
         self._P[calibration, calibration] = self._calibration.initial_variances
         start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P)
         self._history = History(self._axes, start)
+        self._observations, self._turn_rad = 0, 0.0
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
@@ -92,15 +94,29 @@ class RiccatiGains:
         P[:p, :p] += np.sum(Ad @ motion.covariances @ Ad.swapaxes(1, 2), axis=0)
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Append landmarks (m, 3): ã_i = J ε + noise, with J = [−[y_i°]×, I]."""
-        n, k = len(self._P), self._axes.point
-        J = self._axes.output_matrix(y_ref).reshape(-1, self._p)
-        P = np.empty((n + len(J), n + len(J)))
-        P[:n, :n] = self._P
-        P[n:, :n] = J @ self._P[: self._p]
-        P[:n, n:] = P[n:, :n].T
-        P[n:, n:] = P[n:, : self._p] @ J.T + block_diagonal(covariances[:, :k, :k])
+        """Append landmarks (m, 3) with room for them in P."""
+        count, size = self._count, len(self._P) + self._axes.point * len(y_ref)
+        P = np.zeros((size, size))
+        P[: len(self._P), : len(self._P)] = self._P
         self._P = P
+        self._place(np.arange(count, count + len(y_ref)), y_ref, covariances)
+
+    def relocate_landmarks(
+        self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
+    ) -> None:
+        """Take landmarks for new ones; what was seen of them before now is forgotten."""
+        self._history.relocate_landmarks(indices)
+        self._place(indices, y_ref, covariances)
+
+    def _place(self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Fill in P for landmarks seen now: ã_i = J ε + noise, with J = [−[y_i°]×, I]."""
+        P, p, k = self._P, self._p, self._axes.point
+        columns = self._columns(indices)
+        J = self._axes.output_matrix(y_ref).reshape(-1, p)
+        P[columns] = J @ P[:p]
+        P[:, columns] = P[columns].T
+        own = J @ P[:p, :p] @ J.T + block_diagonal(covariances[:, :k, :k])
+        P[np.ix_(columns, columns)] = own
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Delete the rows and columns of the landmarks at ``indices``."""
@@ -110,23 +126,34 @@ class RiccatiGains:
 
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each observation was given."""
-        k, P, columns = self._axes.point, self._P, self._columns(innovation.indices)
-        lever_arms = innovation.e - innovation.r
-        C = self._axes.output_matrix(lever_arms).reshape(-1, self._p)
-        PC = P[:, : self._p] @ C.T - P[:, columns]  # P Cᵀ
-        CPC = C @ PC[: self._p] - PC[columns]  # C P Cᵀ
-        r = innovation.r[:, :k]
-        noise = innovation.covariances[:, :k, :k]
+        k, P = self._axes.point, self._P
+        PC, CPC = self._project(innovation)
+        r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
         weights = observation_weights(r, CPC, noise, self._settings)
-        used = np.repeat(weights > 0.0, k)
-        R = block_diagonal(noise[weights > 0.0] / weights[weights > 0.0, None, None])
+        passed = weights > 0.0
+        used = np.repeat(passed, k)
+        R = block_diagonal(noise[passed] / weights[passed, None, None])
         S, PC = CPC[np.ix_(used, used)] + R, PC[:, used]
         K = np.linalg.solve(S, PC.T).T
         half = K @ (0.5 * S @ K.T - PC.T)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
-        return self._as_correction(-K @ r.ravel()[used]), weights
+        return self._as_correction(-K @ r[passed].ravel()), weights
 
-    def look_back(self, observer: Observer, seen: Seen) -> None:
+    def distances(self, innovation: Innovation) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        k = self._axes.point
+        _, CPC = self._project(innovation)
+        return distances(innovation.r[:, :k], CPC, innovation.covariances[:, :k, :k])
+
+    def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+        """Return P Cᵀ and C P Cᵀ."""
+        columns = self._columns(innovation.indices)
+        y_ref = innovation.e - innovation.r
+        C = self._axes.output_matrix(y_ref).reshape(-1, self._p)
+        PC = self._P[:, : self._p] @ C.T - self._P[:, columns]
+        return PC, C @ PC[: self._p] - PC[columns]
+
+    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise all of it anew.
 
         Covariances that were computed around a poor early estimate stay wrong, so after a long
@@ -137,7 +164,9 @@ class RiccatiGains:
         if interval == 0:
             return
         self._history.see(seen, observer.A)
-        if len(self._history.stamps_ns) % interval == 0:
+        self._observations += 1
+        turned_far = self._turn_rad > self._settings.hindsight_turn
+        if in_doubt or (turned_far and self._observations >= interval):
             self._rebase(observer)
 
     def smooth(self, observer: Observer) -> Solution:
@@ -150,8 +179,8 @@ class RiccatiGains:
         return self._history.stamps_ns
 
     def _smoother(self) -> Smoother:
-        history, threshold = self._history, self._settings.huber_threshold
-        return Smoother(self._axes, history.prior, history.frames(), threshold)
+        history = self._history
+        return Smoother(self._axes, history.prior, history.frames(), self._settings)
 
     def _in_hindsight(self, observer: Observer) -> Solution:
         """Return the estimates as they are, for the smoother to start from."""
@@ -161,6 +190,7 @@ class RiccatiGains:
     def _rebase(self, observer: Observer) -> None:
         smoother = self._smoother()
         solution = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
+        self._observations, self._turn_rad = 0, 0.0
         covariance = smoother.marginal(solution)
         observer.rebase(solution.poses[-1], solution.points)
         self._calibration.shift(solution.calibration - self._calibration.values)
@@ -186,5 +216,6 @@ class RiccatiGains:
         """Return the group element exp(x); the calibration moves by its own part of x."""
         self._calibration.shift(x[self._p : self._first])
         Delta = self._axes.full_pose(x[: self._p])
+        self._turn_rad += float(np.linalg.norm(Delta[:3]))
         X = slam_group.exp(Delta, self._axes.full_points(x[self._first :]))
         return Correction(X.A, slice(None), X.a)

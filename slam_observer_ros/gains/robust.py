@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
@@ -26,13 +25,11 @@ def observation_weights(
     noise : FloatArray
         (m, k, k) covariances of the observations, m².
     settings : Settings
-        ``gate_probability`` and ``huber_threshold``.
+        ``rejection_distance`` and ``huber_threshold``.
 
     """
-    m, k = r.shape
-    i = np.arange(m)
-    blocks = predicted.reshape(m, k, m, k)[i, :, i] + noise
-    passed = mahalanobis_squared(r, blocks) <= chi2.ppf(settings.gate_probability, k)
+    k = r.shape[1]
+    passed = distances(r, predicted, noise) <= settings.rejection_distance
     weights = passed.astype(np.float64)
     if passed.any() and settings.huber_threshold > 0.0:
         used = np.repeat(passed, k)
@@ -40,6 +37,14 @@ def observation_weights(
             r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
         )
     return weights
+
+
+def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return the Mahalanobis distance (m,) of each residual; parameters as above."""
+    m, k = r.shape
+    i = np.arange(m)
+    blocks = predicted.reshape(m, k, m, k)[i, :, i] + noise
+    return np.sqrt(_mahalanobis_squared(r, blocks))
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:
@@ -58,19 +63,18 @@ def _huber_weights(
     The residual left, R S⁻¹ r, is judged by the sensor's noise R, as in an M-estimator, and not
     by S: where the state is uncertain a large residual says nothing against the observation.
     """
-    weights = np.ones(len(r))
+    weights: FloatArray = np.ones(len(r))
     for _ in range(REWEIGHTINGS):
         R = block_diagonal(noise / weights[:, None, None])
-        left = (R @ np.linalg.solve(predicted + R, r.ravel())).reshape(r.shape)
-        distance = np.sqrt(mahalanobis_squared(left, noise))
-        weights = threshold / np.maximum(distance, threshold)
+        left: FloatArray = (R @ np.linalg.solve(predicted + R, r.ravel())).reshape(r.shape)
+        distance = np.sqrt(_mahalanobis_squared(left, noise))
+        weights = np.asarray(threshold / np.maximum(distance, threshold), dtype=np.float64)
         if weights.min() == 1.0:
             break
     return weights
 
 
-def mahalanobis_squared(r: FloatArray, covariances: FloatArray) -> FloatArray:
+def _mahalanobis_squared(r: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return r_iᵀ Σ_i⁻¹ r_i (m,) of residuals (m, k) with covariances (m, k, k)."""
     whitened: FloatArray = np.linalg.solve(covariances, r[:, :, None])
-    squared: FloatArray = (r[:, None, :] @ whitened)[:, 0, 0]
-    return squared
+    return np.asarray((r[:, None, :] @ whitened)[:, 0, 0], dtype=np.float64)
