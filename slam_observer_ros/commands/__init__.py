@@ -1,0 +1,1 @@
+"""What ``slam-observer`` can do: one module a command, each with ``add_parser``."""

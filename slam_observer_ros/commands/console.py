@@ -1,0 +1,60 @@
+"""What the user sees: messages and progress on standard error, results on standard output."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+import json
+import logging
+import sys
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+PROGRAM = 'slam-observer'
+
+_Item = TypeVar('_Item')
+
+_stderr = Console(stderr=True, highlight=False)
+
+
+class MessageHandler(logging.Handler):
+    """Shows log records as ``slam-observer: warning: …``, a line each."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show one record."""
+        show_message(record.levelname.lower(), record.getMessage())
+
+
+def show_message(kind: str, text: str) -> None:
+    """Write ``slam-observer: kind: text`` to standard error, above any progress bar."""
+    line = f'{PROGRAM}: {kind}: {" ".join(text.split())}'
+    _stderr.print(line, markup=False, soft_wrap=True)
+
+
+def show_progress(items: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
+    """Pass items on, with a progress bar on standard error where that is a terminal."""
+    yield from track(
+        items,
+        description,
+        total=total,
+        console=_stderr,
+        transient=True,
+        disable=not _stderr.is_terminal,
+    )
+
+
+def print_json(result: Mapping[str, object]) -> None:
+    """Print one JSON object, on one line, on standard output."""
+    sys.stdout.write(json.dumps(result, allow_nan=False) + '\n')
+
+
+def print_table(title: str, rows: Mapping[str, str]) -> None:
+    """Print names and values on standard output."""
+    table = Table(title=title, title_justify='left', show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column()
+    for name, value in rows.items():
+        table.add_row(name, value)
+    Console(highlight=False, markup=False).print(table)

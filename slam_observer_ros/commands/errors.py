@@ -1,0 +1,9 @@
+"""Exceptions of the command line."""
+
+from __future__ import annotations
+
+from slam_observer_ros.errors import SlamObserverError
+
+
+class UsageError(SlamObserverError):
+    """The command line asks for something that can't be done."""

@@ -1,0 +1,139 @@
+"""Command-line options that several commands share: the estimator's settings, typed values."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+import json
+import os
+from pathlib import Path
+import sys
+
+from slam_observer_ros.commands.errors import UsageError
+from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.parameters import (
+    from_parameters,
+    Parameter,
+    read_parameter_file,
+    table,
+    Value,
+)
+from slam_observer_ros.settings import Settings
+
+_PACKAGE = 'slam_observer_ros'
+_ESTIMATOR_NAMES = frozenset(row.name for row in table(Settings))
+_NODE_NAMES = frozenset(row.name for row in table(ObserverNodeSettings))
+_ROS_NAMES = ('use_sim_time', 'qos_overrides.', 'start_type_description_service')
+"""Parameters that every ROS node has; a name that ends with a dot stands for all below it."""
+
+
+def add_settings_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--config``, ``--gains`` and ``--set``."""
+    gains = next(row for row in table(Settings) if row.name == 'gains')
+    group = parser.add_argument_group('estimator')
+    group.add_argument(
+        '--config',
+        metavar='FILE',
+        help="the observer node's parameter file, or the name of one that comes with the package",
+    )
+    group.add_argument('--gains', choices=gains.choices, help='gain design')
+    group.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='set any other parameter of the estimator; may be given several times',
+    )
+
+
+def read_settings(args: argparse.Namespace, **defaults: Value) -> Settings:
+    """Build settings from defaults, ``--config``, ``--set`` and ``--gains``; later ones win.
+
+    Parameters
+    ----------
+    args : Namespace
+        With the options of :func:`add_settings_options`.
+    **defaults : Value
+        What the command sets if the user doesn't.
+
+    Raises
+    ------
+    SlamObserverError
+        If a file, a name or a value is wrong.
+
+    """
+    values: dict[str, object] = dict(defaults)
+    if args.config is not None:
+        values |= _read_config(args.config)
+    values |= dict(_parse_assignment(text) for text in args.set)
+    if args.gains is not None:
+        values['gains'] = args.gains
+    return from_parameters(Settings, values)
+
+
+def _read_config(name: str) -> dict[str, object]:
+    """Read the estimator's part of a parameter file of the node."""
+    values = read_parameter_file(_find_config(name))
+    return {key: value for key, value in values.items() if not _is_only_for_node(key)}
+
+
+def _is_only_for_node(name: str) -> bool:
+    if name in _ESTIMATOR_NAMES:
+        return False
+    return name in _NODE_NAMES or any(
+        name.startswith(ros_name) if ros_name.endswith('.') else name == ros_name
+        for ros_name in _ROS_NAMES
+    )
+
+
+def _find_config(name: str) -> Path:
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    shipped = {file.stem: file for file in _shipped_configs()}
+    if name not in shipped:
+        raise ParameterError(
+            f"no parameter file '{name}'; those that come with the package: "
+            f'{", ".join(sorted(shipped)) or "none"}'
+        )
+    return shipped[name]
+
+
+def _shipped_configs() -> Iterable[Path]:
+    """List the files in config/ of the source tree or of the places where it is installed."""
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
+    folders = [Path(prefix) / 'share' / _PACKAGE / 'config' for prefix in prefixes if prefix]
+    folders.append(Path(__file__).parents[2] / 'config')
+    return (file for folder in reversed(folders) for file in sorted(folder.glob('*.yaml')))
+
+
+def _parse_assignment(text: str) -> tuple[str, object]:
+    name, equals, value = text.partition('=')
+    if not (name and equals):
+        raise UsageError(f"--set takes NAME=VALUE, not '{text}'")
+    if name not in _ESTIMATOR_NAMES and _is_only_for_node(name):
+        raise UsageError(f"--set {name}: that is the node's parameter, of no use here")
+    return name, _parse_value(value)
+
+
+def _parse_value(text: str) -> object:
+    """Read a number, true, false or a [list]; anything else is a string."""
+    with suppress(json.JSONDecodeError):
+        return json.loads(text)
+    with suppress(ValueError):
+        return float(text)
+    return text
+
+
+def value_of(row: Parameter) -> Callable[[str], Value]:
+    """Return an argparse type that takes what the parameter ``row`` takes."""
+
+    def parse(text: str) -> Value:
+        try:
+            return row.check(_parse_value(text))
+        except ParameterError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parse

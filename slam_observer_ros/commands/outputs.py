@@ -1,0 +1,91 @@
+"""Output files: refused before the work if they are in the way, and never half-written."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+import tempfile
+
+from slam_observer_ros.commands.errors import UsageError
+
+
+def add_force_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--force``."""
+    parser.add_argument('--force', action='store_true', help='replace files that exist already')
+
+
+def recording_path(text: str) -> Path:
+    """Take the name of a recording to be made, as an argparse type."""
+    path = Path(text)
+    if path.suffix != '.mcap':
+        raise argparse.ArgumentTypeError(f"recordings are .mcap files, so not '{text}'")
+    return path
+
+
+def check_outputs(files: Iterable[Path | None], force: bool) -> None:
+    """Refuse files that can't be written, before any work is done.
+
+    Parameters
+    ----------
+    files : iterable of Path or None
+        Files to be written; None for those not asked for.
+    force : bool
+        Whether files may be replaced.
+
+    Raises
+    ------
+    UsageError
+        If a file exists and may not be replaced, is a directory, or would lie in none, or two
+        are the same.
+
+    """
+    wanted = [file for file in files if file is not None]
+    for number, file in enumerate(wanted):
+        if file.is_dir():
+            raise UsageError(f'{file} is a directory; give the name of a file')
+        if file.exists() and not force:
+            raise UsageError(f'{file} exists already; give another name, or --force to replace it')
+        if not file.parent.is_dir():
+            raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
+        if file in wanted[:number]:
+            raise UsageError(f'{file} is named for two outputs')
+
+
+def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> None:
+    """Refuse a directory for figures that can't take them.
+
+    Parameters
+    ----------
+    directory : Path or None
+        Where the figures go; it need not exist, but its parent must. None if none are asked for.
+    names : iterable of str
+        Names of the figures.
+    force : bool
+        Whether figures may be replaced.
+
+    Raises
+    ------
+    UsageError
+        If it is a file, lies in no directory, or holds one of the figures already.
+
+    """
+    if directory is None:
+        return
+    if directory.is_dir():
+        check_outputs((directory / name for name in names), force)
+    elif directory.exists():
+        raise UsageError(f'{directory} is a file; give a directory for the figures')
+    elif not directory.parent.is_dir():
+        raise UsageError(f'{directory}: there is no directory {directory.parent}; make it first')
+
+
+@contextmanager
+def filled_directory(directory: Path) -> Iterator[Path]:
+    """Give a directory to write in, whose files go to ``directory`` when all are written."""
+    with tempfile.TemporaryDirectory(dir=directory.parent, prefix='.writing-') as unfinished:
+        yield Path(unfinished)
+        directory.mkdir(exist_ok=True)
+        for file in sorted(Path(unfinished).iterdir()):
+            file.replace(directory / file.name)

@@ -1,0 +1,263 @@
+"""Events of a recording through the estimator, and how accurate the outcome is.
+
+What is measured is the *online* estimate: the pose as it was known at each moment, from the events
+received until then, never corrected in hindsight. The trajectory is sampled at the stamps of
+velocities and observations alike, so that stretches in which nothing is seen count too, at most
+every :data:`SAMPLE_PERIOD_NS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+import logging
+import time
+
+import numpy as np
+
+from slam_observer_ros.estimator import Estimator, Update
+from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.evaluation.metrics import (
+    anchored_average_nees,
+    ConfigurationError,
+    landmark_errors,
+    trajectory_errors,
+    TrajectoryErrors,
+)
+from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.recording.reader import Truth
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray, IntArray
+
+logger = logging.getLogger(__name__)
+
+SAMPLE_PERIOD_NS = 50_000_000
+"""Least time between two poses of a sampled trajectory: 20 Hz at most."""
+
+
+class TrajectorySampler:
+    """Collects the poses that an estimator passes through.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        What is watched.
+
+    """
+
+    def __init__(self, estimator: Estimator) -> None:
+        self._estimator = estimator
+        self._stamps_ns: list[int] = []
+        self._poses: list[FloatArray] = []
+        self._covariances: list[FloatArray] = []
+
+    def sample(self) -> None:
+        """Keep the present pose, unless the one kept last is less than a period older."""
+        stamp_ns = self._estimator.stamp_ns
+        if stamp_ns is None:
+            return
+        if self._stamps_ns and 0 <= stamp_ns - self._stamps_ns[-1] < SAMPLE_PERIOD_NS:
+            return
+        self._stamps_ns.append(stamp_ns)
+        self._poses.append(self._estimator.pose)
+        covariance = self._estimator.pose_covariance
+        if covariance is not None:
+            self._covariances.append(covariance)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses kept, in stamp order."""
+        return Trajectory.from_samples(self._stamps_ns, self._poses)
+
+    @property
+    def covariances(self) -> FloatArray | None:
+        """(k, 6, 6) covariance of each pose of the trajectory; None where the gains know none."""
+        if not self._covariances:
+            return None
+        latest = dict(zip(self._stamps_ns, self._covariances, strict=True))
+        return np.array([latest[stamp_ns] for stamp_ns in sorted(latest)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What came of a replay.
+
+    Attributes
+    ----------
+    estimator : Estimator
+        In its final state, with the map and the events dropped.
+    trajectory : Trajectory
+        (k) poses of the online estimate.
+    pose_covariances : FloatArray or None
+        (k, 6, 6) their covariances, as :attr:`Estimator.pose_covariance` gives them.
+    dead_reckoning : Trajectory
+        What the velocities alone give, from the same start.
+    configuration : ConfigurationError
+        Gauge-free error after each observation; empty without truth.
+    residual_stamps_ns : IntArray
+        (m,) stamp of each residual, nanoseconds.
+    residuals : FloatArray
+        (m, 3) residuals of the landmarks seen, metres.
+    events : int
+        Events taken in, dropped ones included.
+    seconds : float
+        CPU time of the estimator alone, without reading and measuring.
+
+    """
+
+    estimator: Estimator
+    trajectory: Trajectory
+    pose_covariances: FloatArray | None
+    dead_reckoning: Trajectory
+    configuration: ConfigurationError
+    residual_stamps_ns: IntArray
+    residuals: FloatArray
+    events: int
+    seconds: float
+
+
+def replay(events: Iterable[Event], settings: Settings, truth: Truth | None = None) -> Replay:
+    """Run events through an estimator, from the identity pose.
+
+    Parameters
+    ----------
+    events : iterable of Event
+        In the order in which they were received.
+    settings : Settings
+        Settings of the estimator.
+    truth : Truth, optional
+        What the configuration error is measured against.
+
+    """
+    run = _Run(settings, truth)
+    for event in events:
+        run.add(event)
+    return run.finish()
+
+
+class _Run:
+    """A replay under way: keeps what the metrics need, and the estimator's time apart from it."""
+
+    def __init__(self, settings: Settings, truth: Truth | None) -> None:
+        self._estimator = Estimator(settings, on_update=self._on_update)
+        self._sampler = TrajectorySampler(self._estimator)
+        self._blind = Estimator(settings)
+        self._blind_sampler = TrajectorySampler(self._blind)
+        self._landmark_truth = truth.landmarks if truth else None
+        self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
+        self._configuration = ConfigurationError()
+        self._updates: list[Update] = []
+        self._events = 0
+        self._seconds = 0.0
+
+    def add(self, event: Event) -> None:
+        self._events += 1
+        start_s = time.thread_time()
+        accepted = self._estimator.add(event)
+        self._seconds += time.thread_time() - start_s
+        self._sampler.sample()
+        if accepted and isinstance(event, VelocityEvent):
+            self._blind.add(event)
+            self._blind_sampler.sample()
+
+    def finish(self) -> Replay:
+        start_s = time.thread_time()
+        self._estimator.flush()
+        self._seconds += time.thread_time() - start_s
+        self._sampler.sample()
+        return Replay(
+            self._estimator,
+            self._sampler.trajectory,
+            self._sampler.covariances,
+            self._blind_sampler.trajectory,
+            self._configuration,
+            np.repeat(
+                np.array([update.stamp_ns for update in self._updates], dtype=np.int64),
+                np.array([len(update.residuals) for update in self._updates], dtype=np.int64),
+            ),
+            np.concatenate([np.empty((0, 3)), *(update.residuals for update in self._updates)]),
+            self._events,
+            self._seconds,
+        )
+
+    def _on_update(self, update: Update) -> None:
+        start_s = time.thread_time()
+        self._updates.append(update)
+        self._compare(update)
+        self._seconds -= time.thread_time() - start_s
+
+    def _compare(self, update: Update) -> None:
+        if self._pose_truth is None or self._landmark_truth is None:
+            return
+        true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
+        if covered[0]:
+            self._configuration.add(
+                update.stamp_ns,
+                update.pose,
+                self._estimator.landmark_ids,
+                self._estimator.world_points,
+                true_poses[0],
+                self._landmark_truth,
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accuracy:
+    """Errors of a replay; None where the truth that it takes is not in the recording.
+
+    Attributes
+    ----------
+    pose_errors : TrajectoryErrors or None
+        Of the online trajectory, after one rigid alignment.
+    dead_reckoning_errors : TrajectoryErrors or None
+        The same of the velocities alone.
+    landmark_rmse_m : float or None
+        Of the final map, after a rigid alignment of its own, metres.
+    configuration_rmse_m : float or None
+        See :class:`ConfigurationError`, metres.
+    anees : float or None
+        Of the pose, per degree of freedom; None where the gains know no covariance, too.
+
+    """
+
+    pose_errors: TrajectoryErrors | None
+    dead_reckoning_errors: TrajectoryErrors | None
+    landmark_rmse_m: float | None
+    configuration_rmse_m: float | None
+    anees: float | None
+
+
+def measure(result: Replay, truth: Truth) -> Accuracy:
+    """Compare a replay with the truth."""
+    pose_truth = Trajectory(truth.stamps_ns, truth.poses)
+    return Accuracy(
+        _pose_errors(result.trajectory, pose_truth),
+        _pose_errors(result.dead_reckoning, pose_truth),
+        _landmark_rmse_m(result.estimator, truth),
+        result.configuration.rmse_m,
+        None
+        if result.pose_covariances is None
+        else anchored_average_nees(result.trajectory, result.pose_covariances, pose_truth),
+    )
+
+
+def _pose_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
+    if not len(truth):
+        return None
+    try:
+        return trajectory_errors(estimate, truth)
+    except EvaluationError as error:
+        logger.warning('The trajectory is not compared with the truth: %s', error)
+        return None
+
+
+def _landmark_rmse_m(estimator: Estimator, truth: Truth) -> float | None:
+    if truth.landmarks is None:
+        return None
+    try:
+        errors = landmark_errors(estimator.landmark_ids, estimator.world_points, truth.landmarks)
+    except EvaluationError as error:
+        logger.warning('The map is not compared with the truth: %s', error)
+        return None
+    return errors.rmse_m

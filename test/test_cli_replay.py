@@ -1,0 +1,275 @@
+"""``slam-observer replay`` and ``convert``: recordings of every kind, and what they tell."""
+
+from __future__ import annotations
+
+from command_line import CommandLine
+import numpy as np
+import pytest
+import recordings
+import ros_messages as ros
+import yaml
+
+from slam_observer_ros.evaluation.trajectory import read_tum
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.recording.writer import RecordingWriter
+
+REPORT_KEYS = {
+    'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
+    'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
+    'dead_reckoning_ate_rmse_m',
+}  # fmt: skip
+
+
+@pytest.fixture
+def slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+@pytest.fixture
+def simulated(slam_observer, tmp_path):
+    """A simulated run of five seconds, 50 Hz, with truth."""
+    path = tmp_path / 'simulated.mcap'
+    slam_observer.succeed('simulate', '--duration', 5, '--output', path)
+    return path
+
+
+@pytest.fixture(scope='module')
+def run_in_every_format(tmp_path_factory):
+    return recordings.write_all_formats(tmp_path_factory.mktemp('formats'))
+
+
+def write_events(path, events):
+    """Write a recording without truth."""
+    with RecordingWriter(path) as writer:
+        for event in events:
+            if isinstance(event, VelocityEvent):
+                writer.write_velocity(event)
+            else:
+                writer.write_observation(event)
+    return path
+
+
+class TestReport:
+    def test_simulation_against_its_truth(self, slam_observer, simulated):
+        report = slam_observer.succeed('replay', simulated, '--json').json
+        assert set(report) == REPORT_KEYS
+        assert (report['events'], report['landmarks'], report['dropped']) == (502, 4, {})
+        assert report['duration_s'] == pytest.approx(5.0)
+        assert report['dead_reckoning_ate_rmse_m'] == pytest.approx(0.0, abs=1e-6)
+        assert 0.0 < report['landmark_rmse_m'] < 0.5
+        assert 0.0 < report['configuration_rmse_m'] < 0.7
+        assert report['ate_rmse_m'] < 0.5
+        assert report['seconds'] > 0.0
+
+    def test_one_run_one_estimate(self, slam_observer, simulated):
+        first, again = (slam_observer('replay', simulated, '--json').json for _ in range(2))
+        del first['seconds'], again['seconds']
+        assert first == again
+
+    @pytest.mark.parametrize(
+        'name', ['mcap file', 'mcap directory', 'sqlite3 file', 'sqlite3 directory', 'ROS 1 bag']
+    )
+    def test_every_format(self, slam_observer, run_in_every_format, name):
+        ended = slam_observer('replay', run_in_every_format[name], '--json')
+        assert ended.code == 0
+        assert ended.json['events'] == 150
+        assert ended.json['landmarks'] == 3
+
+    def test_without_truth_no_accuracy_is_claimed(self, slam_observer, tmp_path):
+        path = write_events(tmp_path / 'own.mcap', recordings.events())
+        report = slam_observer('replay', path, '--json').json
+        unknown = {key for key, value in report.items() if value is None}
+        assert unknown == {key for key in REPORT_KEYS if 'rmse' in key} | {'anees'}
+        assert 'no truth to compare with' in slam_observer('replay', path).output
+
+    def test_truth_at_another_time_is_no_truth(self, slam_observer, tmp_path):
+        path = tmp_path / 'run.mcap'
+        with RecordingWriter(path) as writer:
+            for event in recordings.events():
+                if isinstance(event, VelocityEvent):
+                    writer.write_velocity(event)
+                else:
+                    writer.write_observation(event)
+            for index, truth in enumerate(recordings.true_poses()):
+                early = type(truth)(1_000_000_000 + index * recordings.STEP_NS, truth.pose)
+                writer.write_pose(early)
+        ended = slam_observer('replay', path, '--json')
+        assert ended.json['ate_rmse_m'] is None
+        assert 'slam-observer: warning: The trajectory is not compared' in ended.errors
+
+    def test_summary_names_topics_and_errors(self, slam_observer, simulated):
+        output = slam_observer.succeed('replay', simulated).output
+        for text in ('/twist', '/landmarks', '502 over 5.0 s', '(ATE)', 'not aligned'):
+            assert text in output
+
+
+class TestOutputs:
+    def test_trajectory_and_map_and_figures(self, slam_observer, simulated, tmp_path):
+        tum, landmarks, figures = tmp_path / 'run.tum', tmp_path / 'map.yaml', tmp_path / 'figures'
+        slam_observer.succeed(
+            'replay', simulated, '--tum', tum, '--map', landmarks, '--plot', figures
+        )
+        trajectory = read_tum(tum)
+        assert len(trajectory) == 84  # 20 Hz at most, of stamps every 20 ms: every 60 ms
+        assert np.diff(trajectory.stamps_ns).min() >= 50_000_000
+        content = yaml.safe_load(landmarks.read_text())
+        assert (content['version'], content['frame']) == (1, 'map')
+        assert [landmark['id'] for landmark in content['landmarks']] == [0, 1, 2, 3]
+        assert all(len(landmark['position']) == 3 for landmark in content['landmarks'])
+        assert content['landmarks'][0]['observations'] == 251
+        assert {path.name for path in figures.iterdir()} == {
+            'map.png', 'errors.png', 'residuals.png'
+        }  # fmt: skip
+
+    def test_map_tells_what_the_gains_know_of_its_accuracy(
+        self, slam_observer, simulated, tmp_path
+    ):
+        for gains in ('constant', 'riccati'):
+            path = tmp_path / f'{gains}.yaml'
+            slam_observer.succeed('replay', simulated, '--gains', gains, '--map', path)
+            landmark = yaml.safe_load(path.read_text())['landmarks'][0]
+            if gains == 'constant':
+                assert 'covariance' not in landmark
+            else:
+                assert np.linalg.eigvalsh(landmark['covariance']).min() > 0.0
+
+    def test_nothing_is_overwritten_but_by_force(self, slam_observer, simulated, tmp_path):
+        figures = tmp_path / 'figures'
+        figures.mkdir()
+        files = {'--tum': tmp_path / 'a.tum', '--map': tmp_path / 'a.yaml', '--plot': figures}
+        for option, path in files.items():
+            mine = path / 'map.png' if path == figures else path
+            mine.write_text('mine')
+            assert '--force' in slam_observer.fail('replay', simulated, option, path)
+            assert mine.read_text() == 'mine'
+            slam_observer.succeed('replay', simulated, option, path, '--force')
+            assert b'mine' not in mine.read_bytes()[:4]
+
+    def test_figures_leave_other_files_alone(self, slam_observer, simulated, tmp_path):
+        (tmp_path / 'notes.txt').write_text('mine')
+        slam_observer.succeed('replay', simulated, '--plot', tmp_path)
+        assert (tmp_path / 'notes.txt').read_text() == 'mine'
+        assert (tmp_path / 'map.png').exists()
+        assert not list(tmp_path.glob('.writing-*'))
+
+
+class TestSettings:
+    def config(self, tmp_path, text):
+        path = tmp_path / 'robot.yaml'
+        path.write_text(f'/**: {{ros__parameters: {{{text}}}}}')
+        return path
+
+    def test_the_nodes_own_file(self, slam_observer, simulated, tmp_path):
+        config = self.config(
+            tmp_path, 'gains: constant, publish_rate: 20.0, base_frame: rover, use_sim_time: true'
+        )
+        output = slam_observer.succeed('replay', simulated, '--config', config).output
+        assert 'constant gains' in output
+
+    def test_the_command_line_wins(self, slam_observer, simulated, tmp_path):
+        config = self.config(tmp_path, 'gains: constant')
+        arguments = ('replay', simulated, '--config', config)
+        wins = slam_observer.succeed(*arguments, '--gains', 'riccati').output
+        assert 'riccati gains' in wins
+        wins = slam_observer.succeed(*arguments, '--set', 'gains=riccati').output
+        assert 'riccati gains' in wins
+
+    def test_file_by_the_name_that_it_is_shipped_under(self, slam_observer, simulated):
+        slam_observer.succeed('replay', simulated, '--config', 'observer')
+
+    def test_values_of_each_type(self, slam_observer, simulated):
+        slam_observer.succeed(
+            'replay', simulated, '--set', 'gain_k=1e1', '--set', 'gain_l=.5',
+            '--set', 'angular_velocity_noise=[1e-3, 0.01, 1]', '--set', 'step_mode=paper',
+        )  # fmt: skip
+
+    def test_misspelt_name_in_the_file(self, slam_observer, simulated, tmp_path):
+        config = self.config(tmp_path, 'gain_q: 4.0')
+        error = slam_observer.fail('replay', simulated, '--config', config)
+        assert "unknown parameter 'gain_q'; did you mean 'gain_" in error
+
+
+class TestTroubledRecordings:
+    def test_malformed_and_impossible_messages_are_dropped_by_reason(
+        self, slam_observer, tmp_path
+    ):
+        path = tmp_path / 'troubled.mcap'
+        good = ros.serialise(ros.twist_stamped([0.1] * 6))
+        with RecordingWriter(path) as writer:
+            for data in (good, good[:20], ros.serialise(ros.twist_stamped([np.nan] * 6))):
+                writer.write('/twist', 'geometry_msgs/msg/TwistStamped', data, ros.STAMP_NS)
+            for ids in ([1, 2], [3, 3]):
+                writer.write_observation(
+                    ObservationEvent(ros.STAMP_NS, np.array(ids), np.ones((2, 3)))
+                )
+        ended = slam_observer('replay', path, '--json')
+        assert ended.code == 0
+        assert ended.json['dropped'] == {'not_finite': 1, 'repeated_id': 1, 'malformed': 1}
+        assert ended.json['events'] == 5
+        assert ended.errors.count('slam-observer: warning: ') == 3
+
+    def test_truncated_recording_is_used_up_to_the_damage(self, slam_observer, tmp_path):
+        path = tmp_path / 'long.mcap'
+        slam_observer.succeed('simulate', '--duration', 300, '--step', 0.1, '--output', path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+        ended = slam_observer('replay', path, '--json')
+        assert ended.code == 0
+        assert 0 < ended.json['events'] < 6002
+        assert ended.errors.startswith('slam-observer: warning: ')
+        assert ended.errors.count('\n') == 1
+
+    def test_frames_that_differ_are_told(self, slam_observer, tmp_path):
+        path = tmp_path / 'frames.mcap'
+        with RecordingWriter(path) as writer:
+            for event in recordings.events():
+                if isinstance(event, VelocityEvent):
+                    writer.write_velocity(event)
+                else:
+                    writer.write_observation(event, frame_id='camera')
+        errors = slam_observer('replay', path).errors
+        assert 'base_link' in errors
+        assert 'camera' in errors
+
+    def test_two_topics_that_fit_are_listed_with_the_option_that_decides(
+        self, slam_observer, tmp_path
+    ):
+        path = tmp_path / 'two.mcap'
+        with RecordingWriter(path) as writer:
+            for event in recordings.events():
+                if isinstance(event, VelocityEvent):
+                    writer.write_velocity(event, topic='/wheels')
+                    writer.write_velocity(event, topic='/imu')
+                else:
+                    writer.write_observation(event)
+        error = slam_observer.fail('replay', path)
+        for text in ('/wheels', '/imu', '--velocity-topic'):
+            assert text in error
+        ended = slam_observer('replay', path, '--velocity-topic', 'wheels', '--json')
+        assert ended.json['events'] == 150
+
+
+class TestRealData:
+    def accuracy(self, slam_observer, path, *options):
+        ended = slam_observer('replay', path, '--json', *options)
+        assert ended.code == 0
+        return ended.json
+
+    def test_starry_night(self, slam_observer, data_dir, tmp_path):
+        path = tmp_path / 'starry_night.mcap'
+        output = slam_observer.succeed(
+            'convert', 'starry-night', data_dir / 'starry_night' / 'dataset3.mat', path
+        ).output
+        assert '1900' in output
+        report = self.accuracy(slam_observer, path, '--gains', 'constant')
+        assert report['ate_rmse_m'] < 0.2 < 0.8 < report['dead_reckoning_ate_rmse_m']
+        assert report['landmarks'] == 20
+        assert report['configuration_rmse_m'] < 0.2
+
+    def test_mrclam(self, slam_observer, data_dir, tmp_path):
+        path = tmp_path / 'robot3.mcap'
+        folder = data_dir / 'mrclam' / 'MRCLAM_Dataset6'
+        output = slam_observer.succeed('convert', 'mrclam', folder, '--robot', 3, path).output
+        assert 'left out: misread' in output
+        report = self.accuracy(slam_observer, path, '--gains', 'constant')
+        assert report['ate_rmse_m'] < 0.5 * report['dead_reckoning_ate_rmse_m']
+        assert report['landmarks'] == 15
