@@ -13,7 +13,7 @@ Vector3 = tuple[float, float, float]
 class Settings:
     """Settings of the estimator; each field is a parameter."""
 
-    gains: str = parameter('riccati', 'Gain design', choices=('constant', 'riccati'))
+    gains: str = parameter('riccati', 'Gain design', choices=('constant', 'scheduled', 'riccati'))
     gain_k: float = parameter(
         4.0,
         "Constant gains: k of the paper's (30), how fast the pose follows the residuals",
@@ -192,8 +192,8 @@ class Settings:
         minimum=0,
     )
     hindsight_turn: float = parameter(
-        0.3,
-        'Riccati gains: sum of the corrections of the attitude after which to look back',
+        0.1,
+        'Riccati gains: root of the summed squares of attitude corrections after which to look back',
         unit='rad',
         minimum=0.0,
     )

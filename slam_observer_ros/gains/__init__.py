@@ -7,10 +7,12 @@ from collections.abc import Callable
 from slam_observer_ros.gains.base import GainDesign
 from slam_observer_ros.gains.constant import ConstantGains
 from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.scheduled import ScheduledGains
 from slam_observer_ros.settings import Settings
 
 DESIGNS: dict[str, Callable[[Settings], GainDesign]] = {
     'constant': ConstantGains,
+    'scheduled': ScheduledGains,
     'riccati': RiccatiGains,
 }
 """Every gain design by its name, the values of the parameter ``gains``."""

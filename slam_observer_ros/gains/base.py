@@ -99,6 +99,36 @@ class GainDesign(Protocol):
     ) -> None:
         """Take landmarks (m,) for new ones at ``y_ref`` (m, 3), seen for the first time."""
 
+    def add_known_landmarks(self, covariances: FloatArray) -> None:
+        """Account for landmarks from a map with ``covariances`` (m, 3, 3), reference frame, m²."""
+
+    def set_pose_covariance(self, covariance: FloatArray) -> None:
+        """Take ``covariance`` (6, 6) for that of ε, independent of all else."""
+
+    def joint_covariance(self, indices: IntArray) -> FloatArray | None:
+        """Return the covariance (m k, m k) of landmarks (m,) together; None if unknown."""
+
+    def anchor(
+        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+    ) -> Correction:
+        """Return the correction that brings the whole estimate to where known landmarks are.
+
+        Parameters
+        ----------
+        points : FloatArray
+            (n, 3) all landmarks, metres, reference frame.
+        indices : IntArray
+            (m,) which of them are known.
+        r : FloatArray
+            (m, 3) estimated minus known positions, metres, reference frame.
+        covariances : FloatArray
+            (m, 3, 3) covariances of the known positions, m².
+
+        """
+
+    def restart(self, observer: Observer) -> None:
+        """Forget the past: what is known now is all that is known when looking back."""
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
 

@@ -62,6 +62,24 @@ class ConstantGains:
     ) -> None:
         """Do nothing: constant gains have no state."""
 
+    def add_known_landmarks(self, covariances: FloatArray) -> None:
+        """Do nothing: constant gains know no noise."""
+
+    def set_pose_covariance(self, covariance: FloatArray) -> None:
+        """Do nothing: constant gains know no noise."""
+
+    def joint_covariance(self, indices: IntArray) -> None:
+        """Return None: constant gains know no noise."""
+
+    def anchor(
+        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+    ) -> Correction:
+        """Return the correction that puts the known landmarks where they are known to be."""
+        return Correction(np.eye(4), indices, -r)
+
+    def restart(self, observer: Observer) -> None:
+        """Do nothing: constant gains have no memory."""
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Do nothing: constant gains have no state."""
 

@@ -1,12 +1,14 @@
-"""How well known points tell where a whole estimate lies: the gauge of SLAM.
+"""How landmarks that are known in another frame tell where a whole estimate lies in it.
 
 Pose and landmarks of an estimate may be moved together by any rigid motion exp(γ) without
-changing what is observed. Where some of its landmarks are also known in another frame, with
+changing what is observed: that is the gauge of SLAM. If nothing is known of γ beforehand, the
+error of an estimate, seen from the other frame, is x + G γ, with x ~ N(0, P) as before. Landmarks
+known there, up to noise of covariance R, show the differences
 
-    r = J γ + ã,        ã ~ N(0, S),
+    r = H (x + G γ) + noise,        S = H P Hᵀ + R,        J = H G.
 
-r being the differences and S the covariance of estimate and known points together, γ follows by
-generalised least squares, with no guess about γ beforehand.
+Generalised least squares give γ = Λ Jᵀ S⁻¹ r with Λ = (Jᵀ S⁻¹ J)⁻¹, and then x follows as in a
+Kalman filter from what γ leaves of r. No large number has to stand for 'unknown'.
 """
 
 from __future__ import annotations
@@ -14,36 +16,80 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.types import FloatArray, IntArray
+
+JITTER_M2 = 1e-12
+"""Added to variances, so that S can be inverted where both sides are exact."""
 
 
 @dataclass(frozen=True, slots=True)
 class GaugeFit:
-    """The best γ and how sure it is.
+    """The best γ.
 
     Attributes
     ----------
     gamma : FloatArray
-        (d,) rotation vector and translation, as the columns of J have them.
-    covariance : FloatArray
-        (d, d) covariance of ``gamma``.
+        (d,) rotation vector and translation, on the axes that J has.
+    information : FloatArray
+        (d, d) inverse covariance Λ⁻¹ of ``gamma``.
     misfit : float
-        ãᵀ S⁻¹ ã of what is left; χ² distributed with q − d degrees of freedom.
+        What is left of r, squared, in units of S; χ² distributed with q − d degrees of freedom.
 
     """
 
     gamma: FloatArray
-    covariance: FloatArray
+    information: FloatArray
     misfit: float
 
 
 def fit_gauge(J: FloatArray, S: FloatArray, r: FloatArray) -> GaugeFit:
-    """Fit γ to differences ``r`` (q,) with Jacobian ``J`` (q, d) and covariance ``S`` (q, q)."""
-    whitener = np.linalg.cholesky(S)
-    J_white, r_white = np.linalg.solve(whitener, J), np.linalg.solve(whitener, r)
-    information = J_white.T @ J_white
-    covariance = np.linalg.pinv(information, hermitian=True)
-    gamma = covariance @ (J_white.T @ r_white)
-    left = r_white - J_white @ gamma
-    return GaugeFit(gamma, np.asarray(covariance, dtype=np.float64), float(left @ left))
+    """Fit γ to differences ``r`` (q,) with Jacobian ``J`` (q, d) and covariance ``S`` (q, q).
+
+    Where the landmarks leave some of γ open, that part is zero.
+    """
+    W = _solve(S, np.column_stack([J, r]))
+    information: FloatArray = J.T @ W[:, :-1]
+    gamma = np.linalg.lstsq(information, J.T @ W[:, -1])[0]
+    left = r - J @ gamma
+    return GaugeFit(gamma, information, float(left @ _solve(S, left)))
+
+
+def anchor(
+    P: FloatArray, G: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Bring an estimate of unknown gauge to where known landmarks say that it is.
+
+    Parameters
+    ----------
+    P : FloatArray
+        (N, N) covariance of the error x.
+    G : FloatArray
+        (N, d) how x changes when the whole estimate is moved.
+    rows : IntArray
+        (q,) entries of x that are the errors of the known landmarks' coordinates.
+    R : FloatArray
+        (q, q) covariance of the known landmarks.
+    r : FloatArray
+        (q,) estimate minus known coordinates.
+
+    Returns
+    -------
+    x : FloatArray
+        (N,) error of the estimate, the gauge's included.
+    P : FloatArray
+        (N, N) its covariance now.
+
+    """
+    J, PH = G[rows], P[:, rows]
+    S = PH[rows] + R + JITTER_M2 * np.eye(len(r))
+    fit = fit_gauge(J, S, r)
+    K = _solve(S, PH.T).T
+    B = G - K @ J
+    after = P - K @ PH.T + B @ np.linalg.solve(fit.information, B.T)
+    return G @ fit.gamma + K @ (r - J @ fit.gamma), 0.5 * (after + after.T)
+
+
+def _solve(S: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray(cho_solve(cho_factor(S), right), dtype=np.float64)

@@ -18,11 +18,14 @@ at O(m n) for m landmarks seen plus O(m n²) to update the covariance of n known
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.history import History
+from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import block_diagonal, distances, observation_weights
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.observer import Correction, Observer
@@ -30,7 +33,7 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Prior, Smoother, Solution
 from slam_observer_ros.types import FloatArray, IntArray
 
-ITERATIONS = 3
+ITERATIONS = 2
 TOLERANCE = 1e-2
 
 
@@ -50,12 +53,10 @@ class RiccatiGains:
         self._calibration = Calibration(settings, self._axes)
         self._p = len(self._axes.pose)
         self._first = self._p + self._calibration.count
-        self._P = np.zeros((self._first, self._first))
-        calibration = np.arange(self._p, self._first)
-        self._P[calibration, calibration] = self._calibration.initial_variances
-        start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P)
+        self._P = initial_covariance(self._axes, self._calibration)
+        start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P.copy())
         self._history = History(self._axes, start)
-        self._observations, self._turn_rad = 0, 0.0
+        self._observations, self._turn_squared = 0, 0.0
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
@@ -83,15 +84,8 @@ class RiccatiGains:
 
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
-        P, p, c = self._P, self._p, slice(self._p, self._first)
-        Ad = se3.adjoint(motion.path[:-1])[:, self._axes.pose]
-        if self._calibration.count:
-            F = self._calibration.sensitivity(Ad, motion)
-            P[:p] += F @ P[c]
-            P[:, :p] += P[:, c] @ F.T
-            P[c, c] += np.diag(self._calibration.drift_variances * np.sum(motion.dt_s))
         self._history.move(motion, self._calibration)
-        P[:p, :p] += np.sum(Ad @ motion.covariances @ Ad.swapaxes(1, 2), axis=0)
+        predict(self._P, self._axes, self._calibration, motion)
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks (m, 3) with room for them in P."""
@@ -117,6 +111,35 @@ class RiccatiGains:
         P[:, columns] = P[columns].T
         own = J @ P[:p, :p] @ J.T + block_diagonal(covariances[:, :k, :k])
         P[np.ix_(columns, columns)] = own
+
+    def set_pose_covariance(self, covariance: FloatArray) -> None:
+        """Take over the covariance (6, 6) of ε, independent of all else."""
+        p, pose = self._p, self._axes.pose
+        self._P[:p] = self._P[:, :p] = 0.0
+        self._P[:p, :p] = covariance[np.ix_(pose, pose)]
+
+    def add_known_landmarks(self, covariances: FloatArray) -> None:
+        """Append landmarks whose errors are independent of all else."""
+        k = self._axes.point
+        own = block_diagonal(covariances[:, :k, :k])
+        self._P = np.asarray(scipy.linalg.block_diag(self._P, own), dtype=np.float64)
+
+    def joint_covariance(self, indices: IntArray) -> FloatArray:
+        """Return the covariance (m k, m k) of landmarks together."""
+        columns = self._columns(indices)
+        return self._P[np.ix_(columns, columns)]
+
+    def anchor(
+        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+    ) -> Correction:
+        """Return the correction that puts the whole estimate where known landmarks are."""
+        k = self._axes.point
+        G = np.zeros((len(self._P), self._p))
+        G[: self._p] = np.eye(self._p)
+        G[self._first :] = self._axes.output_matrix(points).reshape(-1, self._p)
+        R = block_diagonal(covariances[:, :k, :k])
+        x, self._P = anchor(self._P, G, self._columns(indices), R, r[:, :k].ravel())
+        return self._as_correction(-x)
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Delete the rows and columns of the landmarks at ``indices``."""
@@ -148,10 +171,14 @@ class RiccatiGains:
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
         columns = self._columns(innovation.indices)
-        y_ref = innovation.e - innovation.r
-        C = self._axes.output_matrix(y_ref).reshape(-1, self._p)
+        C = self._pose_output(innovation)
         PC = self._P[:, : self._p] @ C.T - self._P[:, columns]
         return PC, C @ PC[: self._p] - PC[columns]
+
+    def _pose_output(self, innovation: Innovation) -> FloatArray:
+        """Return the columns (m k, p) of C that belong to ε."""
+        y_ref = innovation.e - innovation.r
+        return self._axes.output_matrix(y_ref).reshape(-1, self._p)
 
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise all of it anew.
@@ -165,8 +192,9 @@ class RiccatiGains:
             return
         self._history.see(seen, observer.A)
         self._observations += 1
-        turned_far = self._turn_rad > self._settings.hindsight_turn
-        if in_doubt or (turned_far and self._observations >= interval):
+        rested = self._observations >= max(interval, len(self._history.stamps_ns) // 10)
+        turned_far = self._turn_squared > self._settings.hindsight_turn**2
+        if in_doubt or (turned_far and rested):
             self._rebase(observer)
 
     def smooth(self, observer: Observer) -> Solution:
@@ -177,6 +205,19 @@ class RiccatiGains:
     def stamps_ns(self) -> list[int]:
         """Stamps of the frames that :meth:`smooth` returns, nanoseconds."""
         return self._history.stamps_ns
+
+    def restart(self, observer: Observer) -> None:
+        """Forget the past: what is known now is all that is known when looking back."""
+        J = np.eye(len(self._P))
+        pose = self._axes.pose
+        J[: self._p, : self._p] = se3.adjoint(se3.inverse(observer.A))[np.ix_(pose, pose)]
+        points = observer.y_ref + observer.a
+        prior = Prior(observer.A, self._calibration.values, points, J @ self._P @ J.T)
+        self._history = History(self._axes, prior)
+        self._observations, self._turn_squared = 0, 0.0
+
+    def _remember(self, motion: Motion) -> None:
+        self._history.move(motion, self._calibration)
 
     def _smoother(self) -> Smoother:
         history = self._history
@@ -190,7 +231,7 @@ class RiccatiGains:
     def _rebase(self, observer: Observer) -> None:
         smoother = self._smoother()
         solution = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
-        self._observations, self._turn_rad = 0, 0.0
+        self._observations, self._turn_squared = 0, 0.0
         covariance = smoother.marginal(solution)
         observer.rebase(solution.poses[-1], solution.points)
         self._calibration.shift(solution.calibration - self._calibration.values)
@@ -216,6 +257,6 @@ class RiccatiGains:
         """Return the group element exp(x); the calibration moves by its own part of x."""
         self._calibration.shift(x[self._p : self._first])
         Delta = self._axes.full_pose(x[: self._p])
-        self._turn_rad += float(np.linalg.norm(Delta[:3]))
+        self._turn_squared += float(Delta[:3] @ Delta[:3])
         X = slam_group.exp(Delta, self._axes.full_points(x[self._first :]))
         return Correction(X.A, slice(None), X.a)

@@ -33,7 +33,7 @@ def observation_weights(
     weights = passed.astype(np.float64)
     if passed.any() and settings.huber_threshold > 0.0:
         used = np.repeat(passed, k)
-        weights[passed] = _huber_weights(
+        weights[passed] = _reweighted(
             r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
         )
     return weights
@@ -43,8 +43,20 @@ def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatA
     """Return the Mahalanobis distance (m,) of each residual; parameters as above."""
     m, k = r.shape
     i = np.arange(m)
-    blocks = predicted.reshape(m, k, m, k)[i, :, i] + noise
-    return np.sqrt(_mahalanobis_squared(r, blocks))
+    return mahalanobis(r, predicted.reshape(m, k, m, k)[i, :, i] + noise)
+
+
+def huber_weights(left: FloatArray, noise: FloatArray, threshold: float) -> FloatArray:
+    """Return Huber's weights (m,) of residuals (m, k) with noise (m, k, k); ones for 0."""
+    if threshold == 0.0:
+        return np.ones(len(left))
+    return np.asarray(threshold / np.maximum(mahalanobis(left, noise), threshold))
+
+
+def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return √(r_iᵀ Σ_i⁻¹ r_i) (m,) of residuals (m, k) with covariances (m, k, k)."""
+    whitened = np.linalg.solve(covariances, r[:, :, None])
+    return np.asarray(np.sqrt((r[:, None, :] @ whitened)[:, 0, 0]))
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:
@@ -55,7 +67,7 @@ def block_diagonal(blocks: FloatArray) -> FloatArray:
     return matrix.reshape(m * k, m * k)
 
 
-def _huber_weights(
+def _reweighted(
     r: FloatArray, predicted: FloatArray, noise: FloatArray, threshold: float
 ) -> FloatArray:
     """Return Huber's weights (m,) of what is left of the residuals after the correction.
@@ -63,18 +75,11 @@ def _huber_weights(
     The residual left, R S⁻¹ r, is judged by the sensor's noise R, as in an M-estimator, and not
     by S: where the state is uncertain a large residual says nothing against the observation.
     """
-    weights: FloatArray = np.ones(len(r))
+    weights = np.ones(len(r))
     for _ in range(REWEIGHTINGS):
         R = block_diagonal(noise / weights[:, None, None])
-        left: FloatArray = (R @ np.linalg.solve(predicted + R, r.ravel())).reshape(r.shape)
-        distance = np.sqrt(_mahalanobis_squared(left, noise))
-        weights = np.asarray(threshold / np.maximum(distance, threshold), dtype=np.float64)
+        left = (R @ np.linalg.solve(predicted + R, r.ravel())).reshape(r.shape)
+        weights = huber_weights(left, noise, threshold)
         if weights.min() == 1.0:
             break
     return weights
-
-
-def _mahalanobis_squared(r: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return r_iᵀ Σ_i⁻¹ r_i (m,) of residuals (m, k) with covariances (m, k, k)."""
-    whitened: FloatArray = np.linalg.solve(covariances, r[:, :, None])
-    return np.asarray((r[:, None, :] @ whitened)[:, 0, 0], dtype=np.float64)

@@ -1,0 +1,60 @@
+"""Riccati gains in a map that is taken to be exact: O(m) for m landmarks seen, however large.
+
+What :mod:`slam_observer_ros.gains.riccati` is for pose, calibration and landmarks, for pose and
+calibration alone: the landmarks' errors ã_i are zero, so r_i ≈ [ −[y]×  I ] ε.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.observer import Correction, Observer
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+class FixedMapGains(RiccatiGains):
+    """Gains that know pose and calibration as well as ``before``, and never move a landmark.
+
+    Parameters
+    ----------
+    before : RiccatiGains
+        Gains until now. The covariances that they have for the landmarks are only passed on.
+
+    """
+
+    def __init__(self, before: RiccatiGains) -> None:
+        super().__init__(before._settings)
+        self._calibration = before._calibration
+        self._P = before._P[: self._first, : self._first].copy()
+        self._landmark_covariances = before.landmark_covariances
+
+    @property
+    def landmark_covariances(self) -> FloatArray:
+        """(n, 3, 3) covariances of the landmarks, as the map has them."""
+        return self._landmark_covariances
+
+    def remove_landmarks(self, indices: IntArray) -> None:
+        """Forget the landmarks at ``indices``."""
+        self._landmark_covariances = np.delete(self._landmark_covariances, indices, axis=0)
+
+    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
+        """Do nothing: in an exact map there is no drift to undo."""
+
+    def restart(self, observer: Observer) -> None:
+        """Do nothing: nothing is kept of the past."""
+
+    def _remember(self, motion: Motion) -> None:
+        """Do nothing: nothing is kept of the past."""
+
+    def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+        """Return P Cᵀ and C P Cᵀ."""
+        C = self._pose_output(innovation)
+        PC = self._P[:, : self._p] @ C.T
+        return PC, C @ PC[: self._p]
+
+    def _as_correction(self, x: FloatArray) -> Correction:
+        """Return the group element exp(x); it moves no landmark."""
+        D = super()._as_correction(x).D
+        return Correction(D, np.empty(0, dtype=np.int64), np.empty((0, 3)))

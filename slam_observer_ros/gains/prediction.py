@@ -1,0 +1,40 @@
+"""What a motion does to the covariance of pose and calibration, for every design that has one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.axes import Axes
+from slam_observer_ros.gains.base import Motion
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.types import FloatArray
+
+
+def initial_covariance(axes: Axes, calibration: Calibration) -> FloatArray:
+    """Return (p + c, p + c): a pose that is known, it is the reference; a calibration that isn't."""
+    return np.diag(np.append(np.zeros(len(axes.pose)), calibration.initial_variances))
+
+
+def predict(P: FloatArray, axes: Axes, calibration: Calibration, motion: Motion) -> None:
+    """Add a motion's noise Ad_Â Q Ad_Âᵀ to the pose block of P, in place.
+
+    Parameters
+    ----------
+    P : FloatArray
+        (p + c + …, p + c + …) covariance of pose error, calibration, and anything else.
+    axes, calibration : Axes, Calibration
+        Which p axes of the pose and c of the calibration are estimated.
+    motion : Motion
+        The motion since the last call.
+
+    """
+    p = len(axes.pose)
+    c = slice(p, p + calibration.count)
+    Ad = se3.adjoint(motion.path[:-1])[:, axes.pose]
+    if calibration.count:
+        F = calibration.sensitivity(Ad, motion)
+        P[:p] += F @ P[c]
+        P[:, :p] += P[:, c] @ F.T
+        P[c, c] += np.diag(calibration.drift_variances * np.sum(motion.dt_s))
+    P[:p, :p] += np.sum(Ad @ motion.covariances @ so3.transpose(Ad), axis=0)
