@@ -193,7 +193,7 @@ class Settings:
     )
     hindsight_turn: float = parameter(
         0.1,
-        'Riccati gains: root of the summed squares of attitude corrections after which to look back',
+        'Riccati gains: root sum square of attitude corrections after which to look back',
         unit='rad',
         minimum=0.0,
     )
@@ -201,4 +201,16 @@ class Settings:
         3000,
         'Riccati gains: observations after which older ones are only kept as a summary; 0 for all',
         minimum=0,
+    )
+    localization_mode: str = parameter(
+        'off',
+        'What a loaded map is: off, a start from which mapping goes on; uncertain, landmarks that '
+        'are refined within their covariance, with no new ones added; fixed, exact',
+        choices=('off', 'uncertain', 'fixed'),
+    )
+    map_noise: float = parameter(
+        0.05,
+        'Standard deviation of each coordinate of loaded landmarks whose file tells none',
+        unit='m',
+        minimum=0.0,
     )

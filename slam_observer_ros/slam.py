@@ -48,6 +48,8 @@ class Slam:
         What turns residuals into innovations.
     landmarks : LandmarkTable
         Ids and counts of the n known landmarks.
+    is_mapping : bool
+        Whether landmarks are added, and taken to have moved if they are rejected too often.
 
     """
 
@@ -56,6 +58,7 @@ class Slam:
         self.observer = Observer(initial_pose)
         self.gains = make_gains(settings)
         self.landmarks = LandmarkTable()
+        self.is_mapping = True
         self._counts = counts
         self._noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
@@ -79,11 +82,28 @@ class Slam:
         covariance = self.gains.pose_covariance
         if covariance is None:
             return None
-        J = np.eye(6)
-        J[3:, :3] = -so3.hat(self.observer.A[:3, 3])
-        turn = np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
+        turn = self._turn_to_world()
         world: FloatArray = turn @ covariance @ turn.T
         return world
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
+        """Move the robot and keep the map; what they have to do with each other is forgotten.
+
+        Parameters
+        ----------
+        pose : FloatArray
+            (4, 4) body to world.
+        covariance : FloatArray or None
+            (6, 6) as :attr:`pose_covariance` gives it; None for an exact pose.
+
+        """
+        observer = self.observer
+        A = se3.inverse(observer.reference_pose) @ pose
+        observer.rebase(A, observer.y_ref + observer.a)
+        back = np.linalg.inv(self._turn_to_world())
+        given = np.zeros((6, 6)) if covariance is None else covariance
+        self.gains.set_pose_covariance(back @ given @ back.T)
+        self.gains.restart(observer)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other gains from now on."""
@@ -114,10 +134,13 @@ class Slam:
         """
         rows = self.landmarks.indices_of(event.ids)
         known = rows >= 0
+        if not self.is_mapping:
+            self._counts['unmapped_landmark'] += int(np.sum(~known))
+            event, rows, known = _select(event, known), rows[known], known[known]
         residuals = self._innovate(_select(event, known), rows[known])
         self._initialise(_select(event, ~known))
         rows = self.landmarks.indices_of(event.ids)
-        in_doubt = self._in_doubt(rows)
+        in_doubt = self._in_doubt(rows) if self.is_mapping else np.zeros(len(rows), np.bool_)
         seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
         self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
         self._relocate(_select(event, in_doubt), rows[in_doubt])
@@ -134,6 +157,10 @@ class Slam:
         """
         if not isinstance(self.gains, RiccatiGains) or self.settings.hindsight_interval == 0:
             raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
+        if self.settings.localization_mode == 'fixed':
+            raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
+        if self.settings.localization_mode == 'fixed':
+            raise ParameterError("in a map that is 'fixed' there is nothing to smooth")
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
         stamps_ns = np.array(self.gains.stamps_ns, dtype=np.int64)
@@ -144,6 +171,12 @@ class Slam:
         self.observer.remove_landmarks(rows)
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
+
+    def _turn_to_world(self) -> FloatArray:
+        """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
+        J = np.eye(6)
+        J[3:, :3] = -so3.hat(self.observer.A[:3, 3])
+        return np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
 
     def _innovate(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Correct the state by m known landmarks; return their residuals (m, 3)."""
@@ -167,7 +200,9 @@ class Slam:
         R = self.observer.A[:3, :3]
         since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
         covariances = R @ self._noise.observation(event) @ R.T
-        return Innovation(rows, e, r, covariances, (event.stamp_ns - since_ns) * 1e-9)
+        return Innovation(
+            rows, e, r, self.observer.a[rows], covariances, (event.stamp_ns - since_ns) * 1e-9
+        )
 
     def _in_doubt(self, rows: IntArray) -> BoolArray:
         """Return which of the landmarks seen (m,) have been rejected too often to be trusted."""

@@ -45,6 +45,8 @@ class Innovation:
         (m, 3) errors (29), metres, reference frame.
     r : FloatArray
         (m, 3) residuals e_i − y_i°, metres.
+    a : FloatArray
+        (m, 3) â_i, metres.
     covariances : FloatArray
         (m, 3, 3) covariance of the observations, rotated into the reference frame, m².
     dt_s : float
@@ -55,6 +57,7 @@ class Innovation:
     indices: IntArray
     e: FloatArray
     r: FloatArray
+    a: FloatArray
     covariances: FloatArray
     dt_s: float
 
@@ -83,7 +86,10 @@ class Seen:
 
 
 class GainDesign(Protocol):
-    """Strategy that turns residuals into the innovation (D, d_i)."""
+    """Strategy that turns residuals into the innovation (D, d_i).
+
+    Covariances are those of the errors in the reference frame; None where a design knows none.
+    """
 
     def change_settings(self, settings: Settings) -> None:
         """Use the settings that may change while running."""

@@ -12,7 +12,7 @@ from slam_observer_ros.types import FloatArray
 
 
 def initial_covariance(axes: Axes, calibration: Calibration) -> FloatArray:
-    """Return (p + c, p + c): a pose that is known, it is the reference; a calibration that isn't."""
+    """Return (p + c, p + c): the pose is the reference, so known; the calibration is not."""
     return np.diag(np.append(np.zeros(len(axes.pose)), calibration.initial_variances))
 
 

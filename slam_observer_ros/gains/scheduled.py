@@ -1,14 +1,15 @@
 """Variance-scheduled gains: the paper's k_i and l_i, set by what is known, at O(m) for m seen.
 
 Kept are a covariance P of the pose error ε (with the velocity's calibration) and a covariance L_i
-of each landmark by itself; how they are correlated is not kept. With C_i = [−[e_i]×, I] and the
-noise R_i of the observation, the gains of (30) and (31) become matrices
+of each landmark by itself; how they are correlated is not kept. Landmark errors are those of
+p̂_i itself, so that landmarks out of view have none to correct. With C_i = [−[e_i + â_i]×, I] and
+the noise R_i of the observation, the gains of (30) and (31) become matrices
 
     k_i = (L_i + R_i)⁻¹,                 Δ = −P⁺ Σ C_iᵀ k_i r_i
-    l_i / k_i · dt = L_i (L_i + R_i)⁻¹,  δ_i = Δ â_i + L_i k_i (r_i + C_i Δ)
+    l_i / k_i · dt = L_i (L_i + R_i)⁻¹,  δ_i = L_i k_i (r_i + C_i Δ)
 
-where P⁺ = (P⁻¹ + Σ C_iᵀ k_i C_i)⁻¹. Since correlations are ignored, P and L_i are too small to be
-published as covariances: they only set gains.
+where P⁺ = (P⁻¹ + Σ C_iᵀ k_i C_i)⁻¹. Since correlations are ignored, P and L_i come out too small:
+they set gains, and are not published as covariances.
 """
 
 from __future__ import annotations
@@ -27,6 +28,13 @@ from slam_observer_ros.types import FloatArray, IntArray
 
 REWEIGHTINGS = 3
 """Rounds of reweighted least squares."""
+
+NOISE_INFLATION = 3.0
+"""Factor on the observations' standard deviations.
+
+A landmark seen again and again tells less and less about the pose, as their errors have become
+the same; a design that does not know this must believe each observation less.
+"""
 
 
 class ScheduledGains:
@@ -71,6 +79,39 @@ class ScheduledGains:
         """Take landmarks for new ones."""
         self._L[indices] = self._first_variances(y_ref, covariances)
 
+    def add_known_landmarks(self, covariances: FloatArray) -> None:
+        """Append landmarks (m,) as certain as the map has them, or exact in a fixed map."""
+        self._L = np.concatenate([self._L, self._map_variances(covariances)])
+
+    def set_pose_covariance(self, covariance: FloatArray) -> None:
+        """Take over the covariance (6, 6) of ε."""
+        p, pose = len(self._axes.pose), self._axes.pose
+        self._P[:p] = self._P[:, :p] = 0.0
+        self._P[:p, :p] = covariance[np.ix_(pose, pose)]
+
+    def joint_covariance(self, indices: IntArray) -> FloatArray:
+        """Return the covariance (m k, m k) of landmarks, without correlations."""
+        return block_diagonal(self._L[indices])
+
+    def anchor(
+        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+    ) -> Correction:
+        """Return the correction that puts pose and known landmarks where these are known to be."""
+        first, p, m, k = len(self._P), len(self._axes.pose), len(r), self._axes.point
+        P = block_diag(self._P, block_diagonal(self._L[indices]))
+        G = np.zeros((len(P), p))
+        G[:p] = np.eye(p)
+        G[first:] = self._axes.output_matrix(points[indices]).reshape(-1, p)
+        R = block_diagonal(self._map_variances(covariances))
+        x, P = anchor(P, G, np.arange(first, len(P)), R, r[:, :k].ravel())
+        self._P = P[:first, :first]
+        self._L[indices] = P[first:, first:].reshape(m, k, m, k)[np.arange(m), :, np.arange(m)]
+        shifts = self._axes.full_points(-x[first:])
+        return self._as_correction(indices, -x[:first], shifts.ravel(), np.zeros_like(r))
+
+    def restart(self, observer: Observer) -> None:
+        """Do nothing: these gains keep no history."""
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
         self._L = np.delete(self._L, indices, axis=0)
@@ -79,29 +120,29 @@ class ScheduledGains:
         """Return the innovation and the weight that each observation was given."""
         passed = self.distances(innovation) <= self._settings.rejection_distance
         k, rows = self._axes.point, innovation.indices[passed]
-        r, e = innovation.r[passed][:, :k, None], innovation.e[passed]
-        C, L = self._output_matrix(e), self._L[rows]
-        R = innovation.covariances[passed][:, :k, :k]
+        r, a = innovation.r[passed][:, :k, None], innovation.a[passed]
+        C, L = self._output_matrix(innovation.e[passed] + a), self._L[rows]
+        R = self._noise(innovation.covariances[passed])
         weights = np.ones(len(r))
         for _ in range(REWEIGHTINGS):
-            gain_k = np.linalg.inv(L + R / weights[:, None, None])
+            gain_k = np.asarray(np.linalg.inv(L + R / weights[:, None, None]))
             P_new, x = self._pose_step(C, gain_k, r)
             pull = gain_k @ (r + C @ x)
             left = (R @ pull)[:, :, 0] / weights[:, None]
             weights = huber_weights(left, R, self._settings.huber_threshold)
         spread = gain_k - gain_k @ C @ P_new @ so3.transpose(C) @ gain_k
         self._P, self._L[rows] = P_new, L - L @ spread @ L
-        correction = self._as_correction(rows, x[:, 0], (L @ pull)[:, :, 0])
+        correction = self._as_correction(rows, x[:, 0], (L @ pull)[:, :, 0], a)
         all_weights = np.zeros(len(passed))
         all_weights[passed] = weights
         return correction, all_weights
 
     def distances(self, innovation: Innovation) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
-        k = self._axes.point
-        C, L = self._output_matrix(innovation.e), self._L[innovation.indices]
-        S = C @ self._P @ so3.transpose(C) + L + innovation.covariances[:, :k, :k]
-        return mahalanobis(innovation.r[:, :k], S)
+        C = self._output_matrix(innovation.e + innovation.a)
+        L, R = self._L[innovation.indices], self._noise(innovation.covariances)
+        S = C @ self._P @ so3.transpose(C) + L + R
+        return mahalanobis(innovation.r[:, : self._axes.point], S)
 
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Do nothing: these gains keep no history."""
@@ -122,12 +163,23 @@ class ScheduledGains:
         return np.concatenate([C, np.zeros((*C.shape[:2], self._calibration.count))], axis=2)
 
     def _first_variances(self, y_ref: FloatArray, covariances: FloatArray) -> FloatArray:
-        J, k = self._output_matrix(y_ref), self._axes.point
-        return J @ self._P @ so3.transpose(J) + covariances[:, :k, :k]
+        J = self._output_matrix(y_ref)
+        return J @ self._P @ so3.transpose(J) + self._noise(covariances)
 
-    def _as_correction(self, rows: IntArray, x: FloatArray, d: FloatArray) -> Correction:
+    def _map_variances(self, covariances: FloatArray) -> FloatArray:
+        k = self._axes.point
+        is_exact = self._settings.localization_mode == 'fixed'
+        return np.zeros((len(covariances), k, k)) if is_exact else covariances[:, :k, :k]
+
+    def _noise(self, covariances: FloatArray) -> FloatArray:
+        k = self._axes.point
+        return NOISE_INFLATION**2 * covariances[:, :k, :k]
+
+    def _as_correction(
+        self, rows: IntArray, x: FloatArray, shifts: FloatArray, a: FloatArray
+    ) -> Correction:
+        """Return the element that moves the pose by x and â_i (m, 3) by ``shifts`` alone."""
         p = len(self._axes.pose)
         self._calibration.shift(x[p:])
-        full = np.zeros((len(rows), 3))
-        full[:, : self._axes.point] = d
-        return Correction(se3.exp(self._axes.full_pose(x[:p])), rows, full)
+        D = se3.exp(self._axes.full_pose(x[:p]))
+        return Correction(D, rows, self._axes.full_points(shifts) + a - se3.rotate(D, a))
