@@ -15,12 +15,14 @@ they set gains, and are not published as covariances.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.prediction import initial_covariance, predict
-from slam_observer_ros.gains.robust import huber_weights, mahalanobis
+from slam_observer_ros.gains.gauge import anchor
+from slam_observer_ros.gains.robust import block_diagonal, huber_weights, mahalanobis
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
@@ -105,9 +107,34 @@ class ScheduledGains:
         R = block_diagonal(self._map_variances(covariances))
         x, P = anchor(P, G, np.arange(first, len(P)), R, r[:, :k].ravel())
         self._P = P[:first, :first]
-        self._L[indices] = P[first:, first:].reshape(m, k, m, k)[np.arange(m), :, np.arange(m)]
-        shifts = self._axes.full_points(-x[first:])
-        return self._as_correction(indices, -x[:first], shifts.ravel(), np.zeros_like(r))
+        own = P[first:, first:].reshape(m, k, m, k)[np.arange(m), :, np.arange(m)]
+        self._L[indices] = own * (self._settings.localization_mode != 'fixed')
+        return self._as_correction(indices, -x[:first], -x[first:], np.zeros_like(r))
+
+    def restart(self, observer: Observer) -> None:
+        """Do nothing: these gains keep no history."""
+
+    def add_known_landmarks(self, covariances: FloatArray) -> None:
+        """Append landmarks (m,) that are known from a map."""
+        k = self._axes.point
+        self._L = np.concatenate([self._L, covariances[:, :k, :k]])
+
+    def set_pose_covariance(self, covariance: FloatArray) -> None:
+        """Take ``covariance`` (6, 6) for that of ε."""
+        p, pose = len(self._axes.pose), self._axes.pose
+        self._P[:p] = self._P[:, :p] = 0.0
+        self._P[:p, :p] = covariance[np.ix_(pose, pose)]
+
+    def joint_covariance(self, indices: IntArray) -> None:
+        """Return None: how landmarks are correlated is not kept."""
+
+    def anchor(
+        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+    ) -> Correction:
+        """Return the correction that puts the known landmarks where they are known to be."""
+        k = self._axes.point
+        self._L[indices] = covariances[:, :k, :k]
+        return Correction(np.eye(4), indices, -r)
 
     def restart(self, observer: Observer) -> None:
         """Do nothing: these gains keep no history."""
@@ -168,8 +195,7 @@ class ScheduledGains:
 
     def _map_variances(self, covariances: FloatArray) -> FloatArray:
         k = self._axes.point
-        is_exact = self._settings.localization_mode == 'fixed'
-        return np.zeros((len(covariances), k, k)) if is_exact else covariances[:, :k, :k]
+        return covariances[:, :k, :k] * (self._settings.localization_mode != 'fixed')
 
     def _noise(self, covariances: FloatArray) -> FloatArray:
         k = self._axes.point
