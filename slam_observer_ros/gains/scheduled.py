@@ -114,31 +114,6 @@ class ScheduledGains:
     def restart(self, observer: Observer) -> None:
         """Do nothing: these gains keep no history."""
 
-    def add_known_landmarks(self, covariances: FloatArray) -> None:
-        """Append landmarks (m,) that are known from a map."""
-        k = self._axes.point
-        self._L = np.concatenate([self._L, covariances[:, :k, :k]])
-
-    def set_pose_covariance(self, covariance: FloatArray) -> None:
-        """Take ``covariance`` (6, 6) for that of ε."""
-        p, pose = len(self._axes.pose), self._axes.pose
-        self._P[:p] = self._P[:, :p] = 0.0
-        self._P[:p, :p] = covariance[np.ix_(pose, pose)]
-
-    def joint_covariance(self, indices: IntArray) -> None:
-        """Return None: how landmarks are correlated is not kept."""
-
-    def anchor(
-        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
-    ) -> Correction:
-        """Return the correction that puts the known landmarks where they are known to be."""
-        k = self._axes.point
-        self._L[indices] = covariances[:, :k, :k]
-        return Correction(np.eye(4), indices, -r)
-
-    def restart(self, observer: Observer) -> None:
-        """Do nothing: these gains keep no history."""
-
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
         self._L = np.delete(self._L, indices, axis=0)
