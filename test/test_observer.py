@@ -140,7 +140,7 @@ def test_any_reference_pose_gives_the_same_configuration(reference_pose):
         for step in range(40):
             y = paper_observation(0.1 * step)
             e, r = observer.errors(slice(None), y)
-            innovation = Innovation(np.arange(4), e, r, np.zeros((4, 3, 3)), 0.1)
+            innovation = Innovation(np.arange(4), e, r, observer.a, np.zeros((4, 3, 3)), 0.1)
             observer.correct(gains.correct(innovation)[0])
             observer.propagate(PAPER_VELOCITY[None], np.array([0.1]))
         return se3.transform(se3.inverse(observer.pose), observer.world_points)
@@ -165,7 +165,7 @@ def test_lyapunov_never_increases_at_any_step_gain_distance_and_rotation(
     e = y_ref @ turn.T + 0.3 * distance_m * rng.normal(size=(n, 3))
     r = e - y_ref
     settings = Settings(gain_k=k, gain_l=k * rng.uniform(0.01, 10.0), step_mode=step_mode)
-    innovation = Innovation(np.arange(n), e, r, np.zeros((n, 3, 3)), dt_s)
+    innovation = Innovation(np.arange(n), e, r, np.zeros((n, 3)), np.zeros((n, 3, 3)), dt_s)
     correction, _ = ConstantGains(settings).correct(innovation)
     remaining = se3.transform(correction.D, e) - correction.d - y_ref
     assert lyapunov(k, remaining) <= lyapunov(k, r) * (1.0 + 1e-9) + 1e-18 * k * distance_m**2
@@ -203,7 +203,7 @@ def test_far_landmarks_that_overflow_the_explicit_step_converge():
     for _ in range(500):
         e, r = observer.errors(slice(None), y_ref)
         levels.append(lyapunov(4.0, r))
-        innovation = Innovation(np.arange(100), e, r, np.zeros((100, 3, 3)), 0.02)
+        innovation = Innovation(np.arange(100), e, r, observer.a, np.zeros((100, 3, 3)), 0.02)
         observer.correct(gains.correct(innovation)[0])
     assert levels[-1] < 0.02 * levels[0]
     assert np.all(np.diff(levels) <= 0.0)
@@ -215,6 +215,6 @@ def test_unseen_landmarks_stay_where_they_are_in_the_world():
     before = observer.world_points[2:]
     seen = np.array([0, 1])
     e, r = observer.errors(seen, paper_observation(0.0)[:2])
-    innovation = Innovation(seen, e, r, np.zeros((2, 3, 3)), 0.1)
+    innovation = Innovation(seen, e, r, observer.a[seen], np.zeros((2, 3, 3)), 0.1)
     observer.correct(ConstantGains(Settings()).correct(innovation)[0])
     np.testing.assert_array_equal(observer.world_points[2:], before)
