@@ -13,6 +13,8 @@ from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.localisation import enter_map, is_lost, start_in_map
 from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
@@ -93,8 +95,10 @@ class Estimator:
     Attributes
     ----------
     counts : Counter
-        Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``), and
-        what became of landmarks (``'rejected_landmark'``, ``'moved_landmark'``).
+        Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``),
+        observations made before the place in a loaded map was found (``'not_localised'``), how
+        often it was lost again (``'lost'``), and what became of landmarks
+        (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``).
     dropped : Counter
         Events refused, by reason.
 
@@ -109,6 +113,7 @@ class Estimator:
         self.settings = settings
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self._map: LandmarkMap | None = None
         self._on_update = on_update
         self._queue = EventQueue(
             _nanoseconds(settings.reorder_window),
@@ -118,12 +123,65 @@ class Estimator:
         self.reset(initial_pose)
 
     def reset(self, pose: FloatArray | None = None) -> None:
-        """Forget the map and the motion, and start again at ``pose`` (4, 4), default identity."""
-        self._slam = Slam(self.settings, np.eye(4) if pose is None else pose, self.counts)
+        """Forget the motion and what was mapped, and start again.
+
+        Parameters
+        ----------
+        pose : FloatArray, optional
+            (4, 4) body to world. By default identity, or unknown in a map that was loaded.
+
+        """
+        self._start(pose)
         self._velocities = VelocityHistory(_nanoseconds(self.settings.velocity_timeout))
         self._state_ns: int | None = None
         self._stamp_ns: int | None = None
         self._last: Update | None = None
+
+    def load_map(
+        self,
+        landmark_map: LandmarkMap,
+        pose: FloatArray | None = None,
+        pose_covariance: FloatArray | None = None,
+    ) -> None:
+        """Estimate in the frame of a map from now on, as ``localization_mode`` says.
+
+        Parameters
+        ----------
+        landmark_map : LandmarkMap
+            What is known. It takes the place of a map loaded before.
+        pose : FloatArray, optional
+            (4, 4) pose in the map's frame; what was mapped until now is forgotten. By default
+            the pose is unknown: it follows from landmarks of the map that are seen, three in
+            space or two in a plane, and what was mapped until then is carried into the map's
+            frame. See :attr:`is_localised`.
+        pose_covariance : FloatArray, optional
+            (6, 6) covariance of ``pose`` as :attr:`pose_covariance` has it; default exact.
+
+        """
+        self._map = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
+        self._is_in_map = False
+        if pose is None:
+            self._enter_map()
+        else:
+            self.set_pose(pose, pose_covariance)
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
+        """Move the robot as of ``stamp_ns``; the map stays.
+
+        Parameters
+        ----------
+        pose : FloatArray
+            (4, 4) body to world. If the place in a loaded map was not known, it is now.
+        covariance : FloatArray, optional
+            (6, 6) its covariance, as :attr:`pose_covariance` has it; default exact.
+
+        """
+        if self._stamp_ns is not None:
+            self._advance(self._stamp_ns)
+        if self.is_localised:
+            self._slam.set_pose(pose, covariance)
+        else:
+            self._start(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other gains from now on; parameters that are read-only keep their effect."""
@@ -145,7 +203,7 @@ class Estimator:
             return False
         if jumped:
             logger.warning('The clock has jumped; starting again.')
-            self.reset(self._slam.observer.reference_pose)
+            self.reset(None if self._map else self._slam.observer.reference_pose)
             self._queue.restart(event)
         for ready in self._queue.pop_ready():
             self._process(ready)
@@ -177,6 +235,21 @@ class Estimator:
             return False
         self._slam.remove(rows)
         return True
+
+    @property
+    def is_localised(self) -> bool:
+        """Whether the estimate is in its final frame: always, unless a map was loaded.
+
+        Until the place in a loaded map is found, the estimate is in a frame of its own.
+        """
+        return self._map is None or self._is_in_map
+
+    @property
+    def landmark_map(self) -> LandmarkMap:
+        """The present map, as it can be saved and loaded."""
+        return LandmarkMap(
+            self.landmark_ids, self.world_points, self.landmark_covariances, self.landmark_counts
+        )
 
     @property
     def stamp_ns(self) -> int | None:
@@ -281,10 +354,35 @@ class Estimator:
         self._advance(event.stamp_ns)
         ids, residuals = self._slam.observe(event)
         self.counts['observation'] += 1
+        self._localise(ids)
         level = lyapunov(self.settings.gain_k, residuals)
         self._last = Update(event.stamp_ns, self._slam.observer.pose, ids, residuals, level)
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
+        """Start with an empty map, or with the one that was loaded."""
+        self._slam = Slam(self.settings, np.eye(4) if pose is None else pose, self.counts)
+        self._is_in_map = self._map is not None and pose is not None
+        if self._map is not None and pose is not None:
+            start_in_map(self._slam, self._map, covariance)
+
+    def _localise(self, seen_ids: IntArray) -> None:
+        """Find the place in the loaded map if it is not known, or not any more."""
+        if self._map is None:
+            return
+        if self._is_in_map and is_lost(self._slam, seen_ids):
+            logger.warning('All landmarks are far from where they should be; localising anew.')
+            self.counts['lost'] += 1
+            self._start(None)
+        if not self._is_in_map:
+            self._enter_map()
+            self.counts['not_localised'] += not self._is_in_map
+
+    def _enter_map(self) -> None:
+        if self._map is not None and enter_map(self._slam, self._map):
+            self._is_in_map = True
+            logger.info('Found the place in the map of %d landmarks.', len(self._map.ids))
 
     def _begin(self, stamp_ns: int) -> None:
         self._stamp_ns = max(stamp_ns, self._stamp_ns or stamp_ns)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -32,13 +34,19 @@ class LandmarkMap:
     counts: IntArray
     frame_id: str = 'map'
 
-    def __len__(self) -> int:
-        """Return the number of landmarks."""
-        return len(self.ids)
-
     def select(self, rows: IntArray | BoolArray) -> LandmarkMap:
         """Return the map of the landmarks at ``rows``."""
         covariances = None if self.covariances is None else self.covariances[rows]
         return LandmarkMap(
             self.ids[rows], self.world_points[rows], covariances, self.counts[rows], self.frame_id
         )
+
+    def flattened(self) -> LandmarkMap:
+        """Return the map with all landmarks in the plane z = 0."""
+        return replace(self, world_points=self.world_points * np.array([1.0, 1.0, 0.0]))
+
+    def covariances_or(self, sigma_m: float) -> FloatArray:
+        """Return (n, 3, 3) covariances, those of ``sigma_m`` in each coordinate if unknown."""
+        if self.covariances is not None:
+            return self.covariances
+        return np.tile(sigma_m**2 * np.eye(3), (len(self.ids), 1, 1))

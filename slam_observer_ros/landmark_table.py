@@ -52,6 +52,11 @@ class LandmarkTable:
         self.last_seen_ns = np.concatenate([self.last_seen_ns, np.full(len(ids), stamp_ns)])
         self._order = np.argsort(self.ids)
 
+    def add_known(self, ids: IntArray, counts: IntArray) -> None:
+        """Append landmarks (m,) that were seen ``counts`` (m,) times before this run."""
+        self.add(ids, 0)
+        self.counts[len(self.counts) - len(ids) :] = counts
+
     def see(self, indices: IntArray, stamp_ns: int) -> None:
         """Count one more accepted observation of the rows ``indices`` (m,)."""
         self.counts[indices] += 1

@@ -46,9 +46,9 @@ class ConstantGains:
         self.change_settings(settings)
 
     def change_settings(self, settings: Settings) -> None:
-        """Take over k, l and the step mode."""
+        """Take over k, l (zero in a fixed map) and the step mode."""
         self.gain_k = settings.gain_k
-        self.gain_l = settings.gain_l
+        self.gain_l = 0.0 if settings.localization_mode == 'fixed' else settings.gain_l
         self.step_mode = settings.step_mode
 
     def predict(self, motion: Motion) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.types import FloatArray, IntArray
@@ -35,6 +36,10 @@ class FixedMapGains(RiccatiGains):
         """(n, 3, 3) covariances of the landmarks, as the map has them."""
         return self._landmark_covariances
 
+    def predict(self, motion: Motion) -> None:
+        """Add the motion's noise to the pose's covariance."""
+        predict(self._P, self._axes, self._calibration, motion)
+
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
         self._landmark_covariances = np.delete(self._landmark_covariances, indices, axis=0)
@@ -43,9 +48,6 @@ class FixedMapGains(RiccatiGains):
         """Do nothing: in an exact map there is no drift to undo."""
 
     def restart(self, observer: Observer) -> None:
-        """Do nothing: nothing is kept of the past."""
-
-    def _remember(self, motion: Motion) -> None:
         """Do nothing: nothing is kept of the past."""
 
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:

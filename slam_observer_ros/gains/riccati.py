@@ -216,9 +216,6 @@ class RiccatiGains:
         self._history = History(self._axes, prior)
         self._observations, self._turn_squared = 0, 0.0
 
-    def _remember(self, motion: Motion) -> None:
-        self._history.move(motion, self._calibration)
-
     def _smoother(self) -> Smoother:
         history = self._history
         return Smoother(self._axes, history.prior, history.frames(), self._settings)

@@ -20,8 +20,8 @@ from scipy.linalg import block_diag
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
-from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.gauge import anchor
+from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import block_diagonal, huber_weights, mahalanobis
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, Observer

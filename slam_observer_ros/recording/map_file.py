@@ -1,72 +1,231 @@
-"""Maps as files: landmark ids, positions and what is known of their accuracy."""
+"""Maps as YAML files: a head, then a line a landmark.
+
+The same format serves saved maps and surveyed ones. A surveyor writes no more than this::
+
+    format: slam_observer_ros map
+    version: 1
+    frame: map
+    landmarks:
+    - {id: 7, position: [1.5, -2.0, 0.3], sigma: 0.01}
+
+``sigma`` is the standard deviation of each coordinate, metres; a saved map has the whole
+``covariance`` (m²) in its place, ``observations`` (how often each landmark was seen), and tells
+in its head with which ``package_version`` and ``settings`` it was made.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping, Sequence
+import dataclasses
 import os
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
 
-from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros import __version__
+from slam_observer_ros.errors import MapError
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray
 
+FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
 
+_MAX_INT64 = 2**63 - 1
 
-def write_map(
-    path: Path,
-    ids: IntArray,
-    world_points: FloatArray,
-    counts: IntArray,
-    covariances: FloatArray | None = None,
-    frame_id: str = 'map',
-) -> None:
-    """Write a map as YAML, a line a landmark; the file appears whole or not at all.
+_LARGEST = 1e12
+"""Metres; nothing larger is meant seriously, and its square still has all digits."""
+
+_ROUNDING = 1e-6
+"""Part of a covariance's largest entry by which it may miss being one."""
+
+_Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # ten times faster, where libyaml is
+
+
+def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
+    """Write a map; the file appears whole or not at all.
 
     Parameters
     ----------
     path : Path
         File to create or replace.
-    ids : IntArray
-        (n,) landmark ids.
-    world_points : FloatArray
-        (n, 3) positions, metres, in ``frame_id``.
-    counts : IntArray
-        (n,) in how many observations each was seen.
-    covariances : FloatArray, optional
-        (n, 3, 3) covariances of the positions, m².
-    frame_id : str
-        Frame of the positions.
+    landmark_map : LandmarkMap
+        What to write.
+    settings : Settings
+        With what the map was made, to be told in the file.
 
     Raises
     ------
-    RecordingError
+    MapError
         If the file can't be written.
 
     """
-    head = {'format': 'slam_observer_ros map', 'version': FORMAT_VERSION, 'frame': frame_id}
-    landmarks: list[dict[str, object]] = [
-        {'id': landmark_id, 'position': position, 'observations': count}
-        for landmark_id, position, count in zip(
-            ids.tolist(), world_points.tolist(), counts.tolist(), strict=True
-        )
-    ]
-    if covariances is not None:
-        for landmark, covariance in zip(landmarks, covariances.tolist(), strict=True):
-            landmark['covariance'] = covariance
+    head = {
+        'format': FORMAT,
+        'version': FORMAT_VERSION,
+        'frame': landmark_map.frame_id,
+        'package_version': __version__,
+        'settings': {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in dataclasses.asdict(settings).items()
+        },
+    }
+    lines = [_on_one_line(landmark) for landmark in _as_mappings(landmark_map)]
     unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
         with unfinished.open('w', encoding='utf-8') as file:
             yaml.safe_dump(head, file, sort_keys=False)
-            file.write('landmarks:\n' if landmarks else 'landmarks: []\n')
-            for landmark in landmarks:
-                file.write(f'- {_on_one_line(landmark)}')
+            file.write('landmarks:\n' if lines else 'landmarks: []\n')
+            file.writelines(f'- {line}' for line in lines)
+            file.flush()
+            os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file
         unfinished.replace(path)
     except OSError as error:
-        raise RecordingError(f"can't write {path}: {error.strerror}") from error
+        raise MapError(f"can't write map {path}: {error.strerror}") from error
     finally:
         unfinished.unlink(missing_ok=True)
 
 
-def _on_one_line(landmark: dict[str, object]) -> str:
-    return yaml.safe_dump(landmark, default_flow_style=True, sort_keys=False, width=10**6)
+def read_map(path: Path) -> LandmarkMap:
+    """Read a map, strictly.
+
+    Raises
+    ------
+    MapError
+        If the file can't be read, is no map of a version that is known, lacks a field or has one
+        too many, or holds a value that can't be right; the message names the file, the landmark
+        and the reason.
+
+    """
+    try:
+        content = yaml.load(path.read_text(encoding='utf-8'), _Loader)
+    except OSError as error:
+        raise MapError(f"can't read map {path}: {error.strerror}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = str(error).splitlines()[0]
+        raise MapError(f'map {path} is not valid YAML: {reason}') from error
+    try:
+        return _parse(content)
+    except MapError as error:
+        raise MapError(f'map {path}: {error}') from error
+
+
+def _as_mappings(landmark_map: LandmarkMap) -> list[dict[str, Any]]:
+    landmarks: list[dict[str, Any]] = [
+        {'id': landmark_id, 'position': position, 'observations': count}
+        for landmark_id, position, count in zip(
+            landmark_map.ids.tolist(),
+            landmark_map.world_points.tolist(),
+            landmark_map.counts.tolist(),
+            strict=True,
+        )
+    ]
+    if landmark_map.covariances is not None:
+        for landmark, covariance in zip(landmarks, landmark_map.covariances, strict=True):
+            landmark['covariance'] = covariance.tolist()
+    return landmarks
+
+
+def _on_one_line(landmark: Mapping[str, Any]) -> str:
+    return yaml.safe_dump(dict(landmark), default_flow_style=True, sort_keys=False, width=10**6)
+
+
+def _parse(content: Any) -> LandmarkMap:
+    is_map = isinstance(content, dict) and content.get('format') == FORMAT
+    _expect(is_map, f"it has no line 'format: {FORMAT}'")
+    version = content.get('version')
+    if version != FORMAT_VERSION:
+        raise MapError(f'it has version {version!r}; this program reads {FORMAT_VERSION}')
+    required = ('format', 'version', 'frame', 'landmarks')
+    _check_names('it', content, required, ('package_version', 'settings'))
+    frame_id, rows = content['frame'], content['landmarks']
+    _expect(isinstance(frame_id, str) and frame_id != '', f"'frame' is {frame_id!r}, not a name")
+    _expect(isinstance(rows, list), "'landmarks' is not a list")
+    ids = [_landmark_id(row, place) for place, row in enumerate(rows)]
+    for landmark_id, times in Counter(ids).items():
+        _expect(times == 1, f'landmark {landmark_id} is there {times} times')
+    return LandmarkMap(
+        np.array(ids, dtype=np.int64),
+        np.array([_position(row) for row in rows], dtype=np.float64).reshape(-1, 3),
+        _covariances(rows),
+        np.array([_observations(row) for row in rows], dtype=np.int64),
+        frame_id,
+    )
+
+
+def _landmark_id(row: Any, place: int) -> int:
+    who = f'entry {place} of landmarks'
+    _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
+    _check_names(who, row, ('id', 'position'), ('sigma', 'covariance', 'observations'))
+    return _natural(row['id'], f"{who}: 'id'")
+
+
+def _position(row: Mapping[str, Any]) -> list[float]:
+    return _numbers(row['position'], 3, f"landmark {row['id']}: 'position'")
+
+
+def _observations(row: Mapping[str, Any]) -> int:
+    return _natural(row.get('observations', 0), f"landmark {row['id']}: 'observations'")
+
+
+def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:
+    """Return (n, 3, 3) covariances, m²; None where no landmark has one."""
+    if not any('sigma' in row or 'covariance' in row for row in rows):
+        return None
+    return np.array([_covariance(row) for row in rows])
+
+
+def _covariance(row: Mapping[str, Any]) -> FloatArray:
+    who = f'landmark {row["id"]}'
+    given = [name for name in ('sigma', 'covariance') if name in row]
+    if len(given) != 1:
+        raise MapError(f"{who} has {len(given) or 'none'} of 'sigma' and 'covariance', not one")
+    if 'sigma' in row:
+        (sigma_m,) = _numbers([row['sigma']], 1, f"{who}: 'sigma'")
+        _expect(sigma_m >= 0.0, f"{who}: 'sigma' is negative")
+        return sigma_m**2 * np.eye(3)
+    lines = row['covariance']
+    _expect(isinstance(lines, list) and len(lines) == 3, f"{who}: 'covariance' is not 3 × 3")
+    covariance = np.array([_numbers(line, 3, f"{who}: a row of 'covariance'") for line in lines])
+    tolerance = _ROUNDING * np.abs(covariance).max()
+    is_symmetric = np.abs(covariance - covariance.T).max() <= tolerance
+    _expect(
+        bool(is_symmetric and np.linalg.eigvalsh(covariance).min() >= -tolerance),
+        f"{who}: 'covariance' is not symmetric, or negative in some direction",
+    )
+    return covariance
+
+
+def _check_names(
+    who: str, mapping: Mapping[Any, Any], required: Sequence[str], optional: Sequence[str]
+) -> None:
+    for name in required:
+        _expect(name in mapping, f"{who} lacks '{name}'")
+    for name in mapping:
+        _expect(name in (*required, *optional), f"{who} has '{name}', which is not known here")
+
+
+def _natural(value: Any, what: str) -> int:
+    is_natural = isinstance(value, int) and not isinstance(value, bool)
+    _expect(
+        is_natural and 0 <= value <= _MAX_INT64, f'{what} is {value!r}, not a whole number ≥ 0'
+    )
+    return int(value)
+
+
+def _numbers(value: Any, count: int, what: str) -> list[float]:
+    is_list = isinstance(value, list) and len(value) == count
+    _expect(is_list, f'{what} is {value!r}, not a list of {count} numbers')
+    for entry in value:
+        is_number = isinstance(entry, int | float) and not isinstance(entry, bool)
+        # Written so that NaN is refused too.
+        _expect(is_number and abs(entry) <= _LARGEST, f'{what} has {entry!r}, no finite number')
+    return [float(entry) for entry in value]
+
+
+def _expect(holds: bool, message: str) -> None:
+    if not holds:
+        raise MapError(message)

@@ -1,0 +1,225 @@
+"""Places an estimate in the frame of a map that is known in advance.
+
+Where the start is unknown the robot maps in a frame of its own at first. Once enough landmarks of
+the known map are among its own, well enough spread, the whole estimate is moved into the known
+frame and both maps become one. So it does not matter whether these landmarks are seen at once or
+one after another, nor whether the map is known from the start or is loaded later.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.gains.fixed_map import FixedMapGains
+from slam_observer_ros.gains.gauge import fit_gauge, GaugeFit, JITTER_M2
+from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.robust import block_diagonal
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.slam import Slam
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+MAX_TURN_STD_RAD = 0.2
+"""Standard deviation about any axis beyond which landmarks don't tell how a map lies.
+
+Three of them in a line leave the roll about it open; two that are close together, the heading.
+"""
+
+CONTRADICTION_SIGMAS = 4.0
+"""Landmarks whose misfit is as improbable as this contradict each other."""
+
+
+def start_in_map(slam: Slam, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
+    """Take a map into an estimate that has none yet, at a pose that is given in the map's frame.
+
+    Parameters
+    ----------
+    slam : Slam
+        At its start.
+    known : LandmarkMap
+        The map.
+    pose_covariance : FloatArray or None
+        (6, 6) covariance of rotation vector and position along the map's axes, rad² and m²;
+        None for an exact pose.
+
+    """
+    slam.set_pose(slam.observer.pose, pose_covariance)
+    _complete(slam, known)
+
+
+def enter_map(slam: Slam, known: LandmarkMap) -> bool:
+    """Move an estimate into the frame of a map, if enough of its landmarks have been seen.
+
+    Landmarks that both have are merged. Those that contradict the others are taken as the map has
+    them, and those that only the estimate has are kept where mapping goes on.
+
+    Returns
+    -------
+    bool
+        Whether the estimate is now in the map's frame.
+
+    """
+    rows = slam.landmarks.indices_of(known.ids)
+    shared = np.flatnonzero(rows >= 0)
+    found = _find_frame(slam, rows[shared], known.select(shared))
+    if found is None:
+        return False
+    slam.observer.reference_pose, agree = found
+    merged = shared[agree]
+    _merge(slam, rows[merged], known.select(merged))
+    if slam.settings.localization_mode == 'off':
+        slam.remove(rows[shared[~agree]])
+    else:
+        slam.remove(np.setdiff1d(np.arange(len(slam.landmarks)), rows[merged]))
+    _complete(slam, known)
+    return True
+
+
+def is_lost(slam: Slam, seen_ids: IntArray) -> bool:
+    """Return whether a place in a map has been wrong for some time, or the robot was carried.
+
+    All landmarks just seen were rejected then, and as many as would do to find the place again
+    were rejected so often that elsewhere they would be taken to have moved.
+    """
+    rejections = slam.landmarks.rejections
+    just_now = rejections[slam.landmarks.indices_of(seen_ids)]
+    often = np.sum(rejections >= slam.settings.max_rejections) >= _axes(slam).point
+    return not slam.is_mapping and bool(often and len(just_now) and just_now.all())
+
+
+def find_transform(
+    source: FloatArray,
+    source_covariance: FloatArray,
+    target: FloatArray,
+    target_covariances: FloatArray,
+    axes: Axes,
+) -> tuple[FloatArray, BoolArray] | None:
+    """Find how the frames of two maps lie to each other, even if some landmarks are wrong.
+
+    Landmarks are left out, the worst one first, until the others don't contradict each other.
+
+    Parameters
+    ----------
+    source : FloatArray
+        (m, 3) landmarks in the one frame, metres.
+    source_covariance : FloatArray
+        (m k, m k) their covariance, m².
+    target : FloatArray
+        (m, 3) the same landmarks in the other frame, metres.
+    target_covariances : FloatArray
+        (m, 3, 3) covariance of each of them in that frame, m².
+    axes : Axes
+        Whether they lie in space (k = 3) or in a plane (k = 2).
+
+    Returns
+    -------
+    tuple or None
+        Transform (4, 4) from the source's frame to the target's, and by which landmarks (m,) it
+        was found. None unless at least k of them agree and tell how to turn.
+
+    """
+    agree = np.ones(len(source), dtype=np.bool_)
+    allowed = 2.0 * norm.sf(CONTRADICTION_SIGMAS)
+    while agree.sum() >= axes.point:
+        used = np.repeat(agree, axes.point)
+        own, there = source_covariance[np.ix_(used, used)], target_covariances[agree]
+        T = _aligned(source[agree], own, target[agree], there)
+        fit, misfits = _misfits(T, source[agree], own, target[agree], there, axes)
+        if _turn_std_rad(fit, axes) > MAX_TURN_STD_RAD:
+            return None
+        if chi2.sf(fit.misfit, len(own) - len(axes.pose)) >= allowed:
+            return T, agree
+        agree[np.flatnonzero(agree)[np.argmax(misfits)]] = False
+    return None
+
+
+def _aligned(
+    source: FloatArray, own: FloatArray, target: FloatArray, there: FloatArray
+) -> FloatArray:
+    """Return the transform (4, 4) that aligns landmarks weighted by how well each is known."""
+    variances = np.diagonal(own).reshape(len(source), -1).sum(axis=1)
+    variances = variances + np.trace(there, axis1=1, axis2=2) + JITTER_M2
+    return rigid_alignment(source, target, 1.0 / variances)
+
+
+def _misfits(
+    T: FloatArray,
+    source: FloatArray,
+    own: FloatArray,
+    target: FloatArray,
+    there: FloatArray,
+    axes: Axes,
+) -> tuple[GaugeFit, FloatArray]:
+    """Return what changes T (4, 4) for the better, and how badly each landmark (m,) fits."""
+    k, R = axes.point, T[:3, :3]
+    S = own + block_diagonal((R.T @ there @ R)[:, :k, :k]) + JITTER_M2 * np.eye(len(own))
+    r = (source - se3.transform(se3.inverse(T), target))[:, :k]
+    arms = source - source.mean(axis=0)
+    fit = fit_gauge(axes.output_matrix(arms).reshape(r.size, -1), S, r.ravel())
+    return fit, np.sum(r**2 / np.diagonal(S).reshape(-1, k), axis=1)
+
+
+def _turn_std_rad(fit: GaugeFit, axes: Axes) -> float:
+    """Return the largest standard deviation of the fit's rotation about any axis."""
+    turns = len(axes.pose) - axes.point
+    W = fit.information
+    by_shift = np.linalg.solve(W[turns:, turns:], W[turns:, :turns])
+    smallest = float(np.linalg.eigvalsh(W[:turns, :turns] - W[:turns, turns:] @ by_shift)[0])
+    return float(smallest**-0.5) if smallest > 0.0 else np.inf
+
+
+def _find_frame(
+    slam: Slam, rows: IntArray, known: LandmarkMap
+) -> tuple[FloatArray, BoolArray] | None:
+    """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
+    axes = _axes(slam)
+    points = (slam.observer.y_ref + slam.observer.a)[rows]
+    covariance = slam.gains.joint_covariance(rows)
+    if covariance is None:
+        covariance = slam.settings.point_noise**2 * np.eye(axes.point * len(rows))
+    covariances = known.covariances_or(slam.settings.map_noise)
+    return find_transform(points, covariance, known.world_points, covariances, axes)
+
+
+def _axes(slam: Slam) -> Axes:
+    return PLANAR if slam.settings.two_d_mode else SPATIAL
+
+
+def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
+    """Correct the estimate by what a map knows of the landmarks at ``rows``."""
+    observer = slam.observer
+    points = observer.y_ref + observer.a
+    targets, covariances = _in_reference_frame(slam, known)
+    observer.rebase(observer.A, points)
+    r = points[rows] - targets
+    observer.correct(slam.gains.anchor(points, rows, r, covariances))
+    slam.landmarks.counts[rows] += known.counts
+
+
+def _complete(slam: Slam, known: LandmarkMap) -> None:
+    """Append what a map has beyond the estimate, now that both are in one frame."""
+    observer, settings = slam.observer, slam.settings
+    new = known.select(slam.landmarks.indices_of(known.ids) < 0)
+    y_ref, covariances = _in_reference_frame(slam, new)
+    observer.add_reference_landmarks(y_ref)
+    slam.gains.add_known_landmarks(covariances)
+    # A surveyed landmark needs no observation to be believed.
+    slam.landmarks.add_known(new.ids, np.maximum(new.counts, settings.confirmations))
+    observer.rebase(observer.A, observer.y_ref + observer.a)
+    if settings.localization_mode == 'fixed':
+        observer.y_ref[slam.landmarks.indices_of(known.ids)] = _in_reference_frame(slam, known)[0]
+        if isinstance(slam.gains, RiccatiGains):
+            slam.gains = FixedMapGains(slam.gains)
+    slam.is_mapping = settings.localization_mode == 'off'
+    slam.gains.restart(observer)
+
+
+def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:
+    """Return positions (m, 3) and covariances (m, 3, 3) of a map in the frame of P°."""
+    back = se3.inverse(slam.observer.reference_pose)
+    R = back[:3, :3]
+    covariances: FloatArray = R @ known.covariances_or(slam.settings.map_noise) @ R.T
+    return se3.transform(back, known.world_points), covariances
