@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-import os
 from pathlib import Path
 import re
 import signal
@@ -17,9 +16,6 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
-
-# Without shared memory, whose files other test runs on this machine might clear away.
-os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
 
 PATIENCE_S = 30.0
 """How long anything may take before a test fails; it normally takes a fraction of a second."""

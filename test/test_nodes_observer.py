@@ -376,6 +376,26 @@ def test_bad_parameter_at_the_start_is_refused_with_the_reason(ros, tmp_path):
     assert 'Traceback' not in node.output
 
 
+def test_large_ids_and_foreign_frames_are_warned_about(ros, observer):
+    maps = ros.collect(PointCloud2, 'map', LATCHED_QOS)
+    large_id = 2**32 - 2
+    with Robot(ros) as robot:
+        start_ns = time.time_ns()
+        for step in range(5):
+            stamp = start_ns + step * 100_000_000
+            point = np.array([[1.0, 0.0, 0.0]])
+            cloud = point_cloud2_message(stamp, 'camera', np.array([large_id]), point)
+            robot.landmarks.publish(cloud)
+        ros.spin_until(
+            lambda: (
+                maps and large_id in decode_point_cloud2(serialize_message(maps[-1])).event.ids
+            ),
+            'the landmark',
+        )
+    assert "frame 'camera' is taken to be in the base frame" in observer.output
+    assert "landmark_estimates can't carry ids" in observer.output
+
+
 def test_reset_forgets_pose_and_map(ros, observer):
     estimates = ros.collect(PointCloud, 'landmark_estimates')
     poses = ros.collect(PoseWithCovarianceStamped, 'pose')

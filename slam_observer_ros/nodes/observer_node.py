@@ -41,6 +41,7 @@ class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         estimator_settings = read_settings(self, Settings)
         self._estimator = Estimator(estimator_settings)
         self._outputs = Outputs(self, settings, self._estimator)
+        self._accepted_frames = {'', settings.base_frame}
         self._twist = Input(self, 'twist', settings.velocity_type, VELOCITY_DECODERS, self._add)
         self._landmarks = Input(
             self, 'landmarks', settings.landmarks_type, LANDMARK_DECODERS, self._add
@@ -68,6 +69,12 @@ class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
             self.create_timer(period_s, callback, clock=clock)
 
     def _add(self, message: VelocityMessage | ObservationMessage) -> None:
+        if message.frame_id not in self._accepted_frames:
+            self._accepted_frames.add(message.frame_id)
+            self.get_logger().warning(
+                f"what comes in frame '{message.frame_id}' is taken to be in the base frame: "
+                'no transform is applied'
+            )
         self._estimator.add(message.event)
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:

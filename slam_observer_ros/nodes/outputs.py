@@ -11,6 +11,7 @@ from geometry_msgs.msg import (
     TwistWithCovariance,
 )
 from nav_msgs.msg import Odometry, Path
+import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud, PointCloud2
 from std_msgs.msg import Float64
@@ -29,7 +30,7 @@ from slam_observer_ros.nodes.markers import landmark_markers
 from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.nodes.transforms import TransformPublisher
-from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
+from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud, FLOAT32_ID_LIMIT
 
 PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
@@ -53,6 +54,7 @@ class Outputs:
     """
 
     def __init__(self, node: Node, settings: ObserverNodeSettings, estimator: Estimator) -> None:
+        self._node = node
         self._settings = settings
         self._estimator = estimator
         self._fast_stamp_ns: int | None = None
@@ -79,14 +81,7 @@ class Outputs:
         self._publish_pose(stamp_ns)
         self._extend_path(stamp_ns)
         self._lyapunov.publish(Float64(data=float(self._estimator.lyapunov)))
-        self._estimates.publish(
-            encode_point_cloud(
-                stamp_ns,
-                self._settings.map_frame,
-                self._estimator.landmark_ids,
-                self._estimator.world_points,
-            )
-        )
+        self._publish_estimates(stamp_ns)
 
     def publish_overview(self) -> None:
         """Publish path, map and markers if they are new; they are costly, so seldom."""
@@ -137,6 +132,18 @@ class Outputs:
                 self._settings.base_frame,
                 self._estimator.pose,
             )
+
+    def _publish_estimates(self, stamp_ns: int) -> None:
+        ids = self._estimator.landmark_ids
+        if np.any(ids >= FLOAT32_ID_LIMIT):
+            self._node.get_logger().warning(
+                f"landmark_estimates can't carry ids from {FLOAT32_ID_LIMIT} on; map does",
+                once=True,
+            )
+            return
+        points = self._estimator.world_points
+        raw = encode_point_cloud(stamp_ns, self._settings.map_frame, ids, points)
+        self._estimates.publish(raw)
 
     def _extend_path(self, stamp_ns: int) -> None:
         last_ns = self._path_stamp_ns

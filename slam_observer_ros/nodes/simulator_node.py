@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-import math
 import sys
 import time
 
@@ -56,7 +55,6 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._scenario = read_settings(self, Scenario)
         self._create_publishers()
         self._steady_clock = RosClock(clock_type=ClockType.STEADY_TIME)
-        self._start_wall_s = math.inf
         self._wait_timer = self.create_timer(TICK_S, self._wait, clock=self._steady_clock)
 
     def _create_publishers(self) -> None:
@@ -82,21 +80,19 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
             if publisher.get_subscription_count() < needed
         ]
         if lacking:
-            self._start_wall_s = math.inf
             self.get_logger().info(
                 f'waiting for {needed} subscriber(s) on {" and ".join(lacking)}'
                 ' (parameter wait_for_subscribers)',
                 throttle_duration_sec=WAIT_REPORT_PERIOD_S,
             )
             return
-        self._start_wall_s = min(
-            self._start_wall_s, time.monotonic() + MATCH_DELAY_S * (needed > 0)
-        )
-        if time.monotonic() >= self._start_wall_s:
-            self.destroy_timer(self._wait_timer)
-            self._start()
+        self.destroy_timer(self._wait_timer)
+        delay_s = MATCH_DELAY_S if needed else 0.0
+        self._start_timer = self.create_timer(delay_s, self._start, clock=self._steady_clock)
 
     def _start(self) -> None:
+        self.destroy_timer(self._start_timer)
+        self._start_wall_s = time.monotonic()
         self._start_ns = (
             SIMULATED_EPOCH_NS if self._publishes_clock else self.get_clock().now().nanoseconds
         )
