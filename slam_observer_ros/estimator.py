@@ -396,15 +396,17 @@ class Estimator:
         return self._slam.motion(self._velocities.held(start_ns, end_ns))
 
     def _carry_forward(self, event: ObservationEvent) -> ObservationEvent:
-        """Return what would be seen at the state's stamp: Φ⁻¹ y(t − τ), Φ the motion since."""
+        """Return what would be seen at the state's stamp: Φ⁻¹ (y + v τ), Φ the motion since."""
         state_ns = self._state_ns or 0
         back = self._motion(state_ns, event.stamp_ns)
         self.counts['late_observation'] += 1
-        turn = back[:3, :3]
+        turn, points = back[:3, :3], event.points
+        if event.velocities is not None:
+            points = points + event.velocities * (state_ns - event.stamp_ns) * 1e-9
         return replace(
             event,
             stamp_ns=state_ns,
-            points=se3.transform(back, event.points),
+            points=se3.transform(back, points),
             covariances=None if event.covariances is None else turn @ event.covariances @ turn.T,
             velocities=None if event.velocities is None else se3.rotate(back, event.velocities),
         )

@@ -59,6 +59,10 @@ class Observer:
         (n, 3) â_i, metres, reference frame.
     y_ref : FloatArray
         (n, 3) y_i° = P°⁻¹ p_i°, metres, reference frame.
+    u : FloatArray
+        (n, 3) velocities R_Â v_i of landmarks that move, m/s, reference frame; else zero.
+    shifts : FloatArray
+        (n, 3) how far the landmarks' own motion has moved them so far, metres.
     reference_pose : FloatArray
         (4, 4) P°.
 
@@ -69,6 +73,8 @@ class Observer:
         self.A: FloatArray = np.eye(4)
         self.a: FloatArray = np.empty((0, 3))
         self.y_ref: FloatArray = np.empty((0, 3))
+        self.u: FloatArray = np.empty((0, 3))
+        self.shifts: FloatArray = np.empty((0, 3))
 
     @property
     def pose(self) -> FloatArray:
@@ -95,6 +101,8 @@ class Observer:
         """Append landmarks with given reference y_i° (m, 3), metres, and â_i = 0."""
         self.y_ref = np.concatenate([self.y_ref, y_ref])
         self.a = np.concatenate([self.a, np.zeros_like(y_ref)])
+        self.u = np.concatenate([self.u, np.zeros_like(y_ref)])
+        self.shifts = np.concatenate([self.shifts, np.zeros_like(y_ref)])
 
     def relocate_landmarks(self, indices: IntArray, points: FloatArray) -> None:
         """Give landmarks a new reference y_i° = Â y_i where seen now, ``points`` (m, 3)."""
@@ -111,6 +119,8 @@ class Observer:
         """Delete the landmarks at ``indices``; those behind move up."""
         self.y_ref = np.delete(self.y_ref, indices, axis=0)
         self.a = np.delete(self.a, indices, axis=0)
+        self.u = np.delete(self.u, indices, axis=0)
+        self.shifts = np.delete(self.shifts, indices, axis=0)
 
     def errors(
         self, indices: IntArray | slice, points: FloatArray
@@ -157,9 +167,23 @@ class Observer:
         self.A = path[-1]
         return path
 
-    def move_landmarks(self, indices: IntArray, shifts: FloatArray) -> None:
-        """Add ``shifts`` (m, 3), metres, to â_i: the lift ȧ_i = R_A v_i of landmarks that move."""
-        self.a[indices] += shifts
+    def set_landmark_velocities(self, indices: IntArray, velocities: FloatArray) -> None:
+        """Let landmarks move from now on.
+
+        Parameters
+        ----------
+        indices : IntArray
+            (m,) which landmarks.
+        velocities : FloatArray
+            (m, 3) their velocities v_i (19), m/s, body frame at this instant.
+
+        """
+        self.u[indices] = se3.rotate(self.A, velocities)
+
+    def move_landmarks(self, duration_s: float) -> None:
+        """Add R_Â v_i dt to â_i: the lift of the landmarks' own velocities (19)."""
+        self.a += self.u * duration_s
+        self.shifts += self.u * duration_s
 
     def correct(self, correction: Correction) -> None:
         """Move the state from the left by (D, d_i); see the module's text."""

@@ -118,6 +118,7 @@ class Slam:
     def advance(self, held: HeldVelocities) -> None:
         """Move the state on along ``held``."""
         path = self.observer.propagate(self.gains.calibrated(held.body_velocities), held.dt_s)
+        self.observer.move_landmarks(float(np.sum(held.dt_s + held.gap_s)))
         covariances = self._noise.motion(held)
         self.gains.predict(Motion(path, held.body_velocities, held.dt_s, covariances))
 
@@ -140,6 +141,8 @@ class Slam:
         residuals = self._innovate(_select(event, known), rows[known])
         self._initialise(_select(event, ~known))
         rows = self.landmarks.indices_of(event.ids)
+        if event.velocities is not None:
+            self.observer.set_landmark_velocities(rows, event.velocities)
         in_doubt = self._in_doubt(rows) if self.is_mapping else np.zeros(len(rows), np.bool_)
         seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
         self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
@@ -164,7 +167,8 @@ class Slam:
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
         stamps_ns = np.array(self.gains.stamps_ns, dtype=np.int64)
-        return stamps_ns, P @ solution.poses[1:], se3.transform(P, solution.points)
+        points = se3.transform(P, solution.points + self.observer.shifts)
+        return stamps_ns, P @ solution.poses[1:], points
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""

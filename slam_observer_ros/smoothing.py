@@ -67,6 +67,8 @@ class Frames:
         (M,) which landmark it is.
     points : FloatArray
         (M, 3) where it was seen, metres, body frame.
+    shifts : FloatArray
+        (M, 3) how far it had moved by itself by then, metres.
     information : FloatArray
         (M, k, k) inverse covariance of it, body frame, 1/m².
 
@@ -79,6 +81,7 @@ class Frames:
     frames: IntArray
     landmarks: IntArray
     points: FloatArray
+    shifts: FloatArray
     information: FloatArray
 
 
@@ -93,7 +96,7 @@ class Solution:
     calibration : FloatArray
         (c,) calibration of the velocity.
     points : FloatArray
-        (n, 3) landmarks, metres.
+        (n, 3) landmarks, metres; of those that move, where they would be had they not.
 
     """
 
@@ -222,7 +225,7 @@ class Smoother:
         frames, k = self._frames, self._axes.point
         poses = solution.poses[frames.frames + 1]
         R = poses[:, :3, :3]
-        arms = solution.points[frames.landmarks] - poses[:, :3, 3]
+        arms = solution.points[frames.landmarks] + frames.shifts - poses[:, :3, 3]
         predicted = (so3.transpose(R) @ arms[:, :, None])[:, :, 0]
         error = (predicted - frames.points)[:, :k]
         J_pose = -self._axes.output_matrix(predicted)

@@ -198,3 +198,25 @@ def test_an_empty_observation_moves_the_state_on_and_nothing_else():
     estimator = run([velocity(0.0), empty], velocity_timeout=2.0)
     assert estimator.stamp_ns == empty.stamp_ns
     np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains):
+    speed = np.array(
+        [[0.2, 0.0, 0.0], [0.0, -0.3, 0.1], [0.0, 0.0, 0.0], [0.1, 0.1, 0.0], [0, 0, 0.2]]
+    )
+    estimator = Estimator(Settings(gains=gains, hindsight_interval=20, hindsight_turn=0.0))
+    for step in range(200):
+        time_s = 0.05 * step
+        estimator.add(velocity(time_s))
+        if step < 120:  # then they go on unseen
+            body = se3.inverse(true_pose(time_s))
+            points = se3.transform(body, LANDMARKS + speed * time_s)
+            stamp_ns = START_NS + round(time_s * 1e9)
+            velocities = se3.rotate(body, speed)
+            estimator.add(ObservationEvent(stamp_ns, np.arange(5), points, None, velocities))
+    end = START_NS + round(9.95e9)
+    estimator.add(ObservationEvent(end, np.empty(0, dtype=np.int64), np.empty((0, 3))))
+    estimator.flush()
+    np.testing.assert_allclose(estimator.world_points, LANDMARKS + speed * 9.95, atol=1e-6)
+    np.testing.assert_allclose(estimator.pose, true_pose(9.95), atol=1e-6)

@@ -47,6 +47,7 @@ class History:
         self._calibrations: list[FloatArray] = []
         self._landmarks: list[IntArray] = []
         self._points: list[FloatArray] = []
+        self._shifts: list[FloatArray] = []
         self._information: list[FloatArray] = []
         self._calibration = prior.calibration
         self._motion, self._covariance, self._sensitivity = self._at_rest()
@@ -63,8 +64,11 @@ class History:
         self._sensitivity = carry @ self._sensitivity + calibration.sensitivity(Ad, motion)
         self._calibration = calibration.values
 
-    def see(self, seen: Seen, pose: FloatArray) -> None:
-        """Close a frame: the observation ``seen``, made at ``pose`` (4, 4)."""
+    def see(self, seen: Seen, pose: FloatArray, shifts: FloatArray) -> None:
+        """Close a frame: the observation ``seen``, made at ``pose`` (4, 4).
+
+        ``shifts`` (m, 3) is how far the landmarks had moved by themselves, metres.
+        """
         k = self._axes.point
         self.stamps_ns.append(seen.stamp_ns)
         self.poses.append(pose)
@@ -74,6 +78,7 @@ class History:
         self._calibrations.append(self._calibration)
         self._landmarks.append(seen.indices)
         self._points.append(seen.points)
+        self._shifts.append(shifts)
         information = np.linalg.inv(seen.covariances[:, :k, :k])
         self._information.append(np.asarray(information, dtype=np.float64))
         self._motion, self._covariance, self._sensitivity = self._at_rest()
@@ -113,6 +118,7 @@ class History:
             np.repeat(np.arange(len(counts)), counts),
             np.concatenate(self._landmarks),
             np.concatenate(self._points),
+            np.concatenate(self._shifts),
             np.concatenate(self._information),
         )
 
@@ -120,6 +126,7 @@ class History:
         """Keep only some of the points of frame ``s``."""
         self._landmarks[s] = self._landmarks[s][kept]
         self._points[s] = self._points[s][kept]
+        self._shifts[s] = self._shifts[s][kept]
         self._information[s] = self._information[s][kept]
 
     def _prior_columns(self, indices: IntArray) -> IntArray:

@@ -190,7 +190,7 @@ class RiccatiGains:
         interval = self._settings.hindsight_interval
         if interval == 0:
             return
-        self._history.see(seen, observer.A)
+        self._history.see(seen, observer.A, observer.shifts[seen.indices])
         self._observations += 1
         rested = self._observations >= max(interval, len(self._history.stamps_ns) // 10)
         turned_far = self._turn_squared > self._settings.hindsight_turn**2
@@ -211,7 +211,7 @@ class RiccatiGains:
         J = np.eye(len(self._P))
         pose = self._axes.pose
         J[: self._p, : self._p] = se3.adjoint(se3.inverse(observer.A))[np.ix_(pose, pose)]
-        points = observer.y_ref + observer.a
+        points = observer.y_ref + observer.a - observer.shifts
         prior = Prior(observer.A, self._calibration.values, points, J @ self._P @ J.T)
         self._history = History(self._axes, prior)
         self._observations, self._turn_squared = 0, 0.0
@@ -222,7 +222,7 @@ class RiccatiGains:
 
     def _in_hindsight(self, observer: Observer) -> Solution:
         """Return the estimates as they are, for the smoother to start from."""
-        points = observer.y_ref + observer.a
+        points = observer.y_ref + observer.a - observer.shifts
         return Solution(np.array(self._history.poses), self._calibration.values, points)
 
     def _rebase(self, observer: Observer) -> None:
@@ -230,7 +230,7 @@ class RiccatiGains:
         solution = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
         self._observations, self._turn_squared = 0, 0.0
         covariance = smoother.marginal(solution)
-        observer.rebase(solution.poses[-1], solution.points)
+        observer.rebase(solution.poses[-1], solution.points + observer.shifts)
         self._calibration.shift(solution.calibration - self._calibration.values)
         J = np.eye(len(covariance))
         J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(self._axes.pose, self._axes.pose)]
