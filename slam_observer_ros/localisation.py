@@ -210,11 +210,19 @@ def _complete(slam: Slam, known: LandmarkMap) -> None:
     slam.landmarks.add_known(new.ids, np.maximum(new.counts, settings.confirmations))
     observer.rebase(observer.A, observer.y_ref + observer.a)
     if settings.localization_mode == 'fixed':
-        observer.y_ref[slam.landmarks.indices_of(known.ids)] = _in_reference_frame(slam, known)[0]
-        if isinstance(slam.gains, RiccatiGains):
-            slam.gains = FixedMapGains(slam.gains)
+        _hold(slam, known)
     slam.is_mapping = settings.localization_mode == 'off'
     slam.gains.restart(observer)
+
+
+def _hold(slam: Slam, known: LandmarkMap) -> None:
+    """Put the landmarks exactly where the map has them, and leave them there."""
+    places = np.searchsorted(known.ids, slam.landmarks.ids, sorter=np.argsort(known.ids))
+    in_order = known.select(np.argsort(known.ids)[places])
+    y_ref, covariances = _in_reference_frame(slam, in_order)
+    slam.observer.rebase(slam.observer.A, y_ref)
+    if isinstance(slam.gains, RiccatiGains):
+        slam.gains = FixedMapGains(slam.gains, covariances)
 
 
 def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:

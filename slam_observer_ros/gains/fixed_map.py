@@ -21,15 +21,17 @@ class FixedMapGains(RiccatiGains):
     Parameters
     ----------
     before : RiccatiGains
-        Gains until now. The covariances that they have for the landmarks are only passed on.
+        Gains until now.
+    landmark_covariances : FloatArray
+        (n, 3, 3) what the map says of its landmarks, reference frame, m². It is only passed on.
 
     """
 
-    def __init__(self, before: RiccatiGains) -> None:
+    def __init__(self, before: RiccatiGains, landmark_covariances: FloatArray) -> None:
         super().__init__(before._settings)
         self._calibration = before._calibration
         self._P = before._P[: self._first, : self._first].copy()
-        self._landmark_covariances = before.landmark_covariances
+        self._landmark_covariances = landmark_covariances
 
     @property
     def landmark_covariances(self) -> FloatArray:

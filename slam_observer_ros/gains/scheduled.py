@@ -109,7 +109,10 @@ class ScheduledGains:
         self._P = P[:first, :first]
         own = P[first:, first:].reshape(m, k, m, k)[np.arange(m), :, np.arange(m)]
         self._L[indices] = own * (self._settings.localization_mode != 'fixed')
-        return self._as_correction(indices, -x[:first], -x[first:], np.zeros_like(r))
+        shifts = self._axes.output_matrix(points) @ x[:p]
+        shifts[indices] = x[first:].reshape(m, k)
+        a = np.zeros_like(points)
+        return self._as_correction(np.arange(len(a)), -x[:first], -shifts.ravel(), a)
 
     def restart(self, observer: Observer) -> None:
         """Do nothing: these gains keep no history."""

@@ -1,0 +1,341 @@
+"""Localisation in a known map: where the robot is, in the map's frame, with an honest covariance."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+from scipy.stats import chi2
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.settings import Settings
+
+POINT_NOISE_M = 0.05
+MAP_NOISE_M = 0.03
+BODY_VELOCITY = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.1])
+PLANAR_VELOCITY = BODY_VELOCITY * [0, 0, 1, 1, 1, 0]
+GAINS = ('constant', 'scheduled', 'riccati')
+MODES = ('off', 'uncertain', 'fixed')
+
+
+class World:
+    """50 landmarks, a robot that starts anywhere, and a map with errors of 3 cm."""
+
+    def __init__(self, seed=0, is_planar=False):
+        self.random = np.random.default_rng(seed)
+        self.flat = np.array([1.0, 1.0, 0.0 if is_planar else 1.0])
+        self.points = self.random.uniform([-12, -12, -1], [12, 12, 4], (50, 3)) * self.flat
+        self.velocity = PLANAR_VELOCITY if is_planar else BODY_VELOCITY
+        start = self.random.normal(size=6) * [1, 1, 2, 3, 3, 1]
+        self.start = se3.exp(start * [0, 0, 1, 1, 1, 0] if is_planar else start)
+        self.is_planar = is_planar
+
+    def settings(self, **changes):
+        return Settings(
+            two_d_mode=self.is_planar,
+            observation_model='cartesian',
+            point_noise=POINT_NOISE_M,
+            reorder_window=0.0,
+            **changes,
+        )
+
+    def map(self, ids=range(50), sigma_m=MAP_NOISE_M):
+        ids = np.array(list(ids), dtype=np.int64)
+        noise = self.random.normal(scale=sigma_m, size=(len(ids), 3)) if sigma_m else 0.0
+        covariances = np.tile(sigma_m**2 * np.eye(3), (len(ids), 1, 1))
+        points = self.points[ids] + noise * self.flat
+        return LandmarkMap(ids, points, covariances, np.full(len(ids), 9))
+
+    def pose(self, time_s):
+        return self.start @ se3.exp(self.velocity * time_s)
+
+    def near(self, time_s, count):
+        distance = np.linalg.norm(self.points - self.pose(time_s)[:3, 3], axis=1)
+        return np.sort(np.argsort(distance)[:count])
+
+    def see(self, time_s, ids, pose=None):
+        ids = np.array(ids, dtype=np.int64)
+        pose = self.pose(time_s) if pose is None else pose
+        noise = self.random.normal(scale=POINT_NOISE_M, size=(len(ids), 3))
+        points = se3.transform(se3.inverse(pose), self.points[ids]) + noise * self.flat
+        return ObservationEvent(round(time_s * 1e9), ids, points)
+
+    def drive(self, first_s, last_s, count=6, offset=None):
+        """Velocities and views of the nearest landmarks at 10 Hz, the robot moved by offset."""
+        events = []
+        for time_s in np.arange(first_s, last_s, 0.1):
+            noise = self.random.normal(scale=0.02, size=6) * (self.velocity != 0.0)
+            events.append(VelocityEvent(round(time_s * 1e9), self.velocity + noise))
+            pose = self.pose(time_s) if offset is None else offset @ self.pose(time_s)
+            events.append(self.see(time_s, self.near(time_s, count), pose))
+        return events
+
+    def error(self, estimator, time_s):
+        """Rotation vector and position of the pose's error, along the map's axes."""
+        true, pose = self.pose(time_s), estimator.pose
+        turn = so3.log(pose[:3, :3] @ true[:3, :3].T)
+        return np.concatenate([turn, pose[:3, 3] - true[:3, 3]])
+
+    def nees(self, estimator, time_s):
+        axes = [2, 3, 4] if self.is_planar else list(range(6))
+        error = self.error(estimator, time_s)[axes]
+        covariance = estimator.pose_covariance[np.ix_(axes, axes)]
+        return error @ np.linalg.solve(covariance, error)
+
+
+def add(estimator, events):
+    for event in events:
+        assert estimator.add(event)
+    return estimator
+
+
+@pytest.mark.parametrize(('is_planar', 'count'), [(False, 3), (False, 5), (True, 3), (True, 2)])
+@pytest.mark.parametrize('mode', ['off', 'fixed'])
+def test_after_one_view_of_known_landmarks_the_pose_is_right_within_its_covariance(
+    is_planar, count, mode
+):
+    dof = 3 if is_planar else 6
+    nees = []
+    for seed in range(150):
+        world = World(seed, is_planar)
+        estimator = Estimator(world.settings(localization_mode=mode))
+        estimator.load_map(world.map())
+        ids = world.random.choice(world.near(0.0, 12), count, replace=False)
+        add(estimator, [world.see(0.0, ids)])
+        if estimator.is_localised:  # else they are almost in a line
+            nees.append(world.nees(estimator, 0.0))
+    assert len(nees) > 120
+    assert np.mean(nees) / dof == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / dof / len(nees)))
+    within_three_sigma = np.array(nees) <= chi2.ppf(0.9973, dof)
+    assert within_three_sigma.mean() > 0.98
+
+
+@pytest.mark.parametrize('mode', MODES)
+@pytest.mark.parametrize('gains', GAINS)
+@pytest.mark.parametrize('is_planar', [False, True])
+def test_every_gain_design_tracks_in_every_mode(gains, mode, is_planar):
+    world = World(0, is_planar)
+    known = world.map(range(0, 50, 2))
+    estimator = Estimator(world.settings(gains=gains, localization_mode=mode))
+    estimator.load_map(known)
+    add(estimator, world.drive(0.0, 20.0))
+    assert estimator.is_localised
+    error = world.error(estimator, 19.9)
+    assert np.linalg.norm(error[3:]) < 0.15
+    assert np.linalg.norm(error[:3]) < 0.03
+    rows = [list(estimator.landmark_ids).index(i) for i in known.ids]
+    assert_allclose(estimator.world_points[rows], world.points[known.ids], atol=5 * MAP_NOISE_M)
+    added = set(estimator.landmark_ids) - set(known.ids)
+    assert bool(added) == (mode == 'off')
+    moved = not np.allclose(estimator.world_points[rows], known.world_points, atol=1e-9, rtol=0)
+    assert moved == (mode != 'fixed')
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain'])
+def test_tracking_in_an_uncertain_map_stays_honest(mode):
+    nees = []
+    for seed in range(20):
+        world = World(seed, is_planar=True)
+        settings = world.settings(
+            localization_mode=mode,
+            angular_velocity_noise=(0.02 * 0.1**0.5,) * 3,
+            linear_velocity_noise=(0.02 * 0.1**0.5,) * 3,
+            huber_threshold=0.0,
+            hindsight_interval=20,
+            hindsight_turn=0.0,
+        )
+        estimator = Estimator(settings)
+        estimator.load_map(world.map())
+        add(estimator, world.drive(0.0, 8.0, count=3))
+        nees.append(world.nees(estimator, 7.9))
+    assert 0.5 < np.mean(nees) / 3 < 1.7
+
+
+def test_landmarks_may_be_seen_one_after_another():
+    world = World(4)
+    estimator = Estimator(world.settings(localization_mode='uncertain'))
+    estimator.load_map(world.map())
+    events = world.drive(0.0, 3.0, count=0)
+    for step, landmark_id in enumerate(world.near(1.0, 8)):
+        events += [world.see(0.05 + 0.3 * step, [landmark_id])]
+    add(estimator, sorted(events, key=lambda event: event.stamp_ns))
+    assert estimator.is_localised
+    assert estimator.counts['not_localised'] >= 2
+    assert world.nees(estimator, 2.9) < chi2.ppf(0.9973, 6)
+
+
+def line_of_landmarks(count):
+    points = np.arange(count)[:, None] * np.array([1.0, 0.5, 0.0])
+    return LandmarkMap(np.arange(count), points, None, np.zeros(count, dtype=np.int64))
+
+
+@pytest.mark.parametrize(
+    ('known', 'is_planar', 'is_enough'),
+    [
+        (line_of_landmarks(1), True, False),
+        (line_of_landmarks(2), True, True),
+        (line_of_landmarks(2), False, False),
+        (line_of_landmarks(9), False, False),
+    ],
+)
+def test_what_leaves_the_pose_open_does_not_place_the_robot(known, is_planar, is_enough):
+    estimator = Estimator(Settings(two_d_mode=is_planar, reorder_window=0.0))
+    estimator.load_map(known)
+    add(estimator, [ObservationEvent(10**9, known.ids, known.world_points + [1.0, 0.0, 0.0])])
+    assert estimator.is_localised == is_enough
+    assert estimator.counts['not_localised'] == (not is_enough)
+
+
+def test_landmarks_that_have_moved_since_do_not_mislead():
+    world = World(5)
+    known = world.map()
+    seen = world.near(0.0, 8)
+    world.points[seen[2]] += [0.0, 2.0, 0.0]
+    world.points[seen[5]] += [3.0, 0.0, 1.0]
+    estimator = Estimator(world.settings())
+    estimator.load_map(known)
+    add(estimator, [world.see(0.0, seen)])
+    assert world.nees(estimator, 0.0) < chi2.ppf(0.9973, 6)
+
+
+def test_in_a_map_of_another_place_the_robot_is_never_placed():
+    world, other = World(6), World(7)
+    estimator = Estimator(world.settings(localization_mode='fixed'))
+    estimator.load_map(other.map())
+    add(estimator, world.drive(0.0, 2.0, count=4))
+    assert not estimator.is_localised
+    assert estimator.counts['not_localised'] == 20
+
+
+@pytest.mark.parametrize('mode', MODES)
+def test_a_known_start_counts_with_its_covariance(mode):
+    nees = []
+    for seed in range(40):
+        world = World(seed)
+        estimator = Estimator(world.settings(localization_mode=mode))
+        covariance = np.diag([0.02, 0.02, 0.05, 0.2, 0.2, 0.1]) ** 2
+        error = world.random.normal(size=6) * np.sqrt(np.diag(covariance))
+        start = se3.pose(so3.exp(error[:3]) @ world.start[:3, :3], world.start[:3, 3] + error[3:])
+        estimator.load_map(world.map(), start, covariance)
+        assert estimator.is_localised
+        assert_allclose(estimator.pose, start, atol=1e-12)
+        assert_allclose(estimator.pose_covariance, covariance, atol=1e-12)
+        add(estimator, [world.see(0.0, world.near(0.0, 1))])
+        nees.append(world.nees(estimator, 0.0))
+    assert np.mean(nees) / 6 == pytest.approx(1.0, abs=0.4)
+
+
+def test_a_pose_that_is_set_moves_the_robot_and_keeps_the_map():
+    world = World(8)
+    estimator = add(Estimator(world.settings()), world.drive(0.0, 3.0))
+    points, covariances = estimator.world_points, estimator.landmark_covariances
+    pose = se3.exp(np.array([0.1, 0.2, 0.3, 4.0, 5.0, 6.0]))
+    covariance = np.diag([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    estimator.set_pose(pose, covariance)
+    assert_allclose(estimator.pose, pose, atol=1e-12)
+    assert_allclose(estimator.pose_covariance, covariance, atol=1e-12)
+    assert_allclose(estimator.world_points, points, atol=1e-12)
+    assert_allclose(estimator.landmark_covariances, covariances, atol=1e-12)
+
+
+def test_a_robot_set_down_elsewhere_finds_back_once_its_pose_is_set():
+    world = World(9)
+    estimator = add(Estimator(world.settings(), world.start), world.drive(0.0, 4.0))
+    offset = se3.exp(np.array([0.0, 0.0, 0.5, 2.0, -1.0, 0.0]))
+    wrong = se3.exp(np.array([0.0, 0.0, 0.02, 0.1, 0.1, 0.0]))
+    estimator.set_pose(wrong @ offset @ world.pose(4.0), np.diag([0.03, 0.03, 0.1, 0.2, 0.2, 0.1]))
+    add(estimator, world.drive(4.1, 8.0, offset=offset))
+    error = se3.log(estimator.pose @ se3.inverse(offset @ world.pose(7.9)))
+    assert np.linalg.norm(error) < 0.2
+    assert estimator.counts['moved_landmark'] == 0
+
+
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_map_loaded_while_running_is_merged_with_what_was_mapped(gains):
+    world = World(10)
+    settings = world.settings(gains=gains, hindsight_interval=10, hindsight_turn=0.0)
+    estimator = add(Estimator(settings), world.drive(0.0, 5.0))
+    mapped = set(estimator.landmark_ids)
+    known = world.map(range(0, 50, 2))
+    estimator.load_map(known)
+    assert estimator.is_localised
+    assert set(estimator.landmark_ids) == mapped | set(known.ids)
+    assert np.linalg.norm(world.error(estimator, 4.9)[3:]) < 0.15
+    add(estimator, world.drive(5.0, 10.0))
+    assert np.linalg.norm(world.error(estimator, 9.9)[3:]) < 0.1
+    errors = estimator.world_points - world.points[estimator.landmark_ids]
+    assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.15
+
+
+def test_counts_of_both_maps_add_up():
+    world = World(11)
+    estimator = Estimator(world.settings())
+    estimator.load_map(world.map())
+    seen = world.near(0.0, 5)
+    add(estimator, [world.see(0.0, seen), world.see(0.1, seen)])
+    counts = dict(zip(estimator.landmark_ids, estimator.landmark_counts, strict=True))
+    assert {counts[i] for i in seen} == {11}
+    assert {counts[i] for i in counts if i not in seen} == {9}
+
+
+def test_what_is_saved_can_be_loaded_and_gives_the_same_frame():
+    world = World(12)
+    first = add(Estimator(world.settings(), world.start), world.drive(0.0, 10.0))
+    second = Estimator(world.settings(localization_mode='uncertain'))
+    second.load_map(first.landmark_map)
+    add(second, world.drive(30.0, 31.0))
+    assert np.linalg.norm(world.error(second, 30.9)[3:]) < 0.15
+
+
+def test_a_fixed_map_is_saved_as_it_was_loaded():
+    world = World(13)
+    known = world.map()
+    estimator = Estimator(world.settings(localization_mode='fixed'))
+    estimator.load_map(known)
+    add(estimator, world.drive(0.0, 5.0))
+    saved = estimator.landmark_map
+    order = np.argsort(saved.ids)
+    assert_array_equal(saved.ids[order], known.ids)
+    assert_allclose(saved.world_points[order], known.world_points, atol=1e-9)
+    assert_allclose(saved.covariances[order], known.covariances, atol=1e-12)
+
+
+def test_a_robot_that_was_carried_away_finds_itself_again(caplog):
+    world = World(14)
+    estimator = Estimator(world.settings(localization_mode='fixed'))
+    estimator.load_map(world.map())
+    add(estimator, world.drive(0.0, 2.0))
+    offset = se3.exp(np.array([0.0, 0.0, 1.5, 3.0, -4.0, 0.0]))
+    with caplog.at_level(logging.WARNING):
+        add(estimator, world.drive(2.0, 6.0, offset=offset))
+    assert estimator.counts['lost'] == 1
+    assert 'localising anew' in caplog.text
+    error = se3.log(estimator.pose @ se3.inverse(offset @ world.pose(5.9)))
+    assert np.linalg.norm(error) < 0.1
+
+
+def test_after_a_reset_the_place_in_the_map_is_found_again():
+    world = World(15)
+    estimator = Estimator(world.settings())
+    estimator.load_map(world.map())
+    add(estimator, world.drive(0.0, 1.0))
+    estimator.reset()
+    assert not estimator.is_localised
+    add(estimator, world.drive(1.0, 2.0))
+    assert np.linalg.norm(world.error(estimator, 1.9)[3:]) < 0.15
+
+
+def test_far_from_the_origin_as_in_a_national_grid_nothing_is_lost_to_rounding():
+    world = World(16)
+    grid = np.array([500_000.0, 5_000_000.0, 300.0])
+    world.points += grid
+    world.start = se3.pose(world.start[:3, :3], world.start[:3, 3] + grid)
+    estimator = Estimator(world.settings())
+    estimator.load_map(world.map())
+    add(estimator, world.drive(0.0, 5.0))
+    assert np.linalg.norm(world.error(estimator, 4.9)[3:]) < 0.1
