@@ -12,7 +12,6 @@ from contextlib import contextmanager, ExitStack
 import math
 import os
 from pathlib import Path
-import signal
 import subprocess
 import sys
 import time
@@ -113,11 +112,17 @@ def _run(
         executor.add_node(listener)
         cleanup.callback(executor.shutdown)
         cleanup.enter_context(
-            _node('observer_node', folder, gains='constant', use_sim_time=is_simulated_time)
+            _node(
+                'observer_node',
+                folder,
+                gains='constant',
+                velocity_type='TwistStamped',
+                landmarks_type='PointCloud2',
+                publish_rate=PUBLISH_RATE_HZ,
+                use_sim_time=is_simulated_time,
+            )
         )
         _wait_for_observer(executor, listener, stop)
-        if listener.is_disturbed():
-            raise DemoError('other nodes use the same topics; set ROS_DOMAIN_ID to a free number')
         simulator = cleanup.enter_context(
             _node(
                 'simulator_node',
@@ -148,14 +153,20 @@ def _node(name: str, folder: Path, **parameters: object) -> Iterator[subprocess.
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
     try:
         yield process
-        process.send_signal(signal.SIGINT)
-        if process.wait(STOP_LIMIT_S) != 0:
-            raise DemoError(f'{name} has failed; see {log}')
-    except subprocess.TimeoutExpired as error:
-        raise DemoError(f'{name} does not stop; see {log}') from error
     finally:
+        exit_code = _end(process)
+    if exit_code != 0:
+        raise DemoError(f'{name} has failed with exit code {exit_code}; see {log}')
+
+
+def _end(process: subprocess.Popen[bytes]) -> int:
+    """Stop a process if it still runs; return its exit code."""
+    process.terminate()
+    try:
+        return process.wait(STOP_LIMIT_S)
+    except subprocess.TimeoutExpired:
         process.kill()
-        process.wait()
+        return process.wait()
 
 
 def _wait_for_observer(
@@ -163,7 +174,7 @@ def _wait_for_observer(
 ) -> None:
     limit_s = time.monotonic() + STALL_LIMIT_S
     while not listener.hears_observer():
-        _check(stop, limit_s)
+        _check(listener, stop, limit_s)
         executor.spin_once(timeout_sec=0.1)
 
 
@@ -188,7 +199,7 @@ def _listen(
         heard, limit_s = 0, time.monotonic() + STALL_LIMIT_S
         while simulator.poll() is None:
             executor.spin_once(timeout_sec=0.1)
-            _check(stop, limit_s)
+            _check(listener, stop, limit_s)
             if len(listener.lyapunov) > heard:
                 heard, limit_s = len(listener.lyapunov), time.monotonic() + STALL_LIMIT_S
                 level = _level(listener.lyapunov[-1])
@@ -197,9 +208,11 @@ def _listen(
         progress.update(task, completed=listener.elapsed_s)
 
 
-def _check(stop: StopSignal, limit_s: float) -> None:
+def _check(listener: DemoListener, stop: StopSignal, limit_s: float) -> None:
     if stop.is_set:
         raise DemoError('interrupted')
+    if listener.is_disturbed():
+        raise DemoError('other nodes use the same topics; set ROS_DOMAIN_ID to a free number')
     if time.monotonic() > limit_s:
         raise DemoError(f'nothing was heard for {STALL_LIMIT_S:g} s; see the log files')
 

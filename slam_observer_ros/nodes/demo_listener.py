@@ -38,8 +38,8 @@ ESTIMATED = {
     '/landmark_estimates': PointCloud,
     '/lyapunov': Float64,
     '/markers': MarkerArray,
-    '/diagnostics': DiagnosticArray,
 }
+SHARED = {'/diagnostics': DiagnosticArray}
 TRUE = {'/ground_truth/pose': PoseStamped}
 LATCHED = {'/map': PointCloud2, '/ground_truth/landmarks': PointCloud2}
 
@@ -76,7 +76,13 @@ class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
         self.lyapunov: list[float] = []
         transforms = {} if TFMessage is None else {'/tf': TFMessage}
         static_transforms = {} if TFMessage is None else {'/tf_static': TFMessage}
-        for topic, message_class in {**MEASURED, **ESTIMATED, **TRUE, **transforms}.items():
+        for topic, message_class in {
+            **MEASURED,
+            **ESTIMATED,
+            **SHARED,
+            **TRUE,
+            **transforms,
+        }.items():
             self._listen(topic, message_class, DEEP_QOS)
         for topic, message_class in {**LATCHED, **static_transforms}.items():
             self._listen(topic, message_class, LATCHED_QOS)
@@ -86,10 +92,8 @@ class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
         return all(self.count_publishers(topic) > 0 for topic in ESTIMATED)
 
     def is_disturbed(self) -> bool:
-        """Return whether another program publishes too; call it before the simulator starts."""
-        return any(self.count_publishers(topic) > 0 for topic in MEASURED) or any(
-            self.count_publishers(topic) > 1 for topic in ESTIMATED
-        )
+        """Return whether another program publishes on the demo's topics too."""
+        return any(self.count_publishers(topic) > 1 for topic in {**MEASURED, **ESTIMATED})
 
     @property
     def elapsed_s(self) -> float:
