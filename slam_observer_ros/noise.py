@@ -9,6 +9,12 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.velocity_history import HeldVelocities
 
+RESOLUTION_M = 1e-6
+"""Standard deviation that no coordinate of an observed point falls short of, metres."""
+
+LEAST_SHARE = 1e-6
+"""Least variance of an observed point in any direction, as a share of its total variance."""
+
 
 class NoiseModel:
     """Covariances in physical units.
@@ -44,14 +50,24 @@ class NoiseModel:
         return covariances
 
     def observation(self, event: ObservationEvent) -> FloatArray:
-        """Return the covariances (m, 3, 3) of an observation's points, body frame, m²."""
+        """Return the covariances (m, 3, 3) of an observation's points, body frame, m².
+
+        All of them can be inverted, even if a message or a point at the sensor itself says that
+        some direction is known exactly.
+        """
+        covariances = self._stated(event)
+        least = RESOLUTION_M**2 + LEAST_SHARE * np.trace(covariances, axis1=1, axis2=2)
+        return covariances + least[:, None, None] * np.eye(3)
+
+    def _stated(self, event: ObservationEvent) -> FloatArray:
+        """Return the covariances (m, 3, 3) as message or settings have them, m²."""
         if event.covariances is not None:
             return event.covariances
         s = self._settings
-        if s.observation_model == "cartesian":
+        if s.observation_model == 'cartesian':
             return np.broadcast_to(s.point_noise**2 * np.eye(3), (len(event.points), 3, 3))
         range_m = np.linalg.norm(event.points, axis=1)
-        if s.observation_model == "stereo":
+        if s.observation_model == 'stereo':
             along = range_m**2 * s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
             across = range_m * s.pixel_noise / s.stereo_focal_length
         else:
@@ -63,8 +79,12 @@ class NoiseModel:
 def _along_and_across(
     points: FloatArray, range_m: FloatArray, along: FloatArray, across: FloatArray
 ) -> FloatArray:
-    """Return covariances (m, 3, 3) with standard deviations along and across the line of sight."""
+    """Return covariances (m, 3, 3) with standard deviations along and across the line of sight.
+
+    A point at the sensor itself has no line of sight; it is known as well as its range is.
+    """
     safe = np.where(range_m > 0.0, range_m, 1.0)
+    across = np.where(range_m > 0.0, across, along)
     sight = points / safe[:, None]
     outer = sight[:, :, None] * sight[:, None, :]
     spread = (along**2 - across**2)[:, None, None] * outer

@@ -8,6 +8,9 @@ from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.types import FloatArray
 
+ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
+"""Relative error of a covariance whose message has it in single precision."""
+
 
 def check_event(event: Event) -> None:
     """Check an event's shapes and values.
@@ -31,7 +34,7 @@ def _check_velocity(event: VelocityEvent) -> None:
     _check_array('body velocity', event.body_velocity, (6,))
     if event.covariance is not None:
         _check_array('velocity covariance', event.covariance, (6, 6))
-        _check_variances('velocity covariance', event.covariance)
+        _check_definite('velocity covariance', event.covariance)
 
 
 def _check_observation(event: ObservationEvent) -> None:
@@ -46,7 +49,7 @@ def _check_observation(event: ObservationEvent) -> None:
         raise InvalidEventError('repeated_id', 'one observation has the same landmark id twice')
     if event.covariances is not None:
         _check_array('landmark covariances', event.covariances, (m, 3, 3))
-        _check_variances('landmark covariances', event.covariances)
+        _check_definite('landmark covariances', event.covariances)
     if event.velocities is not None:
         _check_array('landmark velocities', event.velocities, (m, 3))
 
@@ -58,6 +61,9 @@ def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
         raise InvalidEventError('not_finite', f'{name} have a NaN or infinite entry')
 
 
-def _check_variances(name: str, covariances: FloatArray) -> None:
-    if np.diagonal(covariances, axis1=-2, axis2=-1).min(initial=0.0) < 0.0:
-        raise InvalidEventError('bad_covariance', f'{name} have a negative variance')
+def _check_definite(name: str, covariances: FloatArray) -> None:
+    """Check that covariances (…, d, d) are symmetric and have no negative eigenvalue."""
+    allowed = ROUNDING * np.trace(covariances, axis1=-2, axis2=-1)
+    skew = np.abs(covariances - covariances.swapaxes(-1, -2)).max(axis=(-2, -1))
+    if np.any(skew > allowed) or np.any(np.linalg.eigvalsh(covariances)[..., 0] < -allowed):
+        raise InvalidEventError('bad_covariance', f'{name} is no covariance matrix')
