@@ -186,6 +186,11 @@ class Settings:
         'Rejections in a row, all at one place, after which a landmark is taken to have moved',
         minimum=1,
     )
+    max_landmarks: int = parameter(
+        0,
+        'Most landmarks kept; a new one then replaces the one seen least often; 0 for any number',
+        minimum=0,
+    )
     hindsight_interval: int = parameter(
         50,
         'Riccati gains: least observations between looking back over all of them; 0 for never',

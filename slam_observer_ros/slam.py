@@ -140,6 +140,8 @@ class Slam:
             event, rows, known = _select(event, known), rows[known], known[known]
         residuals = self._innovate(_select(event, known), rows[known])
         self._initialise(_select(event, ~known))
+        ids = event.ids[known]
+        event = _select(event, self.landmarks.indices_of(event.ids) >= 0)
         rows = self.landmarks.indices_of(event.ids)
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows, event.velocities)
@@ -147,7 +149,7 @@ class Slam:
         seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
         self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
         self._relocate(_select(event, in_doubt), rows[in_doubt])
-        return event.ids[known], residuals
+        return ids, residuals
 
     def smooth(self) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return stamps (s,), poses (s, 4, 4) and points (n, 3), all in the world, in hindsight.
@@ -238,8 +240,24 @@ class Slam:
         self.gains.relocate_landmarks(rows, self.observer.y_ref[rows], covariances)
         self.landmarks.restart(rows)
 
+    def _make_room(self, event: ObservationEvent) -> ObservationEvent:
+        """Forget landmarks out of view, least often seen first; return the new ones that fit."""
+        limit, new = self.settings.max_landmarks, len(event.ids)
+        if limit == 0:
+            return event
+        table = self.landmarks
+        unseen = np.flatnonzero(table.last_seen_ns < event.stamp_ns)
+        fitting = min(new, limit - len(table) + len(unseen))
+        surplus = max(len(table) + fitting - limit, 0)
+        order = np.lexsort((table.last_seen_ns[unseen], table.counts[unseen]))
+        self.remove(np.sort(unseen[order[:surplus]]))
+        self._counts['forgotten_landmark'] += surplus
+        self._counts['unmapped_landmark'] += new - fitting
+        return _select(event, np.arange(new) < fitting)
+
     def _initialise(self, event: ObservationEvent) -> None:
         """Add landmarks where they were seen."""
+        event = self._make_room(event)
         if not len(event.ids):
             return
         R = self.observer.A[:3, :3]

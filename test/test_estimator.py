@@ -200,6 +200,17 @@ def test_an_empty_observation_moves_the_state_on_and_nothing_else():
     np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
 
 
+def test_a_full_map_forgets_the_landmark_seen_least_often_never_one_in_view():
+    events = [observation(0.0, [0, 1, 2]), observation(0.1, [0, 2]), observation(0.2, [0, 1, 3])]
+    estimator = run([velocity(0.0), *events], max_landmarks=3)
+    assert sorted(estimator.landmark_ids) == [0, 1, 3]
+    assert estimator.counts['forgotten_landmark'] == 1
+    estimator.add(observation(0.3, range(5)))
+    estimator.flush()
+    assert sorted(estimator.landmark_ids) == [0, 1, 3]
+    assert estimator.counts['unmapped_landmark'] == 2
+
+
 @pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
 def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains):
     speed = np.array(
