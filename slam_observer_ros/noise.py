@@ -57,7 +57,8 @@ class NoiseModel:
         """
         covariances = self._stated(event)
         least = RESOLUTION_M**2 + LEAST_SHARE * np.trace(covariances, axis1=1, axis2=2)
-        return covariances + least[:, None, None] * np.eye(3)
+        invertible: FloatArray = covariances + least[:, None, None] * np.eye(3)
+        return invertible
 
     def _stated(self, event: ObservationEvent) -> FloatArray:
         """Return the covariances (m, 3, 3) as message or settings have them, m²."""
