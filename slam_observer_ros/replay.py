@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from slam_observer_ros.estimator import Estimator, Update
+from slam_observer_ros.estimator import Estimator, Hindsight, Update
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import (
     anchored_average_nees,
@@ -26,6 +26,7 @@ from slam_observer_ros.evaluation.metrics import (
 )
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Truth
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -53,9 +54,12 @@ class TrajectorySampler:
         self._covariances: list[FloatArray] = []
 
     def sample(self) -> None:
-        """Keep the present pose, unless the one kept last is less than a period older."""
+        """Keep the present pose, unless the one kept last is less than a period older.
+
+        Poses that are not yet in the frame of a map that was loaded are not kept.
+        """
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None:
+        if stamp_ns is None or not self._estimator.is_localised:
             return
         if self._stamps_ns and 0 <= stamp_ns - self._stamps_ns[-1] < SAMPLE_PERIOD_NS:
             return
@@ -117,8 +121,13 @@ class Replay:
     seconds: float
 
 
-def replay(events: Iterable[Event], settings: Settings, truth: Truth | None = None) -> Replay:
-    """Run events through an estimator, from the identity pose.
+def replay(
+    events: Iterable[Event],
+    settings: Settings,
+    truth: Truth | None = None,
+    landmark_map: LandmarkMap | None = None,
+) -> Replay:
+    """Run events through an estimator, from the identity pose or anywhere in a known map.
 
     Parameters
     ----------
@@ -128,9 +137,11 @@ def replay(events: Iterable[Event], settings: Settings, truth: Truth | None = No
         Settings of the estimator.
     truth : Truth, optional
         What the configuration error is measured against.
+    landmark_map : LandmarkMap, optional
+        Landmarks known in advance.
 
     """
-    run = _Run(settings, truth)
+    run = _Run(settings, truth, landmark_map)
     for event in events:
         run.add(event)
     return run.finish()
@@ -139,8 +150,12 @@ def replay(events: Iterable[Event], settings: Settings, truth: Truth | None = No
 class _Run:
     """A replay under way: keeps what the metrics need, and the estimator's time apart from it."""
 
-    def __init__(self, settings: Settings, truth: Truth | None) -> None:
+    def __init__(
+        self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
+    ) -> None:
         self._estimator = Estimator(settings, on_update=self._on_update)
+        if landmark_map is not None:
+            self._estimator.load_map(landmark_map)
         self._sampler = TrajectorySampler(self._estimator)
         self._blind = Estimator(settings)
         self._blind_sampler = TrajectorySampler(self._blind)
@@ -234,12 +249,36 @@ def measure(result: Replay, truth: Truth) -> Accuracy:
     return Accuracy(
         _pose_errors(result.trajectory, pose_truth),
         _pose_errors(result.dead_reckoning, pose_truth),
-        _landmark_rmse_m(result.estimator, truth),
+        _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
         result.configuration.rmse_m,
         None
         if result.pose_covariances is None
         else anchored_average_nees(result.trajectory, result.pose_covariances, pose_truth),
     )
+
+
+def measure_hindsight(
+    hindsight: Hindsight, truth: Truth
+) -> tuple[TrajectoryErrors | None, float | None]:
+    """Compare what was smoothed with the truth.
+
+    Returns
+    -------
+    pose_errors : TrajectoryErrors or None
+        Of the poses at the observations, after one rigid alignment.
+    landmark_rmse_m : float or None
+        Of the map, after a rigid alignment of its own, metres.
+
+    """
+    return (
+        _pose_errors(trajectory_of(hindsight), Trajectory(truth.stamps_ns, truth.poses)),
+        _landmark_rmse_m(hindsight.ids, hindsight.world_points, truth),
+    )
+
+
+def trajectory_of(hindsight: Hindsight) -> Trajectory:
+    """Return the poses of a hindsight as a trajectory."""
+    return Trajectory.from_samples(hindsight.stamps_ns.tolist(), list(hindsight.poses))
 
 
 def _pose_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
@@ -252,11 +291,11 @@ def _pose_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | 
         return None
 
 
-def _landmark_rmse_m(estimator: Estimator, truth: Truth) -> float | None:
+def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
     if truth.landmarks is None:
         return None
     try:
-        errors = landmark_errors(estimator.landmark_ids, estimator.world_points, truth.landmarks)
+        errors = landmark_errors(ids, world_points, truth.landmarks)
     except EvaluationError as error:
         logger.warning('The map is not compared with the truth: %s', error)
         return None

@@ -10,6 +10,7 @@ import logging
 from pathlib import Path
 
 from slam_observer_ros.commands.console import print_json, print_table, show_progress
+from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.commands.options import add_settings_options, read_settings
 from slam_observer_ros.commands.outputs import (
     add_force_option,
@@ -17,14 +18,22 @@ from slam_observer_ros.commands.outputs import (
     check_plots,
     filled_directory,
 )
-from slam_observer_ros.evaluation.metrics import Report
+from slam_observer_ros.estimator import Hindsight
+from slam_observer_ros.evaluation.metrics import Report, TrajectoryErrors
 from slam_observer_ros.evaluation.plots import plot_errors, plot_map, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.recording.map_file import write_map
+from slam_observer_ros.recording.map_file import read_map, write_map
 from slam_observer_ros.recording.reader import open_recording, Recording, Truth
 from slam_observer_ros.recording.topics import SelectedTopics, TopicNames
-from slam_observer_ros.replay import Accuracy, measure, Replay, replay
+from slam_observer_ros.replay import (
+    Accuracy,
+    measure,
+    measure_hindsight,
+    Replay,
+    replay,
+    trajectory_of,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +67,17 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         ('--landmark-truth-topic', 'true landmarks'),
     ):
         topics.add_argument(option, metavar='TOPIC', help=what)
+    parser.add_argument(
+        '--load-map',
+        type=Path,
+        metavar='FILE',
+        help='known landmarks, as --map writes them: the estimate is then in their frame',
+    )
+    parser.add_argument(
+        '--smooth',
+        action='store_true',
+        help='estimate trajectory and map in hindsight, too: the outputs are of these then',
+    )
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument('--tum', type=Path, metavar='FILE', help='trajectory, as evo reads it')
     outputs.add_argument('--map', type=Path, metavar='FILE', help='landmarks, as YAML')
@@ -70,19 +90,25 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    """A replay and all that is told about it."""
+    """A replay and all that is told about it; what is smoothed is None if it wasn't asked for."""
 
     result: Replay
     truth: Truth
     accuracy: Accuracy
     report: Report
+    hindsight: Hindsight | None = None
+    smoothed_errors: TrajectoryErrors | None = None
+    smoothed_landmark_rmse_m: float | None = None
 
 
 def run(args: argparse.Namespace) -> None:
     """Replay a recording, and write what was asked for."""
     settings = read_settings(args)
+    if args.smooth and settings.gains != 'riccati':
+        raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
     check_outputs([args.tum, args.map], args.force)
     check_plots(args.plot, FIGURES, args.force)
+    landmark_map = None if args.load_map is None else read_map(args.load_map)
     names = TopicNames(
         args.velocity_topic, args.landmarks_topic, args.pose_truth_topic, args.landmark_truth_topic
     )
@@ -95,8 +121,10 @@ def run(args: argparse.Namespace) -> None:
         events = show_progress(
             recording.events(selected), 'replaying', recording.event_count(selected)
         )
-        result = replay(events, settings, truth)
+        result = replay(events, settings, truth, landmark_map)
         outcome = _outcome(recording, selected, result, truth)
+    if args.smooth:
+        outcome = _smoothed(outcome)
     _write_files(args, outcome)
     if args.json:
         print_json(_as_json(outcome))
@@ -144,39 +172,60 @@ def _outcome(
     return _Outcome(result, truth, accuracy, report)
 
 
-def _write_files(args: argparse.Namespace, outcome: _Outcome) -> None:
+def _smoothed(outcome: _Outcome) -> _Outcome:
+    """Add what the whole recording tells in hindsight."""
     estimator = outcome.result.estimator
-    if args.tum is not None:
-        write_tum(outcome.result.trajectory, args.tum)
-    if args.map is not None:
-        landmark_map = LandmarkMap(
-            estimator.landmark_ids,
-            estimator.world_points,
-            estimator.landmark_covariances,
-            estimator.landmark_counts,
+    hindsight = estimator.smooth()
+    if len(hindsight.stamps_ns) < estimator.counts['observation']:
+        logger.warning(
+            'Only the last %d observations are smoothed; --set hindsight_window=0 for all.',
+            len(hindsight.stamps_ns),
         )
+    errors, landmark_rmse_m = measure_hindsight(hindsight, outcome.truth)
+    return dataclasses.replace(
+        outcome,
+        hindsight=hindsight,
+        smoothed_errors=errors,
+        smoothed_landmark_rmse_m=landmark_rmse_m,
+    )
+
+
+def _write_files(args: argparse.Namespace, outcome: _Outcome) -> None:
+    estimator, hindsight = outcome.result.estimator, outcome.hindsight
+    landmark_map = estimator.landmark_map
+    trajectory = outcome.result.trajectory
+    if hindsight is not None:
+        landmark_map = dataclasses.replace(landmark_map, world_points=hindsight.world_points)
+        trajectory = trajectory_of(hindsight)
+    if args.tum is not None:
+        write_tum(trajectory, args.tum)
+    if args.map is not None:
         write_map(args.map, landmark_map, estimator.settings)
     if args.plot is not None:
         with filled_directory(args.plot) as unfinished:
-            _draw(outcome, unfinished)
+            _draw(outcome, trajectory, landmark_map, unfinished)
 
 
-def _draw(outcome: _Outcome, directory: Path) -> None:
-    result, truth, pose_errors = outcome.result, outcome.truth, outcome.accuracy.pose_errors
+def _draw(
+    outcome: _Outcome, trajectory: Trajectory, landmark_map: LandmarkMap, directory: Path
+) -> None:
+    result, truth = outcome.result, outcome.truth
     plot_map(
         directory / 'map.png',
-        result.trajectory,
-        result.estimator.landmark_ids,
-        result.estimator.world_points,
-        Trajectory(truth.stamps_ns, truth.poses) if pose_errors else None,
+        trajectory,
+        landmark_map.ids,
+        landmark_map.world_points,
+        Trajectory(truth.stamps_ns, truth.poses) if outcome.accuracy.pose_errors else None,
         truth.landmarks,
     )
-    if pose_errors is not None:
-        covariances = result.pose_covariances
+    if outcome.smoothed_errors is not None:
+        plot_errors(directory / 'errors.png', outcome.smoothed_errors)
+    elif outcome.accuracy.pose_errors is not None:
+        errors, covariances = outcome.accuracy.pose_errors, result.pose_covariances
         plot_errors(
             directory / 'errors.png',
-            pose_errors,
-            None if covariances is None else covariances[pose_errors.covered],
+            errors,
+            None if covariances is None else covariances[errors.covered],
             result.configuration if result.configuration.values_m else None,
         )
     plot_residuals(
@@ -188,15 +237,16 @@ def _draw(outcome: _Outcome, directory: Path) -> None:
     )
 
 
-def _dead_reckoning_ate_rmse_m(outcome: _Outcome) -> float | None:
-    errors = outcome.accuracy.dead_reckoning_errors
-    return None if errors is None else errors.ate_rmse_m
-
-
 def _as_json(outcome: _Outcome) -> dict[str, object]:
     return dataclasses.asdict(outcome.report) | {
-        'dead_reckoning_ate_rmse_m': _dead_reckoning_ate_rmse_m(outcome)
+        'dead_reckoning_ate_rmse_m': _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
+        'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
+        'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,
     }
+
+
+def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
+    return None if errors is None else errors.ate_rmse_m
 
 
 def _print_summary(args: argparse.Namespace, selected: SelectedTopics, outcome: _Outcome) -> None:
@@ -223,11 +273,19 @@ def _accuracy_rows(outcome: _Outcome) -> dict[str, str]:
     report = outcome.report
     figures = {
         'position error (ATE), RMS': (report.ate_rmse_m, 'm after alignment'),
-        'of the velocities alone': (_dead_reckoning_ate_rmse_m(outcome), 'm after alignment'),
+        'of the velocities alone': (
+            _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
+            'm after alignment',
+        ),
         'heading error, RMS': (report.heading_rmse_rad, 'rad after alignment'),
         'landmark error, RMS': (report.landmark_rmse_m, 'm after alignment'),
         'configuration error, RMS': (report.configuration_rmse_m, 'm, not aligned'),
         'ANEES': (report.anees, '(1 is honest)'),
+        'smoothed: position error, RMS': (
+            _ate_rmse_m(outcome.smoothed_errors),
+            'm after alignment',
+        ),
+        'smoothed: landmark error, RMS': (outcome.smoothed_landmark_rmse_m, 'm after alignment'),
     }
     rows = {
         name: f'{value:.3f} {unit}' for name, (value, unit) in figures.items() if value is not None
