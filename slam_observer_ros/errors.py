@@ -42,3 +42,7 @@ class DataSetError(SlamObserverError):
 
 class MapError(SlamObserverError):
     """A map file can't be read or written, or its content can't be right."""
+
+
+class TransformError(SlamObserverError):
+    """Two frames are not connected, or not at the time that is asked for."""

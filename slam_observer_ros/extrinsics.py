@@ -1,0 +1,57 @@
+"""Events measured in a sensor's frame, as the base frame has them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.types import FloatArray
+
+
+def pose_from_rpy(values: tuple[float, ...]) -> FloatArray:
+    """Return the pose (4, 4) of x y z in metres and roll pitch yaw in radians about fixed axes."""
+    roll, pitch, yaw = np.diag(values[3:])
+    R = so3.exp(yaw) @ so3.exp(pitch) @ so3.exp(roll)
+    return se3.pose(R, np.array(values[:3]))
+
+
+def move_observation(event: ObservationEvent, pose: FloatArray) -> ObservationEvent:
+    """Express an observation in another frame.
+
+    Parameters
+    ----------
+    event : ObservationEvent
+        As measured in a sensor's frame.
+    pose : FloatArray
+        (4, 4) pose of that frame in the new one.
+
+    """
+    R = pose[:3, :3]
+    return replace(
+        event,
+        points=se3.transform(pose, event.points),
+        covariances=None if event.covariances is None else R @ event.covariances @ R.T,
+        velocities=None if event.velocities is None else se3.rotate(pose, event.velocities),
+    )
+
+
+def move_velocity(event: VelocityEvent, pose: FloatArray) -> VelocityEvent:
+    """Give the velocity of the base whose sensor moves as ``event`` says.
+
+    Both move as one rigid body, so V_base = Ad_T V_sensor: where the sensor turns off the base's
+    origin, the linear velocity has a lever arm.
+
+    Parameters
+    ----------
+    event : VelocityEvent
+        Velocity of the sensor's frame, expressed in it.
+    pose : FloatArray
+        (4, 4) pose T of the sensor's frame in the base frame, which does not change.
+
+    """
+    Ad = se3.adjoint(pose)
+    covariance = None if event.covariance is None else Ad @ event.covariance @ Ad.T
+    return replace(event, body_velocity=Ad @ event.body_velocity, covariance=covariance)

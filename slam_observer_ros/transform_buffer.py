@@ -1,0 +1,135 @@
+"""What /tf and /tf_static have told of late, and the transform between any two frames at a time.
+
+The semantics are tf2's: each frame has one parent, dynamic transforms are interpolated between
+their stamps and never extrapolated, static ones hold at all times.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam_observer_ros.errors import TransformError
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.types import FloatArray
+
+HISTORY_NS = 10_000_000_000
+"""How far back transforms are kept, nanoseconds; tf2's default."""
+
+
+@dataclass(slots=True)
+class _Track:
+    """Poses of one frame in its parent, by stamp; of a static one there is only the latest."""
+
+    parent: str
+    is_static: bool
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[FloatArray] = field(default_factory=list)
+
+    def insert(self, stamp_ns: int, pose: FloatArray) -> None:
+        place = 0 if self.is_static else bisect_left(self.stamps_ns, stamp_ns)
+        is_known = self.is_static or self.stamps_ns[place : place + 1] == [stamp_ns]
+        self.stamps_ns[place : place + is_known] = [stamp_ns]
+        self.poses[place : place + is_known] = [pose]
+        outdated = bisect_left(self.stamps_ns, self.stamps_ns[-1] - HISTORY_NS)
+        del self.stamps_ns[:outdated], self.poses[:outdated]
+
+    def pose_at(self, stamp_ns: int) -> FloatArray | None:
+        """Interpolate the pose (4, 4); None outside of what is known."""
+        if self.is_static:
+            return self.poses[0]
+        after = bisect_left(self.stamps_ns, stamp_ns)
+        if after == len(self.stamps_ns) or (after == 0 and self.stamps_ns[0] != stamp_ns):
+            return None
+        if self.stamps_ns[after] == stamp_ns:
+            return self.poses[after]
+        start_ns, end_ns = self.stamps_ns[after - 1 : after + 1]
+        return _interpolate(
+            self.poses[after - 1], self.poses[after], (stamp_ns - start_ns) / (end_ns - start_ns)
+        )
+
+
+class TransformBuffer:
+    """A tree of frames over the last seconds."""
+
+    def __init__(self) -> None:
+        self._tracks: dict[str, _Track] = {}
+
+    def insert(
+        self, parent: str, child: str, stamp_ns: int, pose: FloatArray, *, is_static: bool = False
+    ) -> None:
+        """Take a transform.
+
+        Parameters
+        ----------
+        parent, child : str
+            Frame names; a leading slash, as ROS 1 had it, is ignored.
+        stamp_ns : int
+            Time of validity, nanoseconds.
+        pose : FloatArray
+            (4, 4) pose of ``child`` in ``parent``.
+        is_static : bool
+            Whether it holds at all times.
+
+        """
+        parent, child = parent.lstrip('/'), child.lstrip('/')
+        track = self._tracks.get(child)
+        if track is None or track.parent != parent or track.is_static != is_static:
+            track = self._tracks[child] = _Track(parent, is_static)
+        track.insert(stamp_ns, pose)
+
+    def clear(self) -> None:
+        """Forget what has a time, as after a jump of the clock; static transforms stay."""
+        self._tracks = {child: track for child, track in self._tracks.items() if track.is_static}
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
+        """Return the pose (4, 4) of frame ``source`` in frame ``target``.
+
+        Raises
+        ------
+        TransformError
+            If the frames are not connected, or not at that time.
+
+        """
+        target, source = target.lstrip('/'), source.lstrip('/')
+        target_chain, source_chain = self._ancestry(target), self._ancestry(source)
+        common = next((frame for frame in source_chain if frame in target_chain), None)
+        if common is None:
+            raise TransformError(f"'{source}' and '{target}' are not connected on /tf")
+        target_pose = self._pose(target_chain[: target_chain.index(common)], stamp_ns)
+        source_pose = self._pose(source_chain[: source_chain.index(common)], stamp_ns)
+        return se3.inverse(target_pose) @ source_pose
+
+    def _ancestry(self, frame: str) -> list[str]:
+        """Return the frame, its parent, and so on up to the root."""
+        chain = [frame]
+        while (track := self._tracks.get(chain[-1])) is not None:
+            if track.parent in chain:
+                raise TransformError(f"'{frame}' is its own ancestor on /tf")
+            chain.append(track.parent)
+        return chain
+
+    def _pose(self, chain: list[str], stamp_ns: int) -> FloatArray:
+        """Return the pose (4, 4) of the chain's first frame in the last one's parent."""
+        pose = np.eye(4)
+        for frame in chain:
+            track = self._tracks[frame]
+            step = track.pose_at(stamp_ns)
+            if step is None:
+                raise TransformError(
+                    f"'{track.parent}' to '{frame}' is known "
+                    f'from {track.stamps_ns[0] * 1e-9:.3f} to {track.stamps_ns[-1] * 1e-9:.3f} s, '
+                    f'not at {stamp_ns * 1e-9:.3f} s'
+                )
+            pose = step @ pose
+        return pose
+
+
+def _interpolate(start: FloatArray, end: FloatArray, share: float) -> FloatArray:
+    """Return the pose between two: position in a line, rotation about one axis, as tf2 does."""
+    R = start[:3, :3]
+    turn = so3.log(R.T @ end[:3, :3])
+    position = (1.0 - share) * start[:3, 3] + share * end[:3, 3]
+    return se3.pose(R @ so3.exp(share * turn), position)

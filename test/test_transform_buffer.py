@@ -1,0 +1,114 @@
+"""Transforms between frames: chains, interpolation, limits in time; events moved by them."""
+
+from __future__ import annotations
+
+from hypothesis import given
+import hypothesis.strategies as st
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from strategies import poses
+
+from slam_observer_ros.errors import TransformError
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.transform_buffer import HISTORY_NS, TransformBuffer
+
+SECOND = 1_000_000_000
+
+
+@given(poses(), poses(), poses())
+def test_lookup_goes_up_one_branch_and_down_the_other(base, left, right):
+    buffer = TransformBuffer()
+    buffer.insert('odom', 'base', SECOND, base)
+    buffer.insert('base', 'left', 0, left, is_static=True)
+    buffer.insert('/base', '/right', 0, right, is_static=True)
+    assert_allclose(buffer.lookup('odom', 'left', SECOND), base @ left, atol=1e-12)
+    assert_allclose(
+        buffer.lookup('right', 'left', 5 * SECOND), se3.inverse(right) @ left, atol=1e-12
+    )
+    assert_allclose(buffer.lookup('base', 'base', 0), np.eye(4))
+
+
+@given(st.floats(0.0, 1.0))
+def test_dynamic_transforms_are_interpolated(share):
+    buffer = TransformBuffer()
+    xi = np.array([0.0, 0.0, 1.2, 0.0, 0.0, 0.0])
+    shift = np.array([2.0, 0.0, 0.0])
+    end = se3.pose(se3.exp(xi)[:3, :3], shift)
+    buffer.insert('odom', 'base', 2 * SECOND, end)
+    buffer.insert('odom', 'base', SECOND, np.eye(4))  # out of order
+    found = buffer.lookup('odom', 'base', SECOND + round(share * SECOND))
+    assert_allclose(found[:3, 3], share * shift, atol=1e-8)
+    assert_allclose(found[:3, :3], se3.exp(share * xi)[:3, :3], atol=1e-8)
+
+
+def test_nothing_is_extrapolated_and_old_transforms_are_forgotten():
+    buffer = TransformBuffer()
+    buffer.insert('odom', 'base', SECOND, np.eye(4))
+    for stamp_ns in (SECOND - 1, SECOND + 1):
+        with pytest.raises(TransformError, match=r"'odom' to 'base' is known from 1\.000"):
+            buffer.lookup('odom', 'base', stamp_ns)
+    buffer.insert('odom', 'base', 2 * SECOND + HISTORY_NS, np.eye(4))
+    with pytest.raises(TransformError):
+        buffer.lookup('odom', 'base', SECOND)
+
+
+def test_unconnected_frames_and_loops_are_errors():
+    buffer = TransformBuffer()
+    buffer.insert('map', 'base', 0, np.eye(4), is_static=True)
+    with pytest.raises(TransformError, match="'camera' and 'base' are not connected"):
+        buffer.lookup('base', 'camera', 0)
+    buffer.insert('a', 'b', 0, np.eye(4), is_static=True)
+    buffer.insert('b', 'a', 0, np.eye(4), is_static=True)
+    with pytest.raises(TransformError, match='its own ancestor'):
+        buffer.lookup('a', 'map', 0)
+
+
+def test_a_new_parent_and_a_later_message_with_one_stamp_replace_what_was_known():
+    buffer = TransformBuffer()
+    moved = se3.pose(np.eye(3), np.ones(3))
+    buffer.insert('old', 'base', SECOND, np.eye(4))
+    buffer.insert('new', 'base', SECOND, np.eye(4))
+    buffer.insert('new', 'base', SECOND, moved)
+    assert_allclose(buffer.lookup('new', 'base', SECOND), moved)
+    with pytest.raises(TransformError):
+        buffer.lookup('old', 'base', SECOND)
+
+
+def test_after_a_jump_of_the_clock_only_static_transforms_are_left():
+    buffer = TransformBuffer()
+    buffer.insert('odom', 'base', SECOND, np.eye(4))
+    buffer.insert('base', 'camera', 0, np.eye(4), is_static=True)
+    buffer.clear()
+    buffer.lookup('base', 'camera', 0)
+    with pytest.raises(TransformError):
+        buffer.lookup('odom', 'base', SECOND)
+
+
+def test_roll_pitch_and_yaw_turn_about_fixed_axes():
+    pose = pose_from_rpy((1.0, 2.0, 3.0, -np.pi / 2, 0.0, -np.pi / 2))  # a camera's optical axes
+    assert_allclose(se3.transform(pose, np.array([[0.0, 0.0, 5.0]])), [[6.0, 2.0, 3.0]])
+
+
+@given(poses(), poses())
+def test_a_moved_observation_is_of_the_same_points(sensor, body):
+    points = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0]])
+    covariances = np.array([np.diag([1.0, 2.0, 3.0])] * 2)
+    event = ObservationEvent(0, np.array([1, 2]), points, covariances, points)
+    moved = move_observation(event, sensor)
+    world = se3.transform(body @ sensor, points)
+    assert_allclose(se3.transform(body, moved.points), world, atol=1e-9)
+    back = move_observation(moved, se3.inverse(sensor))
+    assert_allclose(back.covariances, covariances, atol=1e-9)
+    assert_allclose(np.linalg.norm(moved.velocities, axis=1), np.linalg.norm(points, axis=1))
+
+
+@given(poses())
+def test_sensor_and_base_move_as_one_body(sensor):
+    V = np.array([0.1, -0.2, 0.3, 1.0, 0.5, -0.4])
+    moved = move_velocity(VelocityEvent(0, V, np.eye(6)), sensor)
+    # Base, then sensor, after one second: the same whichever of the two was carried on.
+    assert_allclose(se3.exp(moved.body_velocity) @ sensor, sensor @ se3.exp(V), atol=1e-9)
+    assert np.linalg.eigvalsh(moved.covariance).min() > 0.0
