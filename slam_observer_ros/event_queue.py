@@ -88,10 +88,10 @@ class EventQueue:
 
     def _insert(self, event: Event) -> None:
         is_observation = isinstance(event, ObservationEvent)
-        ids = event.ids.tobytes() if isinstance(event, ObservationEvent) else b""
+        ids = event.ids.tobytes() if isinstance(event, ObservationEvent) else b''
         key = (event.stamp_ns, is_observation, ids)
         if key in self._known:
-            raise InvalidEventError("duplicate", "an event with this stamp is already known")
+            raise InvalidEventError('duplicate', 'an event with this stamp is already known')
         self._known.add(key)
         heapq.heappush(self._heap, (key, event))
         self.newest_ns = max(event.stamp_ns, self.newest_ns or event.stamp_ns)
@@ -110,8 +110,8 @@ class EventQueue:
         if self._strays >= CONFIRMATIONS:
             self._strays = 0
             return True
-        reason = "stamp_jump" if too_early else "too_late"
-        side = "ahead of" if too_early else "behind"
+        reason = 'stamp_jump' if too_early else 'too_late'
+        side = 'ahead of' if too_early else 'behind'
         raise InvalidEventError(
             reason, f"stamp is {abs(ahead_ns) / 1e9:.3f} s {side} the newest event's"
         )

@@ -21,7 +21,7 @@ from slam_observer_ros.errors import ParameterError
 Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
 
-NODE_NAMES = ("observer_node", "simulator_node")
+NODE_NAMES = ('observer_node', 'simulator_node')
 
 
 class Dataclass(Protocol):
@@ -30,7 +30,7 @@ class Dataclass(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
-SettingsT = TypeVar("SettingsT", bound=Dataclass)
+SettingsT = TypeVar('SettingsT', bound=Dataclass)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Parameter:
     name: str
     default: Value
     description: str
-    unit: str = ""
+    unit: str = ''
     minimum: float = -math.inf
     maximum: float = math.inf
     choices: tuple[str, ...] = ()
@@ -77,26 +77,26 @@ class Parameter:
         """
         default = self.default
         if isinstance(default, bool):
-            self._expect(value, isinstance(value, bool), "true or false")
+            self._expect(value, isinstance(value, bool), 'true or false')
             return bool(value)
         if isinstance(default, int):
             is_int = isinstance(value, int) and not isinstance(value, bool)
-            self._expect(value, is_int, "an integer")
-            return int(self._in_range(cast("int", value)))
+            self._expect(value, is_int, 'an integer')
+            return int(self._in_range(cast('int', value)))
         if isinstance(default, float):
             return self._in_range(self._number(value))
         if isinstance(default, str):
-            self._expect(value, isinstance(value, str), "a string")
+            self._expect(value, isinstance(value, str), 'a string')
             return self._choice(str(value))
         return self._vector(value, len(default))
 
     def range_text(self) -> str:
         """Return the allowed values as text, empty where anything goes."""
         if self.choices:
-            return " | ".join(self.choices)
-        lower = "" if self.minimum == -math.inf else f"≥ {self.minimum:g}"
-        upper = "" if self.maximum == math.inf else f"≤ {self.maximum:g}"
-        return ", ".join(bound for bound in (lower, upper) if bound)
+            return ' | '.join(self.choices)
+        lower = '' if self.minimum == -math.inf else f'≥ {self.minimum:g}'
+        upper = '' if self.maximum == math.inf else f'≤ {self.maximum:g}'
+        return ', '.join(bound for bound in (lower, upper) if bound)
 
     def _expect(self, value: object, is_right: bool, expected: str) -> None:
         if not is_right:
@@ -104,14 +104,14 @@ class Parameter:
 
     def _number(self, value: object) -> float:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        self._expect(value, is_number, "a number")
-        number = float(cast("float", value))
-        self._expect(value, math.isfinite(number), "a finite number")
+        self._expect(value, is_number, 'a number')
+        number = float(cast('float', value))
+        self._expect(value, math.isfinite(number), 'a finite number')
         return number
 
     def _in_range(self, value: float) -> float:
         in_range = self.minimum <= value <= self.maximum
-        self._expect(value, in_range, f"a value {self.range_text()}")
+        self._expect(value, in_range, f'a value {self.range_text()}')
         return value
 
     def _choice(self, value: str) -> str:
@@ -121,7 +121,7 @@ class Parameter:
 
     def _vector(self, value: object, length: int) -> tuple[float, ...]:
         entries = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-        self._expect(value, len(entries) == length, f"a list of {length} numbers")
+        self._expect(value, len(entries) == length, f'a list of {length} numbers')
         return tuple(self._in_range(self._number(entry)) for entry in entries)
 
 
@@ -129,7 +129,7 @@ def parameter(
     default: Value,
     description: str,
     *,
-    unit: str = "",
+    unit: str = '',
     minimum: float = -math.inf,
     maximum: float = math.inf,
     choices: tuple[str, ...] = (),
@@ -140,12 +140,12 @@ def parameter(
     Parameters are those of :class:`Parameter`; its name is the field's.
     """
     row = {
-        "description": description,
-        "unit": unit,
-        "minimum": minimum,
-        "maximum": maximum,
-        "choices": choices,
-        "read_only": read_only,
+        'description': description,
+        'unit': unit,
+        'minimum': minimum,
+        'maximum': maximum,
+        'choices': choices,
+        'read_only': read_only,
     }
     return dataclasses.field(default=default, metadata=row)
 
@@ -153,7 +153,7 @@ def parameter(
 def table(settings_class: type[Dataclass]) -> tuple[Parameter, ...]:
     """Return the parameter table of a settings dataclass, in the order of its fields."""
     return tuple(
-        Parameter(name=field.name, default=cast("Value", field.default), **field.metadata)
+        Parameter(name=field.name, default=cast('Value', field.default), **field.metadata)
         for field in dataclasses.fields(settings_class)
     )
 
@@ -187,19 +187,19 @@ def read_parameter_file(path: Path) -> dict[str, object]:
 
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except OSError as error:
         raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
     except yaml.YAMLError as error:
         reason = str(error).splitlines()[0]
-        raise ParameterError(f"parameter file {path} is not valid YAML: {reason}") from error
+        raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
     values: dict[str, object] = {}
     found = False
     for section, body in content.items() if isinstance(content, dict) else ():
-        is_ours = section == "/**" or str(section).rsplit("/", 1)[-1] == NODE_NAMES[0]
-        if is_ours and isinstance(body, dict) and isinstance(body.get("ros__parameters"), dict):
+        is_ours = section == '/**' or str(section).rsplit('/', 1)[-1] == NODE_NAMES[0]
+        if is_ours and isinstance(body, dict) and isinstance(body.get('ros__parameters'), dict):
             found = True
-            values.update(_flatten(body["ros__parameters"]))
+            values.update(_flatten(body['ros__parameters']))
     if not found:
         raise ParameterError(
             f"parameter file {path} has no '/**: ros__parameters:' or "
@@ -208,16 +208,16 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     return values
 
 
-def _flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:
     flat: dict[str, object] = {}
     for name, value in tree.items():
         if isinstance(value, dict):
-            flat.update(_flatten(value, f"{prefix}{name}."))
+            flat.update(_flatten(value, f'{prefix}{name}.'))
         else:
-            flat[f"{prefix}{name}"] = value
+            flat[f'{prefix}{name}'] = value
     return flat
 
 
 def _suggestion(name: str, rows: Mapping[str, Parameter]) -> str:
     near = difflib.get_close_matches(name, rows, n=1)
-    return f"; did you mean '{near[0]}'?" if near else ""
+    return f"; did you mean '{near[0]}'?" if near else ''
