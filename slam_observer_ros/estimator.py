@@ -312,6 +312,12 @@ class Estimator:
         return self._slam.landmark_covariances
 
     @property
+    def landmark_velocities(self) -> FloatArray:
+        """(n, 3) velocities of landmarks that move, known or estimated, m/s, world."""
+        observer = self._slam.observer
+        return se3.rotate(observer.reference_pose, observer.u)
+
+    @property
     def last_update(self) -> Update | None:
         """The latest update; None before the first observation."""
         return self._last

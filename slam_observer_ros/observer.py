@@ -35,12 +35,15 @@ class Correction:
         Landmarks that are moved, m of them; the others stay where they are in the world.
     d : FloatArray
         (m, 3) translations in the reference frame, metres.
+    u : FloatArray or None
+        (m, 3) changes of the landmarks' own velocities, m/s; None where they are not estimated.
 
     """
 
     D: FloatArray
     indices: IntArray | slice
     d: FloatArray
+    u: FloatArray | None = None
 
 
 class Observer:
@@ -190,6 +193,8 @@ class Observer:
         D, indices = correction.D, correction.indices
         self.A = D @ self.A
         self.a[indices] = self.a[indices] @ D[:3, :3].T + correction.d
+        if correction.u is not None:
+            self.u[indices] = self.u[indices] @ D[:3, :3].T + correction.u
 
 
 def lyapunov(gain_k: FloatArray | float, r: FloatArray) -> float:

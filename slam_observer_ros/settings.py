@@ -153,6 +153,12 @@ class Settings:
         unit='1/√s',
         minimum=0.0,
     )
+    landmark_velocity_error: float = parameter(
+        0.0,
+        'Riccati gains: spread of unknown constant landmark velocities to be estimated; 0: static',
+        unit='m/s',
+        minimum=0.0,
+    )
     two_d_mode: bool = parameter(
         False, 'Whether motion and map are planar: z, roll and pitch stay exactly zero'
     )

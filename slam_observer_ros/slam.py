@@ -119,8 +119,9 @@ class Slam:
         """Move the state on along ``held``."""
         path = self.observer.propagate(self.gains.calibrated(held.body_velocities), held.dt_s)
         self.observer.move_landmarks(float(np.sum(held.dt_s + held.gap_s)))
-        covariances = self._noise.motion(held)
-        self.gains.predict(Motion(path, held.body_velocities, held.dt_s, covariances))
+        noise = self._noise.motion(held)
+        motion = Motion(path, held.body_velocities, held.dt_s, held.gap_s, noise)
+        self.gains.predict(motion)
 
     def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the state's instant.

@@ -231,3 +231,20 @@ def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains)
     estimator.flush()
     np.testing.assert_allclose(estimator.world_points, LANDMARKS + speed * 9.95, atol=1e-6)
     np.testing.assert_allclose(estimator.pose, true_pose(9.95), atol=1e-6)
+
+
+def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():
+    speed = np.array([[0.2, 0.0, 0], [0, -0.3, 0.1], [0, 0, 0], [0.1, 0.1, 0], [0, 0, 0.2]])
+    noise = np.random.default_rng(4)
+    estimator = Estimator(
+        Settings(landmark_velocity_error=0.5, point_noise=0.01, observation_model='cartesian')
+    )
+    for step in range(600):
+        time_s = 0.05 * step
+        estimator.add(velocity(time_s))
+        points = se3.transform(se3.inverse(true_pose(time_s)), LANDMARKS + speed * time_s)
+        points = points + noise.normal(scale=0.01, size=points.shape)
+        stamp_ns = START_NS + round(time_s * 1e9)
+        estimator.add(ObservationEvent(stamp_ns, np.arange(5), points))
+    estimator.flush()
+    np.testing.assert_allclose(estimator.landmark_velocities, speed, atol=0.03)

@@ -22,6 +22,8 @@ class Motion:
         (k, 6) velocities (Ω, v) as measured, rad/s and m/s.
     dt_s : FloatArray
         (k,) seconds that each velocity was held.
+    gap_s : FloatArray
+        (k,) seconds after each piece during which no velocity was known.
     covariances : FloatArray
         (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
 
@@ -30,6 +32,7 @@ class Motion:
     path: FloatArray
     measured_velocities: FloatArray
     dt_s: FloatArray
+    gap_s: FloatArray
     covariances: FloatArray
 
 

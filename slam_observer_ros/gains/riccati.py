@@ -13,12 +13,16 @@ frame, stays exactly in its null space and the covariance stays honest. Then
     update       K = P Cᵀ (C P Cᵀ + R)⁻¹,   X̂ ← exp(−K r) · X̂
 
 at O(m n) for m landmarks seen plus O(m n²) to update the covariance of n known ones.
+
+With ``landmark_velocity_error`` each landmark has an unknown velocity u_i in the reference frame
+as well; ã_i then grows by ũ_i dt, prediction costs O(n²), and there is no looking back.
 """
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
-import scipy.linalg
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
@@ -32,6 +36,8 @@ from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Prior, Smoother, Solution
 from slam_observer_ros.types import FloatArray, IntArray
+
+logger = logging.getLogger(__name__)
 
 ITERATIONS = 2
 TOLERANCE = 1e-2
@@ -53,6 +59,8 @@ class RiccatiGains:
         self._calibration = Calibration(settings, self._axes)
         self._p = len(self._axes.pose)
         self._first = self._p + self._calibration.count
+        self._is_moving = settings.landmark_velocity_error > 0.0
+        self._stride = self._axes.point * (2 if self._is_moving else 1)
         self._P = initial_covariance(self._axes, self._calibration)
         start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P.copy())
         self._history = History(self._axes, start)
@@ -86,14 +94,16 @@ class RiccatiGains:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
         self._history.move(motion, self._calibration)
         predict(self._P, self._axes, self._calibration, motion)
+        if self._is_moving:
+            everything = np.arange(self._count)
+            a, u = self._columns(everything), self._velocity_columns(everything)
+            duration_s = np.sum(motion.dt_s + motion.gap_s)
+            self._P[a] += duration_s * self._P[u]
+            self._P[:, a] += duration_s * self._P[:, u]
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks (m, 3) with room for them in P."""
-        count, size = self._count, len(self._P) + self._axes.point * len(y_ref)
-        P = np.zeros((size, size))
-        P[: len(self._P), : len(self._P)] = self._P
-        self._P = P
-        self._place(np.arange(count, count + len(y_ref)), y_ref, covariances)
+        self._place(self._make_room(len(y_ref)), y_ref, covariances)
 
     def relocate_landmarks(
         self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
@@ -111,6 +121,21 @@ class RiccatiGains:
         P[:, columns] = P[columns].T
         own = J @ P[:p, :p] @ J.T + block_diagonal(covariances[:, :k, :k])
         P[np.ix_(columns, columns)] = own
+        self._place_velocities(indices)
+
+    def _place_velocities(self, indices: IntArray) -> None:
+        """Fill in P for landmarks whose velocity is not known at all yet."""
+        if self._is_moving:
+            columns = self._velocity_columns(indices)
+            self._P[columns] = self._P[:, columns] = 0.0
+            self._P[columns, columns] = self._settings.landmark_velocity_error**2
+
+    def _make_room(self, m: int) -> IntArray:
+        """Append m landmarks to P, filled with zeros; return their indices."""
+        count, old = self._count, self._P
+        self._P = np.zeros((len(old) + self._stride * m,) * 2)
+        self._P[: len(old), : len(old)] = old
+        return np.arange(count, count + m)
 
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
@@ -120,9 +145,10 @@ class RiccatiGains:
 
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Append landmarks whose errors are independent of all else."""
-        k = self._axes.point
-        own = block_diagonal(covariances[:, :k, :k])
-        self._P = np.asarray(scipy.linalg.block_diag(self._P, own), dtype=np.float64)
+        k, indices = self._axes.point, self._make_room(len(covariances))
+        columns = self._columns(indices)
+        self._P[np.ix_(columns, columns)] = block_diagonal(covariances[:, :k, :k])
+        self._place_velocities(indices)
 
     def joint_covariance(self, indices: IntArray) -> FloatArray:
         """Return the covariance (m k, m k) of landmarks together."""
@@ -136,14 +162,15 @@ class RiccatiGains:
         k = self._axes.point
         G = np.zeros((len(self._P), self._p))
         G[: self._p] = np.eye(self._p)
-        G[self._first :] = self._axes.output_matrix(points).reshape(-1, self._p)
+        everything = self._columns(np.arange(self._count))
+        G[everything] = self._axes.output_matrix(points).reshape(-1, self._p)
         R = block_diagonal(covariances[:, :k, :k])
         x, self._P = anchor(self._P, G, self._columns(indices), R, r[:, :k].ravel())
         return self._as_correction(-x)
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Delete the rows and columns of the landmarks at ``indices``."""
-        columns = self._columns(indices)
+        columns = np.append(self._columns(indices), self._velocity_columns(indices))
         self._history.remove_landmarks(indices)
         self._P = np.delete(np.delete(self._P, columns, axis=0), columns, axis=1)
 
@@ -188,7 +215,7 @@ class RiccatiGains:
         filter's covariance, and its solution the observer's new reference ξ°, with â_i = 0.
         """
         interval = self._settings.hindsight_interval
-        if interval == 0:
+        if interval == 0 or self._is_moving:
             return
         self._history.see(seen, observer.A, observer.shifts[seen.indices])
         self._observations += 1
@@ -227,9 +254,13 @@ class RiccatiGains:
 
     def _rebase(self, observer: Observer) -> None:
         smoother = self._smoother()
-        solution = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
         self._observations, self._turn_squared = 0, 0.0
-        covariance = smoother.marginal(solution)
+        try:
+            solution = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
+            covariance = smoother.marginal(solution)
+        except np.linalg.LinAlgError:
+            logger.warning('Could not look back: the observations so far leave something open.')
+            return
         observer.rebase(solution.poses[-1], solution.points + observer.shifts)
         self._calibration.shift(solution.calibration - self._calibration.values)
         J = np.eye(len(covariance))
@@ -243,17 +274,27 @@ class RiccatiGains:
 
     @property
     def _count(self) -> int:
-        return (len(self._P) - self._first) // self._axes.point
+        return (len(self._P) - self._first) // self._stride
 
     def _columns(self, indices: IntArray) -> IntArray:
         """Return the columns of P that belong to landmarks (m,), as (m · point,)."""
-        k = self._axes.point
-        return (self._first + k * indices[:, None] + np.arange(k)).ravel()
+        first = self._first + self._stride * indices[:, None]
+        return (first + np.arange(self._axes.point)).ravel()
+
+    def _velocity_columns(self, indices: IntArray) -> IntArray:
+        """Return those of the landmarks' velocities, none where these are not estimated."""
+        if not self._is_moving:
+            return np.empty(0, dtype=np.int64)
+        return self._columns(indices) + self._axes.point
 
     def _as_correction(self, x: FloatArray) -> Correction:
         """Return the group element exp(x); the calibration moves by its own part of x."""
         self._calibration.shift(x[self._p : self._first])
         Delta = self._axes.full_pose(x[: self._p])
         self._turn_squared += float(Delta[:3] @ Delta[:3])
-        X = slam_group.exp(Delta, self._axes.full_points(x[self._first :]))
-        return Correction(X.A, slice(None), X.a)
+        everything = np.arange(self._count)
+        X = slam_group.exp(Delta, self._axes.full_points(x[self._columns(everything)]))
+        if not self._is_moving:
+            return Correction(X.A, slice(None), X.a)
+        u = self._axes.full_points(x[self._velocity_columns(everything)])
+        return Correction(X.A, slice(None), X.a, u)
