@@ -306,5 +306,3 @@ class TestRealData:
         report = self.accuracy(slam_observer, path, '--gains', 'constant')
         assert report['ate_rmse_m'] < report['dead_reckoning_ate_rmse_m']
         assert report['landmarks'] == 15
-        better = self.accuracy(slam_observer, path, '--config', 'wheeled_bearing_range')
-        assert better['ate_rmse_m'] < report['ate_rmse_m']
