@@ -41,7 +41,7 @@ class Update:
     ids : IntArray
         (m,) ids of the known landmarks that were seen.
     residuals : FloatArray
-        (m, 3) their residuals r_i before the correction, metres, reference frame.
+        (m, 3) their residuals r_i before the correction, metres, along the world's axes.
     lyapunov : float
         L (34) of these residuals.
 
@@ -115,15 +115,10 @@ class Estimator:
         self.dropped: Counter[str] = Counter()
         self._map: LandmarkMap | None = None
         self._on_update = on_update
-        self._queue = EventQueue(
-            _nanoseconds(settings.reorder_window),
-            _nanoseconds(settings.max_stamp_jump),
-            _nanoseconds(settings.late_limit),
-        )
         self.reset(initial_pose)
 
     def reset(self, pose: FloatArray | None = None) -> None:
-        """Forget the motion and what was mapped, and start again.
+        """Forget the motion, what was mapped and events held back, and start again.
 
         Parameters
         ----------
@@ -132,6 +127,11 @@ class Estimator:
 
         """
         self._start(pose)
+        self._queue = EventQueue(
+            _nanoseconds(self.settings.reorder_window),
+            _nanoseconds(self.settings.max_stamp_jump),
+            _nanoseconds(self.settings.late_limit),
+        )
         self._velocities = VelocityHistory(_nanoseconds(self.settings.velocity_timeout))
         self._state_ns: int | None = None
         self._stamp_ns: int | None = None
@@ -204,7 +204,7 @@ class Estimator:
         if jumped:
             logger.warning('The clock has jumped; starting again.')
             self.reset(None if self._map else self._slam.observer.reference_pose)
-            self._queue.restart(event)
+            self._queue.push(event)
         for ready in self._queue.pop_ready():
             self._process(ready)
         return True
@@ -362,7 +362,9 @@ class Estimator:
         self.counts['observation'] += 1
         self._localise(ids)
         level = lyapunov(self.settings.gain_k, residuals)
-        self._last = Update(event.stamp_ns, self._slam.observer.pose, ids, residuals, level)
+        observer = self._slam.observer
+        residuals = se3.rotate(observer.reference_pose, residuals)
+        self._last = Update(event.stamp_ns, observer.pose, ids, residuals, level)
         if self._on_update is not None:
             self._on_update(self._last)
 

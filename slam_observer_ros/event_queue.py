@@ -59,14 +59,6 @@ class EventQueue:
             self._insert(event)
         return jumped
 
-    def restart(self, event: Event) -> None:
-        """Empty the queue and begin anew with ``event``, after a jump of the clock."""
-        self._heap.clear()
-        self._known.clear()
-        self._given_out.clear()
-        self.newest_ns = None
-        self._insert(event)
-
     def pop_ready(self) -> Iterator[Event]:
         """Give out, in order, the events that have left the window."""
         newest_ns = self.newest_ns or 0

@@ -142,10 +142,16 @@ def test_a_forgotten_landmark_leaves_the_others_alone_and_may_come_back():
     assert estimator.landmark_ids[-1] == 3
 
 
-def test_reset_forgets_everything():
-    estimator = run(drive())
+def test_reset_forgets_everything_so_that_a_recording_may_start_over():
+    estimator = Estimator(Settings())
+    for event in drive():
+        estimator.add(event)
     estimator.reset()
     assert len(estimator.landmark_ids) == 0
+    assert all(estimator.add(event) for event in drive())
+    estimator.flush()
+    assert_same_state(estimator, run(drive()))
+    estimator.reset()
     np.testing.assert_array_equal(estimator.pose, np.eye(4))
 
 

@@ -60,7 +60,6 @@ def _residual_lines(header: Header, estimator: Estimator) -> Marker:
     if update is not None:
         _, seen, rows = np.intersect1d(update.ids, estimator.landmark_ids, return_indices=True)
         ends = estimator.world_points[rows]
-        # The reference pose is the identity, so residuals lie along the map's axes.
         lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
         marker.points = [point_message(point) for point in lines]
     return marker
