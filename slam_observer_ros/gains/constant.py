@@ -13,9 +13,11 @@ and the landmarks close the share 1 − e^{−(l/k) dt} of what remains. To firs
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
+from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, lyapunov, Observer
@@ -35,7 +37,7 @@ class ConstantGains:
         ``gain_k`` is k of (30), ``gain_l`` is l of (31). The ``step_mode`` 'paper' turns about
         the reference's origin with the metric of (10), and so converges to the paper's
         differential equation for dt → 0; 'exponential' turns about the centroid of the e_i,
-        where rotation and translation do not compete.
+        where rotation and translation do not compete. In ``two_d_mode`` all turns are about z.
 
     """
 
@@ -43,6 +45,7 @@ class ConstantGains:
     landmark_covariances = None
 
     def __init__(self, settings: Settings) -> None:
+        self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
         self.change_settings(settings)
 
     def change_settings(self, settings: Settings) -> None:
@@ -90,7 +93,8 @@ class ConstantGains:
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return the innovation; all observations take part."""
         k = np.full(len(innovation.r), self.gain_k)
-        step = paper_step if self.step_mode == 'paper' else centroid_step
+        step_on = paper_step if self.step_mode == 'paper' else centroid_step
+        step = partial(step_on, axes=self._axes)
         D = safe_step(step, k, innovation.e, innovation.r, innovation.dt_s)
         remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
         d = -np.expm1(-self.gain_l / self.gain_k * innovation.dt_s) * remaining  # (31)
@@ -104,7 +108,9 @@ class ConstantGains:
         """Do nothing: constant gains have no memory."""
 
 
-def centroid_step(k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float) -> FloatArray:
+def centroid_step(
+    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: Axes = SPATIAL
+) -> FloatArray:
     """Return the pose's step D (4, 4), turning about the gain-weighted centroid of the e_i.
 
     Parameters
@@ -115,19 +121,23 @@ def centroid_step(k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float) -> F
         (m, 3) errors and residuals, metres.
     dt_s : float
         Time step, seconds.
+    axes : Axes
+        Axes of the pose that are moved.
 
     """
     total = np.sum(k)
     centre = k @ e / total if total > 0.0 else np.zeros(3)
-    return _step_about(centre, np.ones(6), k, e, r, dt_s)
+    return _step_about(centre, np.ones(6), k, e, r, dt_s, axes)
 
 
-def paper_step(k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float) -> FloatArray:
+def paper_step(
+    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: Axes = SPATIAL
+) -> FloatArray:
     """Return the pose's step D (4, 4) that tends to exp(Δ dt), Δ as in (30), for dt → 0.
 
     Parameters are those of :func:`centroid_step`.
     """
-    return _step_about(np.zeros(3), PAPER_METRIC, k, e, r, dt_s)
+    return _step_about(np.zeros(3), PAPER_METRIC, k, e, r, dt_s, axes)
 
 
 def safe_step(
@@ -158,15 +168,15 @@ def _step_about(
     e: FloatArray,
     r: FloatArray,
     dt_s: float,
+    axes: Axes,
 ) -> FloatArray:
     """Return the exponential step D (4, 4) about ``centre`` with the diagonal ``metric``."""
-    arms = e - centre
-    J = np.concatenate([-so3.hat(arms), np.broadcast_to(np.eye(3), (len(e), 3, 3))], axis=2)
-    root = np.sqrt(metric)
+    J = axes.output_matrix(e - centre)
+    root, r = np.sqrt(metric[axes.pose]), r[:, : axes.point]
     g = root * np.einsum('i,ijk,ij->k', k, J, r)
     H = root[:, None] * np.einsum('i,ijk,ijl->kl', k, J, J) * root
     rates, U = np.linalg.eigh(H)
-    xi = -root * (U @ (_held_time(rates, dt_s) * (U.T @ g)))
+    xi = axes.full_pose(-root * (U @ (_held_time(rates, dt_s) * (U.T @ g))))
     R = so3.exp(xi[:3])
     return se3.pose(R, centre - R @ centre + xi[3:])
 

@@ -36,5 +36,8 @@ def predict(P: FloatArray, axes: Axes, calibration: Calibration, motion: Motion)
         F = calibration.sensitivity(Ad, motion)
         P[:p] += F @ P[c]
         P[:, :p] += P[:, c] @ F.T
+        P[p:, :p] = P[:p, p:].T
         P[c, c] += np.diag(calibration.drift_variances * np.sum(motion.dt_s))
     P[:p, :p] += np.sum(Ad @ motion.covariances @ so3.transpose(Ad), axis=0)
+    # No observation takes a skew part away again, so rounding must not add to it.
+    P[:p, :p] = 0.5 * (P[:p, :p] + P[:p, :p].T)

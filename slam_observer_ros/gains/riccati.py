@@ -221,7 +221,7 @@ class RiccatiGains:
         self._observations += 1
         rested = self._observations >= max(interval, len(self._history.stamps_ns) // 10)
         turned_far = self._turn_squared > self._settings.hindsight_turn**2
-        if in_doubt or (turned_far and rested):
+        if in_doubt or self._window_is_full or (turned_far and rested):
             self._rebase(observer)
 
     def smooth(self, observer: Observer) -> Solution:
@@ -267,10 +267,13 @@ class RiccatiGains:
         J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(self._axes.pose, self._axes.pose)]
         self._P = J @ covariance @ J.T
         self._history.poses = list(solution.poses)
-        window = self._settings.hindsight_window
-        if window and len(self._history.stamps_ns) >= window:
+        if self._window_is_full:
             prior = Prior(observer.A, solution.calibration, solution.points, covariance)
             self._history = History(self._axes, prior)
+
+    @property
+    def _window_is_full(self) -> bool:
+        return 0 < self._settings.hindsight_window <= len(self._history.stamps_ns)
 
     @property
     def _count(self) -> int:
