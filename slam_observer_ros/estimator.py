@@ -127,15 +127,25 @@ class Estimator:
 
         """
         self._start(pose)
-        self._queue = EventQueue(
-            _nanoseconds(self.settings.reorder_window),
-            _nanoseconds(self.settings.max_stamp_jump),
-            _nanoseconds(self.settings.late_limit),
-        )
-        self._velocities = VelocityHistory(_nanoseconds(self.settings.velocity_timeout))
-        self._state_ns: int | None = None
-        self._stamp_ns: int | None = None
+        self._forget_time()
         self._last: Update | None = None
+
+    def restart_time(self) -> None:
+        """Begin anew in time, after a jump of the clock, as ``on_time_jump`` says.
+
+        ``reset`` starts again where the run began, or anywhere in a loaded map; ``hold`` keeps
+        pose and map, and goes on from there.
+        """
+        if self.settings.on_time_jump == 'reset':
+            logger.warning('The clock has jumped; starting again.')
+            self.reset(None if self._map else self._slam.observer.reference_pose)
+            return
+        logger.warning('The clock has jumped; pose and map are held.')
+        self.flush()
+        if self._stamp_ns is not None:
+            self._advance(self._stamp_ns)
+        self._slam.restart_time()
+        self._forget_time()
 
     def load_map(
         self,
@@ -202,8 +212,7 @@ class Estimator:
             self._drop(error)
             return False
         if jumped:
-            logger.warning('The clock has jumped; starting again.')
-            self.reset(None if self._map else self._slam.observer.reference_pose)
+            self.restart_time()
             self._queue.push(event)
         for ready in self._queue.pop_ready():
             self._process(ready)
@@ -367,6 +376,17 @@ class Estimator:
         self._last = Update(event.stamp_ns, observer.pose, ids, residuals, level)
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _forget_time(self) -> None:
+        """Forget all that has a stamp but the map."""
+        self._queue = EventQueue(
+            _nanoseconds(self.settings.reorder_window),
+            _nanoseconds(self.settings.max_stamp_jump),
+            _nanoseconds(self.settings.late_limit),
+        )
+        self._velocities = VelocityHistory(_nanoseconds(self.settings.velocity_timeout))
+        self._state_ns: int | None = None
+        self._stamp_ns: int | None = None
 
     def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
         """Start with an empty map, or with the one that was loaded."""

@@ -62,6 +62,12 @@ class Settings:
         unit='s',
         minimum=0.1,
     )
+    on_time_jump: str = parameter(
+        'reset',
+        'What happens when the clock jumps, as in a recording that is looped: reset, the run '
+        'starts again; hold, pose and map are kept',
+        choices=('reset', 'hold'),
+    )
     angular_velocity_noise: Vector3 = parameter(
         (0.03, 0.03, 0.03),
         'White noise of the angular velocity x y z: standard deviation of the angle after 1 s',

@@ -105,6 +105,11 @@ class Slam:
         self.gains.set_pose_covariance(back @ given @ back.T)
         self.gains.restart(observer)
 
+    def restart_time(self) -> None:
+        """Go on from here at any other time; what was seen before can't be looked back at."""
+        self._innovation_ns = None
+        self.gains.restart(self.observer)
+
     def change_settings(self, settings: Settings) -> None:
         """Use other gains from now on."""
         self.settings = settings

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.event_queue import CONFIRMATIONS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings
@@ -254,3 +257,26 @@ def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():
         estimator.add(ObservationEvent(stamp_ns, np.arange(5), points))
     estimator.flush()
     np.testing.assert_allclose(estimator.landmark_velocities, speed, atol=0.03)
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+def test_after_a_jump_back_in_time_pose_and_map_are_held_if_asked(gains):
+    events = drive()
+    estimator = run(events, on_time_jump='hold', gains=gains)
+    pose, points = estimator.pose, estimator.world_points
+    stray = ObservationEvent(START_NS - 10**12, np.array([99]), np.ones((1, 3)))
+    for step in range(CONFIRMATIONS):
+        estimator.add(replace(stray, stamp_ns=stray.stamp_ns + step))
+    assert estimator.newest_stamp_ns == stray.stamp_ns + CONFIRMATIONS - 1
+    estimator.flush()
+    np.testing.assert_allclose(estimator.pose, pose, atol=1e-12)
+    np.testing.assert_allclose(estimator.world_points[:-1], points, atol=1e-12)
+    np.testing.assert_allclose(estimator.world_points[-1], pose[:3] @ [1.0, 1.0, 1.0, 1.0])
+
+
+def test_told_of_a_jump_the_estimator_starts_again_at_once():
+    estimator = run(drive())
+    estimator.restart_time()
+    assert len(estimator.landmark_ids) == 0
+    assert estimator.stamp_ns is None
+    assert estimator.add(velocity(-1e6))
