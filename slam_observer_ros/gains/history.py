@@ -109,17 +109,19 @@ class History:
 
     def frames(self) -> Frames:
         """Return all frames as arrays."""
+        S, d, k = len(self.stamps_ns), len(self._axes.pose), self._axes.point
         counts = [len(landmarks) for landmarks in self._landmarks]
+        none = np.empty(0, dtype=np.int64)
         return Frames(
-            np.array(self._motions),
-            np.array(self._covariances),
-            np.array(self._sensitivities),
-            np.array(self._calibrations),
-            np.repeat(np.arange(len(counts)), counts),
-            np.concatenate(self._landmarks),
-            np.concatenate(self._points),
-            np.concatenate(self._shifts),
-            np.concatenate(self._information),
+            np.reshape(self._motions, (S, 4, 4)),
+            np.reshape(self._covariances, (S, d, d)),
+            np.reshape(self._sensitivities, (S, d, len(self._calibration))),
+            np.reshape(self._calibrations, (S, len(self._calibration))),
+            np.repeat(np.arange(S), counts),
+            np.concatenate([none, *self._landmarks]),
+            np.concatenate([np.empty((0, 3)), *self._points]),
+            np.concatenate([np.empty((0, 3)), *self._shifts]),
+            np.concatenate([np.empty((0, k, k)), *self._information]),
         )
 
     def _keep(self, s: int, kept: BoolArray) -> None:

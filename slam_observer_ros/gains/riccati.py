@@ -223,6 +223,9 @@ class RiccatiGains:
         turned_far = self._turn_squared > self._settings.hindsight_turn**2
         if in_doubt or self._window_is_full or (turned_far and rested):
             self._rebase(observer)
+        # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
+        if self._window_is_full and not in_doubt:
+            self.restart(observer)
 
     def smooth(self, observer: Observer) -> Solution:
         """Return the estimates in hindsight of everything since the history's prior."""
@@ -267,9 +270,6 @@ class RiccatiGains:
         J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(self._axes.pose, self._axes.pose)]
         self._P = J @ covariance @ J.T
         self._history.poses = list(solution.poses)
-        if self._window_is_full:
-            prior = Prior(observer.A, solution.calibration, solution.points, covariance)
-            self._history = History(self._axes, prior)
 
     @property
     def _window_is_full(self) -> bool:
