@@ -1,4 +1,4 @@
-"""Localisation in a known map: where the robot is, in the map's frame, with an honest covariance."""
+"""Localisation in a known map: the pose in the map's frame, with an honest covariance."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def line_of_landmarks(count):
 def test_what_leaves_the_pose_open_does_not_place_the_robot(known, is_planar, is_enough):
     estimator = Estimator(Settings(two_d_mode=is_planar, reorder_window=0.0))
     estimator.load_map(known)
-    add(estimator, [ObservationEvent(10**9, known.ids, known.world_points + [1.0, 0.0, 0.0])])
+    add(estimator, [ObservationEvent(10**9, known.ids, known.world_points + np.eye(3)[0])])
     assert estimator.is_localised == is_enough
     assert estimator.counts['not_localised'] == (not is_enough)
 

@@ -11,6 +11,7 @@ from rclpy.node import Node
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.inputs import Input
+from slam_observer_ros.nodes.intake import Intake
 
 SILENT_S = 2.0
 """An input without messages for this long is a warning."""
@@ -25,14 +26,23 @@ class Diagnostics:
         Node whose health is told.
     estimator : Estimator
         Source of counts and drops.
+    intake : Intake
+        Source of further drops, and of the clocks' offsets.
     inputs : sequence of Input
         Topics to watch.
 
     """
 
-    def __init__(self, node: Node, estimator: Estimator, inputs: Sequence[Input[Any]]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        estimator: Estimator,
+        intake: Intake,
+        inputs: Sequence[Input[Any]],
+    ) -> None:
         self._node = node
         self._estimator = estimator
+        self._intake = intake
         self._inputs = inputs
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
@@ -87,6 +97,8 @@ class Diagnostics:
         self._last_dropped = dropped
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
+        if not self._estimator.is_localised:
+            warnings.append('the place in the loaded map is not known yet: no pose is published')
         return [warning for warning in warnings if warning]
 
     @staticmethod

@@ -26,10 +26,11 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
     unknown_covariance_field,
 )
+from slam_observer_ros.nodes.frames import TransformSource
 from slam_observer_ros.nodes.markers import landmark_markers
+from slam_observer_ros.nodes.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.nodes.transforms import TransformPublisher
 from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud, FLOAT32_ID_LIMIT
 
 PATH_SPACING_NS = 100_000_000
@@ -40,7 +41,7 @@ class Outputs:
     """Publishers of the estimate.
 
     Each message carries the stamp of the estimator's state, never the present time, and no stamp
-    is published twice.
+    is published twice. Nothing is published while the place in a loaded map is unknown.
 
     Parameters
     ----------
@@ -50,10 +51,18 @@ class Outputs:
         Frames, rates and lengths.
     estimator : Estimator
         Where the estimate comes from.
+    transforms : TransformSource
+        Where others' odometry is.
 
     """
 
-    def __init__(self, node: Node, settings: ObserverNodeSettings, estimator: Estimator) -> None:
+    def __init__(
+        self,
+        node: Node,
+        settings: ObserverNodeSettings,
+        estimator: Estimator,
+        transforms: TransformSource,
+    ) -> None:
         self._node = node
         self._settings = settings
         self._estimator = estimator
@@ -68,17 +77,21 @@ class Outputs:
         self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
         self._map = node.create_publisher(PointCloud2, 'map', LATCHED_QOS)
         self._markers = node.create_publisher(MarkerArray, 'markers', RELIABLE_QOS)
-        self._transform: TransformPublisher | None = None
+        self._broadcaster: PoseBroadcaster | None = None
         if settings.publish_tf:
-            self._transform = TransformPublisher(node, '/tf', RELIABLE_QOS)
+            self._broadcaster = PoseBroadcaster(node, settings, transforms)
 
     def publish_state(self) -> None:
         """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
+        if self._broadcaster is not None:
+            self._broadcaster.retry()
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None or stamp_ns == self._fast_stamp_ns:
+        if stamp_ns in (None, self._fast_stamp_ns) or not self._estimator.is_localised:
             return
         self._fast_stamp_ns = stamp_ns
         self._publish_pose(stamp_ns)
+        if self._broadcaster is not None:
+            self._broadcaster.add(stamp_ns, self._estimator.pose)
         self._extend_path(stamp_ns)
         self._lyapunov.publish(Float64(data=float(self._estimator.lyapunov)))
         self._publish_estimates(stamp_ns)
@@ -86,7 +99,7 @@ class Outputs:
     def publish_overview(self) -> None:
         """Publish path, map and markers if they are new; they are costly, so seldom."""
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None or stamp_ns == self._slow_stamp_ns:
+        if stamp_ns in (None, self._slow_stamp_ns) or not self._estimator.is_localised:
             return
         self._slow_stamp_ns = stamp_ns
         header = header_message(stamp_ns, self._settings.map_frame)
@@ -103,10 +116,17 @@ class Outputs:
         if self._markers.get_subscription_count() > 0:
             self._markers.publish(landmark_markers(header, self._estimator))
 
-    def forget_path(self) -> None:
-        """Begin the path anew."""
+    def repeat_transform(self) -> None:
+        """Publish the odometry's correction as of now, while no new one comes."""
+        if self._broadcaster is not None:
+            self._broadcaster.repeat(self._node.get_clock().now().nanoseconds)
+
+    def begin_anew(self) -> None:
+        """Forget the path and what waits: the estimate is at another place or in another frame."""
         self._path.clear()
         self._path_stamp_ns = None
+        if self._broadcaster is not None:
+            self._broadcaster.forget()
 
     def _publish_pose(self, stamp_ns: int) -> None:
         header = header_message(stamp_ns, self._settings.map_frame)
@@ -125,14 +145,6 @@ class Outputs:
                 twist=twist,
             )
         )
-        if self._transform is not None:
-            self._transform.publish(
-                stamp_ns,
-                self._settings.map_frame,
-                self._settings.base_frame,
-                self._estimator.pose,
-            )
-
     def _publish_estimates(self, stamp_ns: int) -> None:
         ids = self._estimator.landmark_ids
         if np.any(ids >= FLOAT32_ID_LIMIT):

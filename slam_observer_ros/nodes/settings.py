@@ -39,6 +39,13 @@ class ObserverNodeSettings:
     path_length: int = parameter(
         2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
     )
+    map_file: str = parameter(
+        '', 'Map to load at the start: one saved earlier, or surveyed landmarks; empty for none'
+    )
+    map_path: str = parameter(
+        '', 'File of ~/save_map, ~/load_map and autosave_map', read_only=False
+    )
+    autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
 
 
 @dataclass(frozen=True)

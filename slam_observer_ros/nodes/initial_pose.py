@@ -1,0 +1,83 @@
+"""Poses that a person or another node gives to the observer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+from rclpy.node import Node
+
+from slam_observer_ros.errors import MessageError
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.nodes.qos import RELIABLE_QOS
+from slam_observer_ros.recording.messages import decode_pose_with_covariance_stamped, PoseMessage
+from slam_observer_ros.types import FloatArray
+
+TOPICS = ('initialpose', '~/set_pose')
+
+ASSUMED_STD = np.array([0.26, 0.26, 0.26, 0.5, 0.5, 0.5])
+"""Standard deviation of what the message leaves open, rad and m; the same as RViz's.
+
+RViz's 2D Pose Estimate, for one, gives the variances of x, y and yaw only, and zeros else.
+"""
+
+
+class InitialPose:
+    """Subscriptions whose poses move the robot.
+
+    Parameters
+    ----------
+    node : Node
+        Node that subscribes.
+    map_frame : str
+        Frame that the poses must be in.
+    estimator : Estimator
+        Whose robot is moved.
+    on_move : callable
+        Called after each move.
+
+    """
+
+    def __init__(
+        self, node: Node, map_frame: str, estimator: Estimator, on_move: Callable[[], None]
+    ) -> None:
+        self._node = node
+        self._map_frame = map_frame
+        self._estimator = estimator
+        self._on_move = on_move
+        for topic in TOPICS:
+            node.create_subscription(
+                PoseWithCovarianceStamped, topic, self._receive, RELIABLE_QOS, raw=True
+            )
+
+    def _receive(self, raw: bytes) -> None:
+        try:
+            message = decode_pose_with_covariance_stamped(raw)
+            self._check(message)
+        except MessageError as error:
+            self._node.get_logger().error(f'the pose given is not used: {error}')
+            return
+        self._estimator.flush()  # what has come before belongs to where the robot was
+        self._estimator.set_pose(message.pose, filled_in(message.covariance))
+        self._on_move()
+        x, y, z = message.position.tolist()
+        self._node.get_logger().info(f'the robot is set to ({x:.2f}, {y:.2f}, {z:.2f}) m')
+
+    def _check(self, message: PoseMessage) -> None:
+        if message.frame_id not in ('', self._map_frame):
+            raise MessageError(f"it is in frame '{message.frame_id}', not '{self._map_frame}'")
+        if not np.isfinite(message.position).all():
+            raise MessageError('its position has a NaN or infinite entry')
+        covariance = message.covariance
+        if covariance is not None and not (
+            np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() > -1e-9
+        ):
+            raise MessageError('its covariance is not finite, or negative in some direction')
+
+
+def filled_in(covariance: FloatArray | None) -> FloatArray:
+    """Return a covariance (6, 6) with variances assumed where the message gives none."""
+    given = np.zeros((6, 6)) if covariance is None else covariance
+    assumed: FloatArray = np.where(np.diagonal(given) == 0.0, ASSUMED_STD**2, 0.0)
+    return given + np.diag(assumed)

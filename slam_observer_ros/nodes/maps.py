@@ -1,0 +1,124 @@
+"""Maps loaded and saved by the observer node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+from pathlib import Path
+
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from slam_observer_ros.errors import MapError, ParameterError, SlamObserverError
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.recording.map_file import read_map, write_map
+
+
+class Maps:
+    """The map file of the start, ``~/load_map``, ``~/save_map`` and the autosave at the end.
+
+    Parameters
+    ----------
+    node : Node
+        Node that offers the services; its parameter ``map_path`` names their file.
+    settings : ObserverNodeSettings
+        Files and frame.
+    estimator : Estimator
+        What is saved, and what loads.
+    on_load : callable
+        Called after a map was loaded: the estimate is in another frame then.
+
+    Raises
+    ------
+    MapError
+        If the map of the start can't be read.
+    ParameterError
+        If the map is to be saved at the end, but not where.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: ObserverNodeSettings,
+        estimator: Estimator,
+        on_load: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._map_frame = settings.map_frame
+        self._autosave = settings.autosave_map
+        self._estimator = estimator
+        self._on_load = on_load
+        if settings.autosave_map and not settings.map_path:
+            raise ParameterError("'autosave_map' needs a file in 'map_path'")
+        if settings.map_file:
+            node.get_logger().info(self._load(Path(settings.map_file)))
+        elif estimator.settings.localization_mode != 'off':
+            node.get_logger().warning("no 'map_file': mapping until a map comes by ~/load_map")
+        node.create_service(Trigger, '~/save_map', self._answer_save)
+        node.create_service(Trigger, '~/load_map', self._answer_load)
+
+    def save_at_end(self) -> None:
+        """Save the map if that was asked for; an empty one does not replace a file."""
+        if not self._autosave:
+            return
+        try:
+            if len(self._estimator.landmark_ids):
+                self._node.get_logger().info(self._save(self._path()))
+        except SlamObserverError as error:
+            self._node.get_logger().error(f'the map is not saved: {error}')
+
+    def _answer_save(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        return self._answer(response, self._save)
+
+    def _answer_load(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        return self._answer(response, self._load)
+
+    def _answer(self, response: Trigger.Response, act: Callable[[Path], str]) -> Trigger.Response:
+        try:
+            response.message = act(self._path())
+            response.success = True
+            self._node.get_logger().info(response.message)
+        except SlamObserverError as error:
+            response.message = str(error)
+            response.success = False
+            self._node.get_logger().error(response.message)
+        return response
+
+    def _path(self) -> Path:
+        path: str = self._node.get_parameter('map_path').value
+        if not path:
+            raise ParameterError("no file is named: set the parameter 'map_path'")
+        return Path(path)
+
+    def _save(self, path: Path) -> str:
+        estimator = self._estimator
+        estimator.flush()
+        if not estimator.is_localised:
+            raise MapError('the place in the loaded map is not known yet: nothing is saved')
+        landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
+        path = path.expanduser().absolute()
+        write_map(path, landmark_map, estimator.settings)
+        return f"saved {len(landmark_map.ids)} landmarks in frame '{self._map_frame}' to {path}"
+
+    def _load(self, path: Path) -> str:
+        path = path.expanduser().absolute()
+        landmark_map = read_map(path)
+        if landmark_map.frame_id != self._map_frame:
+            raise MapError(
+                f"map {path} is in frame '{landmark_map.frame_id}', and 'map_frame' is "
+                f"'{self._map_frame}': make them the same"
+            )
+        self._estimator.flush()  # what has come before belongs to the old frame
+        self._estimator.load_map(landmark_map)
+        self._on_load()
+        place = 'the robot has found its place in it'
+        if not self._estimator.is_localised:
+            count = 'two' if self._estimator.settings.two_d_mode else 'three'
+            place = f'the pose is unknown until {count} of them are seen or it is given'
+        return f'loaded {len(landmark_map.ids)} landmarks from {path}; {place}'
