@@ -170,8 +170,8 @@ class Slam:
             raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
         if self.settings.localization_mode == 'fixed':
             raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
-        if self.settings.localization_mode == 'fixed':
-            raise ParameterError("in a map that is 'fixed' there is nothing to smooth")
+        if self.settings.landmark_velocity_error > 0.0:
+            raise ParameterError("smoothing takes landmarks to rest: 'landmark_velocity_error' 0")
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
         stamps_ns = np.array(self.gains.stamps_ns, dtype=np.int64)
