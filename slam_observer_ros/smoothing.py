@@ -185,11 +185,15 @@ class Smoother:
 
     def _add_prior(self, equations: _Equations, solution: Solution) -> None:
         prior, d, k = self._prior, len(self._axes.pose), self._axes.point
-        eta = se3.log(se3.inverse(prior.pose) @ solution.poses[0])[self._axes.pose]
+        eta, pose = se3.log(se3.inverse(prior.pose) @ solution.poses[0]), self._axes.pose
         shifts = (solution.points[: len(prior.points)] - prior.points)[:, :k]
-        error = np.concatenate([eta, solution.calibration - prior.calibration, shifts.ravel()])
-        information, known = self._prior_information, len(error) - d
+        off = solution.calibration - prior.calibration
+        error = np.concatenate([eta[pose], off, shifts.ravel()])
+        information, known = self._prior_information.copy(), len(error) - d
+        J = se3.left_jacobian_inverse(-eta)[np.ix_(pose, pose)]
+        information[:d] = J.T @ information[:d]
         pull = information @ error
+        information[:, :d] = information[:, :d] @ J
         equations.diagonal[0] += information[:d, :d]
         equations.border[0, :, :known] += information[:d, d:]
         equations.corner[:known, :known] += information[d:, d:]
@@ -207,7 +211,8 @@ class Smoother:
         J_right = se3.left_jacobian_inverse(-error)
         J_to = J_right[:, pose][:, :, pose]
         J_from = -(J_right @ se3.adjoint(se3.inverse(step)))[:, pose][:, :, pose]
-        F = -se3.left_jacobian_inverse(error)[:, pose][:, :, pose] @ frames.sensitivities
+        J_off = se3.left_jacobian_inverse(error) @ se3.left_jacobian(-eta)
+        F = -J_off[:, pose][:, :, pose] @ frames.sensitivities
         W = self._motion_information
         We = W @ error[:, pose, None]
         equations.diagonal[1:] += so3.transpose(J_to) @ W @ J_to

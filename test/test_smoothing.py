@@ -1,0 +1,309 @@
+"""Smoothing: least squares over prior, motions and observations, and looking back by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gain_worlds import (
+    configuration_error_m,
+    drive,
+    estimate,
+    OBSERVED_EVERY,
+    START_NS,
+    STEP_NS,
+)
+import numpy as np
+import pytest
+
+from slam_observer_ros.axes import PLANAR, SPATIAL
+from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.smoothing import Frames, Prior, Smoother, Solution
+
+LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_distance=1e9)
+FRAMES, LANDMARKS = 5, 4
+
+
+def random_covariances(rng, count, size, scale):
+    roots = rng.normal(size=(count, size, size))
+    return scale**2 * (roots @ roots.swapaxes(1, 2) / size + 0.1 * np.eye(size))
+
+
+class Problem:
+    """A random smoothing problem whose residuals are far from zero, and its dense solution.
+
+    Its unknowns are x = (η_0 … η_S, dc, dp) as in the module's text.
+    """
+
+    def __init__(self, axes, calibrations, seed, known_landmarks=2):
+        rng = np.random.default_rng(seed)
+        d, k, c = len(axes.pose), axes.point, calibrations
+        self.axes, self.d, self.k, self.c = axes, d, k, c
+        motions = se3.exp(self._tangents(0.3 * rng.normal(size=(FRAMES, d))))
+        prior_size = d + c + k * known_landmarks
+        points = axes.full_points(rng.normal(scale=3.0, size=(LANDMARKS, k)))
+        self.prior = Prior(
+            se3.exp(self._tangents(rng.normal(size=(1, d))))[0],
+            0.1 * rng.normal(size=c),
+            points[:known_landmarks]
+            + 0.05 * axes.full_points(rng.normal(size=known_landmarks * k)),
+            random_covariances(rng, 1, prior_size, 0.1)[0],
+        )
+        frames = np.repeat(np.arange(FRAMES), 3)
+        landmarks = np.concatenate([rng.permutation(LANDMARKS)[:3] for _ in range(FRAMES)])
+        poses = np.array([self.prior.pose])
+        for motion in motions:
+            poses = np.concatenate([poses, poses[-1:] @ motion])
+        seen = se3.transform(se3.inverse(poses[frames + 1]), points[landmarks][:, None])[
+            :, 0
+        ] + 0.1 * axes.full_points(rng.normal(size=len(frames) * k))
+        self.frames = Frames(
+            motions,
+            random_covariances(rng, FRAMES, d, 0.1),
+            0.2 * rng.normal(size=(FRAMES, d, c)),
+            0.1 * rng.normal(size=(FRAMES, c)),
+            frames,
+            landmarks,
+            seen,
+            np.zeros((len(frames), 3)),
+            np.linalg.inv(random_covariances(rng, len(frames), k, 0.1)),
+        )
+        eta = self._tangents(0.1 * rng.normal(size=(FRAMES + 1, d)))
+        self.start = Solution(poses @ se3.exp(eta), np.zeros(c), points)
+
+    def _tangents(self, coordinates):
+        full = np.zeros((len(coordinates), 6))
+        full[:, self.axes.pose] = coordinates
+        return full
+
+    def moved(self, solution, x):
+        poses = (FRAMES + 1) * self.d
+        eta = self._tangents(x[:poses].reshape(-1, self.d))
+        return Solution(
+            solution.poses @ se3.exp(eta),
+            solution.calibration + x[poses : poses + self.c],
+            solution.points + self.axes.full_points(x[poses + self.c :]),
+        )
+
+    def residuals(self, solution):
+        """All residuals, whitened: the cost is half the sum of their squares."""
+        pose, frames = self.axes.pose, self.frames
+        known = len(self.prior.points)
+        off = [
+            se3.log(se3.inverse(self.prior.pose) @ solution.poses[0])[pose],
+            solution.calibration - self.prior.calibration,
+            (solution.points[:known] - self.prior.points)[:, : self.k].ravel(),
+        ]
+        whitened = [whiten(np.linalg.inv(self.prior.covariance), np.concatenate(off))]
+        for s in range(FRAMES):
+            by_calibration = frames.sensitivities[s] @ (
+                solution.calibration - frames.calibrations[s]
+            )
+            motion = frames.motions[s] @ se3.exp(self._tangents(by_calibration[None])[0])
+            step = se3.inverse(solution.poses[s]) @ solution.poses[s + 1]
+            error = se3.log(se3.inverse(motion) @ step)[pose]
+            whitened.append(whiten(np.linalg.inv(frames.motion_covariances[s]), error))
+        for frame, landmark, point, information in zip(
+            frames.frames, frames.landmarks, frames.points, frames.information, strict=True
+        ):
+            back = se3.inverse(solution.poses[frame + 1])
+            error = se3.transform(back, solution.points[None, landmark])[0] - point
+            whitened.append(whiten(information, error[: self.k]))
+        return np.concatenate(whitened)
+
+    def jacobian(self, solution, h=1e-6):
+        size = (FRAMES + 1) * self.d + self.c + self.k * LANDMARKS
+        columns = [
+            self.residuals(self.moved(solution, h * x))
+            - self.residuals(self.moved(solution, -h * x))
+            for x in np.eye(size)
+        ]
+        return np.array(columns).T / (2 * h)
+
+
+def whiten(information, error):
+    return np.linalg.cholesky(information).T @ error
+
+
+problems = pytest.mark.parametrize(
+    'problem',
+    [Problem(axes, c, seed) for axes in (PLANAR, SPATIAL) for c in (0, 2) for seed in (0, 1)],
+)
+
+
+@problems
+def test_one_iteration_is_the_dense_gauss_newton_step(problem):
+    J, r = problem.jacobian(problem.start), problem.residuals(problem.start)
+    expected = problem.moved(problem.start, -np.linalg.solve(J.T @ J, J.T @ r))
+    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    solution = smoother.smooth(problem.start, 1, 0.0)
+    np.testing.assert_allclose(solution.poses, expected.poses, atol=1e-6)
+    np.testing.assert_allclose(solution.calibration, expected.calibration, atol=1e-6)
+    np.testing.assert_allclose(solution.points, expected.points, atol=1e-6)
+
+
+@problems
+def test_the_solution_is_where_the_gradient_of_the_cost_vanishes(problem):
+    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    solution = smoother.smooth(problem.start, 200, 1e-10)
+    gradient = problem.jacobian(solution).T @ problem.residuals(solution)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-5)
+
+
+@problems
+def test_marginal_is_that_of_the_dense_inverse(problem):
+    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    J = problem.jacobian(problem.start)
+    first = FRAMES * problem.d
+    np.testing.assert_allclose(
+        smoother.marginal(problem.start),
+        np.linalg.inv(J.T @ J)[first:, first:],
+        rtol=1e-4,
+        atol=1e-7,
+    )
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_smoothing_a_run_without_noise_returns_the_truth(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
+    world = drive(settings, 15.0, noise=0.0)
+    hindsight = estimate(world, settings).smooth()
+    assert len(hindsight.stamps_ns) == len(world.observations())
+    np.testing.assert_allclose(hindsight.poses, world.poses[::OBSERVED_EVERY], atol=1e-6)
+    np.testing.assert_allclose(
+        hindsight.world_points, world.world_points[hindsight.ids], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_hindsight_beats_the_online_estimate(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
+    online, smoothed = [], []
+    for seed in range(4):
+        world = drive(settings, 20.0, seed)
+        poses = {}
+        estimator = estimate(
+            world,
+            settings,
+            lambda update, poses=poses: poses.update({update.stamp_ns: update.pose}),
+        )
+        hindsight = estimator.smooth()
+        stamps_ns = START_NS + STEP_NS * np.arange(len(world.poses))
+        truth = Trajectory(stamps_ns, world.poses)
+        online_run = Trajectory(np.array(list(poses)), np.array(list(poses.values())))
+        smoothed_run = Trajectory(hindsight.stamps_ns, hindsight.poses)
+        online.append(trajectory_errors(online_run, truth).ate_rmse_m)
+        smoothed.append(trajectory_errors(smoothed_run, truth).ate_rmse_m)
+    assert np.mean(smoothed) < 0.8 * np.mean(online)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode):
+    exact = Settings(
+        two_d_mode=two_d_mode,
+        angular_velocity_noise=(3e-4,) * 3,
+        linear_velocity_noise=(2e-4,) * 3,
+        range_noise=1e-3,
+        bearing_noise=3e-4,
+        huber_threshold=0.0,
+        hindsight_interval=0,
+    )
+    world = drive(exact, 15.0)
+    plain = estimate(world, exact)
+    often = estimate(world, replace(exact, hindsight_interval=10, hindsight_turn=0.0))
+    sigma_m = np.sqrt(plain.pose_covariance.diagonal()[3:].max())
+    np.testing.assert_allclose(often.pose, plain.pose, atol=0.05 * sigma_m)
+    np.testing.assert_allclose(often.world_points, plain.world_points, atol=0.1 * sigma_m)
+    np.testing.assert_allclose(
+        often.pose_covariance,
+        plain.pose_covariance,
+        rtol=0.05,
+        atol=0.02 * np.abs(plain.pose_covariance).max(),
+    )
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_a_short_window_stays_close_to_an_unlimited_one(two_d_mode):
+    settings = Settings(
+        two_d_mode=two_d_mode, hindsight_interval=10, hindsight_turn=0.0, hindsight_window=0
+    )
+    world = drive(settings, 30.0)
+    unlimited = estimate(world, settings)
+    short = estimate(world, replace(settings, hindsight_window=20))
+    assert len(unlimited.smooth().stamps_ns) == len(world.observations())
+    assert len(short.smooth().stamps_ns) < 20
+    sigma_m = np.sqrt(unlimited.pose_covariance.diagonal()[3:])
+    shift_m = np.abs(short.pose[:3, 3] - unlimited.pose[:3, 3])
+    assert np.all(shift_m <= 0.5 * sigma_m)
+    assert configuration_error_m(short, world) < 1.2 * configuration_error_m(unlimited, world)
+
+
+def test_the_window_bounds_the_history_even_if_nothing_ever_turns():
+    settings = Settings(hindsight_window=20, hindsight_turn=1e9)
+    estimator = Estimator(settings)
+    longest = 0
+    for event in drive(settings, 15.0, noise=0.0).events:
+        estimator.add(event)
+        longest = max(longest, len(estimator.smooth().stamps_ns))
+    assert 10 < longest < 20
+
+
+@pytest.mark.parametrize('window', range(41, 48))
+def test_a_landmark_that_moves_as_the_window_closes_stays_where_it_went(window):
+    settings = Settings(reorder_window=0.0, hindsight_window=window)
+    world = drive(settings, 15.0, landmarks=4)
+
+    def move(index, event):
+        """The landmark moves 6 m at frame 40 and is out of view from frame 46 on."""
+        if index < 40:
+            return event
+        is_mover = event.ids == 2
+        away = world.true_pose(event.stamp_ns)[:3, :3].T @ np.array([6.0, 0.0, 0.0])
+        points = event.points + is_mover[:, None] * away
+        kept = ~is_mover | (index < 45)
+        return replace(event, ids=event.ids[kept], points=points[kept])
+
+    estimator = estimate(world.with_observations(move), settings)
+    assert estimator.counts['moved_landmark'] == 1
+    point = estimator.world_points[list(estimator.landmark_ids).index(2)]
+    expected = world.world_points[2] + [6.0, 0.0, 0.0]
+    np.testing.assert_allclose(point, expected, atol=1.0)
+
+
+def test_an_estimator_that_has_seen_nothing_has_nothing_to_smooth():
+    hindsight = Estimator(Settings()).smooth()
+    assert hindsight.poses.shape == (0, 4, 4)
+    assert hindsight.world_points.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'gains': 'constant'},
+        {'gains': 'scheduled'},
+        {'hindsight_interval': 0},
+        {'landmark_velocity_error': 0.1},
+    ],
+)
+def test_designs_that_keep_no_history_say_that_they_cannot_smooth(changes):
+    settings = Settings(**changes)
+    estimator = estimate(drive(settings, 2.0), settings)
+    with pytest.raises(ParameterError, match='smooth'):
+        estimator.smooth()
+
+
+def test_forgotten_landmarks_leave_the_history_too():
+    settings = Settings(hindsight_interval=10, hindsight_turn=0.0, hindsight_window=30)
+    world = drive(settings, 15.0)
+    estimator = Estimator(settings)
+    for index, event in enumerate(world.events):
+        estimator.add(event)
+        if index in (100, 200, 250):
+            assert estimator.forget(int(estimator.landmark_ids[1]))
+    estimator.flush()
+    assert configuration_error_m(estimator, world) < 0.5
+    np.testing.assert_array_equal(estimator.smooth().ids, estimator.landmark_ids)
