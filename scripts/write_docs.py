@@ -1,0 +1,244 @@
+#!/usr/bin/env python3
+"""Write the tables of the documentation: parameters from their typed tables, topics from the nodes.
+
+Between ``<!-- table: NAME -->`` and ``<!-- end -->`` a page holds what is generated here.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+import json
+import os
+from pathlib import Path
+import re
+import sys
+
+# Nothing outside may be heard here, nor hear these nodes. Read when rclpy starts.
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
+
+from slam_observer_ros.nodes.observer_node import ObserverNode
+from slam_observer_ros.nodes.settings import AUTO, ObserverNodeSettings, SimulatorNodeSettings
+from slam_observer_ros.nodes.simulator_node import SimulatorNode
+from slam_observer_ros.parameters import Dataclass, Parameter, table
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.simulation import Scenario
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+PAGES = ('README.md', 'docs/parameters.md', 'docs/topics.md')
+BLOCK = re.compile(r'(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)', re.DOTALL)
+
+NAMESPACE = '/robot'
+SUBSCRIBE_AT_ONCE = ('velocity_type:=Twist', 'landmarks_type:=PointCloud2', 'use_imu:=true')
+OF_EVERY_NODE = ('/rosout', '/parameter_events', '/clock')
+
+INPUTS = {
+    'twist': 'the velocity of the robot in its own frame',
+    'imu': 'the angular velocity, if `use_imu` is set; the linear one then comes from `twist`',
+    'landmarks': 'the landmarks seen at one instant in the sensor\'s frame, each with its id',
+    '/tf': 'where sensors are; `odom_frame` → `base_frame`; fiducials, if asked for',
+    '/tf_static': 'where sensors are',
+    'initialpose': 'where the robot is in the map, as RViz\'s *2D Pose Estimate* gives it',
+    '~/set_pose': 'the same, for programs',
+    '~/forget_landmark': 'the id of a landmark to forget',
+}
+
+TYPE_PARAMETERS = {'twist': 'velocity_type', 'landmarks': 'landmarks_type'}
+"""Inputs of several types, and the parameters that list these."""
+
+OUTPUTS = {
+    'odometry': 'pose in the map, velocity in the robot\'s frame',
+    'pose': 'pose in the map with its covariance',
+    'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
+    'map': 'landmarks with ids; with covariances where the gains know them',
+    'landmark_estimates': 'the same landmarks for tools that read PointCloud',
+    'markers': 'landmarks, ids and residuals for RViz and Foxglove',
+    'lyapunov': 'the Lyapunov value L (34) of the last observation',
+    '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
+    'else `map_frame` → `base_frame`',
+    '/diagnostics': 'rates, ages, what was used, what was dropped and why',
+}
+
+SERVICES = {
+    '~/reset': 'forget the motion and what was mapped, and start again',
+    '~/pause': 'hold the pose and drop what comes in',
+    '~/resume': 'end the pause',
+    '~/save_map': 'write the map to the file that the parameter `map_path` names',
+    '~/load_map': 'read it from there',
+}
+
+SIMULATED = {
+    'twist': 'the velocity; TwistStamped with `stamped:=true`',
+    'landmarks': 'the landmarks in view; PointCloud2 with `landmarks_type:=PointCloud2`',
+    'ground_truth/pose': 'the true pose in `truth_frame`',
+    'ground_truth/landmarks': 'the true landmarks in `truth_frame`',
+}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What a node has on a topic or service."""
+
+    type_name: str
+    is_latched: bool = False
+
+
+@dataclass(frozen=True)
+class Interface:
+    """Topics and services of a node by relative name."""
+
+    published: dict[str, Topic]
+    subscribed: dict[str, Topic]
+    services: dict[str, Topic]
+
+
+def main() -> int:
+    """Write the tables, or check them; return the exit code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument('--check', action='store_true', help='only tell which pages are stale')
+    choice.add_argument('--json', action='store_true', help='only print what the nodes publish')
+    options = parser.parse_args()
+    observer = interface_of(ObserverNode, *SUBSCRIBE_AT_ONCE)
+    simulator = interface_of(SimulatorNode)
+    if options.json:
+        published = {**simulator.published, **observer.published}
+        print(json.dumps({name: topic.type_name for name, topic in published.items()}))
+        return 0
+    stale = [page for page in PAGES if is_stale(page, tables(observer, simulator), options.check)]
+    for page in stale:
+        print(f'{page}: {"stale, run `make docs`" if options.check else "written"}')
+    return 1 if options.check and stale else 0
+
+
+def interface_of(make_node: Callable[[], Node], *parameters: str) -> Interface:
+    """Start a node, and return what it has on its topics and services."""
+    assignments = [argument for text in parameters for argument in ('-p', text)]
+    rclpy.init(args=['--ros-args', '-r', f'__ns:={NAMESPACE}', *assignments])
+    node = make_node()
+    try:
+        return Interface(
+            {
+                relative_name(publisher.topic_name, node): Topic(
+                    type_name(publisher.msg_type),
+                    publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                )
+                for publisher in node.publishers
+                if publisher.topic_name not in OF_EVERY_NODE
+            },
+            {
+                relative_name(subscription.topic_name, node): Topic(type_name(subscription.msg_type))
+                for subscription in node.subscriptions
+                if subscription.topic_name not in OF_EVERY_NODE
+            },
+            {
+                relative_name(service.srv_name, node): Topic(type_name(service.srv_type))
+                for service in node.services
+                if not type_name(service.srv_type).startswith(('rcl_', 'type_description'))
+            },
+        )
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def relative_name(name: str, node: Node) -> str:
+    """Return the name as the node's source has it."""
+    private = f'{NAMESPACE}/{node.get_name()}/'
+    if name.startswith(private):
+        return f'~/{name.removeprefix(private)}'
+    return name.removeprefix(f'{NAMESPACE}/')
+
+
+def type_name(message_class: type) -> str:
+    """Return ``package/Type``."""
+    return f'{message_class.__module__.split(".")[0]}/{message_class.__name__}'
+
+
+def tables(observer: Interface, simulator: Interface) -> dict[str, str]:
+    """Return the Markdown of every table by its name in the pages."""
+    return {
+        'inputs': input_table(observer.subscribed),
+        'outputs': topic_table('topic', observer.published, OUTPUTS),
+        'services': topic_table('service', observer.services, SERVICES),
+        'simulator-outputs': topic_table('topic', simulator.published, SIMULATED),
+        'estimator-parameters': parameter_table(Settings),
+        'observer-node-parameters': parameter_table(ObserverNodeSettings),
+        'scenario-parameters': parameter_table(Scenario),
+        'simulator-node-parameters': parameter_table(SimulatorNodeSettings),
+    }
+
+
+def input_table(subscribed: dict[str, Topic]) -> str:
+    """Return the table of what the observer takes in."""
+    expect_same_names(subscribed, INPUTS)
+    choices = {row.name: row.choices for row in table(ObserverNodeSettings)}
+    types = {name: topic.type_name for name, topic in subscribed.items()}
+    for name, parameter in TYPE_PARAMETERS.items():
+        types[name] = ', '.join(t for t in choices[parameter] if t not in (AUTO, 'tf'))
+    return markdown(
+        ('topic', 'type', 'what it tells'),
+        [(f'`{name}`', types[name], text) for name, text in INPUTS.items()],
+    )
+
+
+def topic_table(kind: str, topics: dict[str, Topic], texts: dict[str, str]) -> str:
+    """Return the table of topics or services, each with its text."""
+    expect_same_names(topics, texts)
+    rows = [
+        (f'`{name}`', topics[name].type_name + ', latched' * topics[name].is_latched, text)
+        for name, text in texts.items()
+    ]
+    return markdown((kind, 'type', 'what it is'), rows)
+
+
+def expect_same_names(found: Iterable[str], described: Iterable[str]) -> None:
+    """Stop unless exactly those that the node has are described."""
+    for name in sorted(set(found) ^ set(described)):
+        raise SystemExit(f'{name} {"has no text" if name in set(found) else "is gone"}: {__file__}')
+
+
+def parameter_table(settings_class: type[Dataclass]) -> str:
+    """Return the table of a settings dataclass."""
+    rows = [
+        (f'`{row.name}`', f'`{default_text(row)}`', row.unit, row.range_text(), description(row))
+        for row in table(settings_class)
+    ]
+    return markdown(('parameter', 'default', 'unit', 'range', 'what it is'), rows)
+
+
+def default_text(row: Parameter) -> str:
+    """Return the default as YAML has it."""
+    if isinstance(row.default, str):
+        return row.default or "''"
+    return json.dumps(row.default)
+
+
+def description(row: Parameter) -> str:
+    """Return the description, and whether the value may change while the node runs."""
+    return row.description + ('' if row.read_only else ' *(may be set while running)*')
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ['---'] * len(head), *([cell.replace('|', '\\|') for cell in r] for r in rows)]
+    return ''.join(f'| {" | ".join(line)} |\n' for line in lines)
+
+
+def is_stale(page: str, contents: dict[str, str], only_check: bool) -> bool:
+    """Write the tables into a page, or only check; return whether they were not as they are."""
+    path = CHECKOUT / page
+    old = path.read_text(encoding='utf-8')
+    new = BLOCK.sub(lambda m: m[1] + contents[m['name']] + m[3], old)
+    if new != old and not only_check:
+        path.write_text(new, encoding='utf-8')
+    return new != old
+
+
+if __name__ == '__main__':
+    sys.exit(main())
