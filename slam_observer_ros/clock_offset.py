@@ -38,6 +38,17 @@ class ClockOffset:
         """Whether the stamps are from another clock."""
         return self.offset_ns is not None and abs(self.offset_ns) > self._limit_ns
 
+    def trouble(self, source: str) -> str:
+        """Say how far off the stamps of ``source`` are; empty if they are right."""
+        if self.offset_ns is None or not self.is_off:
+            return ''
+        side = 'ahead of' if self.offset_ns > 0 else 'behind'
+        return (
+            f"stamps of {source} are {abs(self.offset_ns) * 1e-9:.3f} s {side} this machine's "
+            'clock: synchronise the clocks, or set use_sim_time (for a recording) or '
+            'correct_clock_offset'
+        )
+
     def add(self, stamp_ns: int, receive_ns: int) -> None:
         """Take the stamp and the time of reception of a message."""
         self._recent.append(stamp_ns - receive_ns)

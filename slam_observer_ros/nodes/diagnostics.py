@@ -48,13 +48,18 @@ class Diagnostics:
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
         self._last_dropped = 0
+        self._last_used = 0
 
     def publish(self) -> None:
         """Publish one status; call it about once a second."""
+        dropped, used = self._progress()
+        warnings = self._warnings(dropped)
+        level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
+        if dropped and not used and not self._intake.is_paused:
+            level = DiagnosticStatus.ERROR
         values = self._input_values() | self._estimator_values()
-        warnings = self._warnings()
         status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK,
+            level=level,
             name=f'{self._node.get_name()}: estimate',
             hardware_id=self._node.get_namespace(),
             message='; '.join(warnings) or 'running',
@@ -79,22 +84,32 @@ class Diagnostics:
         return values
 
     def _estimator_values(self) -> dict[str, str]:
-        estimator = self._estimator
+        estimator, update = self._estimator, self._estimator.last_update
         values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
-        values |= {
-            f'dropped: {reason}': str(count) for reason, count in sorted(estimator.dropped.items())
-        }
+        dropped = estimator.dropped + self._intake.dropped
+        values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
         values['landmarks known'] = str(len(estimator.landmark_ids))
+        values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
+        values['processing time, mean [ms]'] = f'{self._intake.take_mean_processing_ms():.3f}'
         values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
         return values
 
-    def _warnings(self) -> list[str]:
-        warnings = [self._input_warning(source) for source in self._inputs]
-        dropped = sum(self._estimator.dropped.values())
+    def _progress(self) -> tuple[int, int]:
+        """Return how many messages were dropped and how many used since the last time."""
+        dropped = self._estimator.dropped.total() + self._intake.dropped.total()
         dropped += sum(source.malformed for source in self._inputs)
-        if dropped > self._last_dropped:
-            warnings.append(f'{dropped - self._last_dropped} messages dropped')
-        self._last_dropped = dropped
+        used = sum(self._estimator.counts[kind] for kind in ('velocity', 'observation'))
+        since_last = dropped - self._last_dropped, used - self._last_used
+        self._last_dropped, self._last_used = dropped, used
+        return since_last
+
+    def _warnings(self, dropped: int) -> list[str]:
+        warnings = [self._input_warning(source) for source in self._inputs]
+        warnings += [clock.trouble(name) for name, clock in self._intake.clocks.items()]
+        if self._intake.is_paused:
+            warnings.append('paused')
+        elif dropped:
+            warnings.append(f'{dropped} messages dropped')
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
         if not self._estimator.is_localised:

@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+import importlib
 import time
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
 from rclpy.node import Node
+from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import PointCloud, PointCloud2
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from slam_observer_ros.errors import MessageError
-from slam_observer_ros.nodes.qos import SENSOR_QOS
-from slam_observer_ros.nodes.settings import AUTO
+from slam_observer_ros.errors import MessageError, ParameterError
 from slam_observer_ros.recording.cdr import Buffer
-
-MESSAGE_CLASSES = {
-    'geometry_msgs/msg/TwistStamped': TwistStamped,
-    'geometry_msgs/msg/Twist': Twist,
-    'nav_msgs/msg/Odometry': Odometry,
-    'sensor_msgs/msg/PointCloud2': PointCloud2,
-    'sensor_msgs/msg/PointCloud': PointCloud,
-}
-"""Types that can be received, the preferred one first where a topic carries several."""
 
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports about one topic."""
 
 DISCOVERY_S = 3.0
-"""How long a topic may be without publisher at the start before that is reported."""
+"""How long a topic may be without publisher or message before that is reported."""
 
 MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
@@ -44,13 +33,14 @@ class Input(Generic[MessageT]):
     node : Node
         Node that subscribes.
     topic : str
-        Relative topic name.
-    type_choice : str
-        Short name of the message type, or ``'auto'``.
+        Topic name before remapping.
     decoders : mapping of str to callable
-        From full type names to decoders.
+        From full type names to decoders, the preferred type first. If there is only one, it is
+        subscribed to at once; of several, the one that is found on the topic.
     on_message : callable
-        Called with each decoded message.
+        Called with each decoded message and the ROS time of its reception in nanoseconds.
+    qos : QoSProfile
+        Quality of service that is asked for.
 
     Attributes
     ----------
@@ -61,9 +51,14 @@ class Input(Generic[MessageT]):
     malformed : int
         Messages that could not be decoded.
     trouble : str
-        Why no message can come, empty if a publisher is there.
+        Why no message comes; empty while they do.
     last_received_s : float or None
         Steady time of the last message, seconds.
+
+    Raises
+    ------
+    ParameterError
+        If the package that defines the only type is not installed.
 
     """
 
@@ -71,17 +66,14 @@ class Input(Generic[MessageT]):
         self,
         node: Node,
         topic: str,
-        type_choice: str,
         decoders: Mapping[str, Decoder[MessageT]],
-        on_message: Callable[[MessageT], None],
+        on_message: Callable[[MessageT, int], None],
+        qos: QoSProfile,
     ) -> None:
         self._node = node
-        self._decoders = {
-            name: decoders[name]
-            for name in MESSAGE_CLASSES
-            if name in decoders and type_choice in (AUTO, _short(name))
-        }
+        self._decoders = decoders
         self._on_message = on_message
+        self._qos = qos
         self._subscription: Subscription | None = None
         self._type_name = ''
         self.topic = node.resolve_topic_name(topic)
@@ -90,8 +82,8 @@ class Input(Generic[MessageT]):
         self.trouble = ''
         self.last_received_s: float | None = None
         self._quiet_until_s = time.monotonic() + DISCOVERY_S
-        if type_choice != AUTO:
-            self._subscribe(next(iter(self._decoders)))
+        if len(decoders) == 1:
+            self._subscribe(next(iter(decoders)))
 
     @property
     def age_s(self) -> float | None:
@@ -101,38 +93,40 @@ class Input(Generic[MessageT]):
         return time.monotonic() - self.last_received_s
 
     def look(self) -> None:
-        """Look at what the topic carries; subscribe to it, or report why that can't be done."""
-        found = self._found_types()
+        """Look at what the topic carries; subscribe to it, or report why nothing comes."""
+        publishers = self._node.get_publishers_info_by_topic(self.topic)
+        found = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in found]
-        self.trouble = '' if usable else self._describe(found)
+        if usable and self._type_name not in usable:
+            self._subscribe(usable[0])
+        self.trouble = self._trouble(publishers, usable)
         if self.trouble:
             self._warn(self.trouble)
-        elif self._type_name not in usable:
-            self._subscribe(usable[0])
 
-    def _found_types(self) -> set[str]:
-        return {info.topic_type for info in self._node.get_publishers_info_by_topic(self.topic)}
-
-    def _subscribe(self, type_name: str) -> None:
+    def close(self) -> None:
+        """Stop receiving."""
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
+
+    def _subscribe(self, type_name: str) -> None:
+        self.close()
         self._type_name = type_name
         self._subscription = self._node.create_subscription(
-            MESSAGE_CLASSES[type_name], self.topic, self._receive, SENSOR_QOS, raw=True
+            message_class(type_name), self.topic, self._receive, self._qos, raw=True
         )
         self._node.get_logger().info(f"receiving {type_name} on '{self.topic}'")
 
     def _receive(self, raw: bytes) -> None:
-        receive_stamp_ns = self._node.get_clock().now().nanoseconds
+        receive_ns = self._node.get_clock().now().nanoseconds
         self.received += 1
         self.last_received_s = time.monotonic()
         try:
-            message = self._decoders[self._type_name](raw, receive_stamp_ns)
+            message = self._decoders[self._type_name](raw, receive_ns)
         except MessageError as error:
             self.malformed += 1
             self._warn(f"malformed message on '{self.topic}' dropped: {error}")
             return
-        self._on_message(message)
+        self._on_message(message, receive_ns)
 
     def _warn(self, text: str) -> None:
         # rclpy throttles by line of code, so one topic's report would silence the other's.
@@ -141,12 +135,39 @@ class Input(Generic[MessageT]):
             self._quiet_until_s = now_s + REPORT_PERIOD_S
             self._node.get_logger().warning(text)
 
-    def _describe(self, found: set[str]) -> str:
+    def _trouble(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
         wanted = ' or '.join(self._decoders)
-        if found:
-            return f"'{self.topic}' carries {', '.join(sorted(found))}; {wanted} is needed"
-        return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
+        if not publishers:
+            return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
+        if not usable:
+            found = ', '.join(sorted({publisher.topic_type for publisher in publishers}))
+            return f"'{self.topic}' carries {found}; {wanted} is needed"
+        for publisher in publishers:
+            compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
+            if compatibility == QoSCompatibility.ERROR:
+                return (
+                    f"'{publisher.node_name}' can't be heard on '{self.topic}', its quality of "
+                    f'service does not fit: {reason.strip()}'
+                )
+        if self.received == 0:
+            return f"no message yet on '{self.topic}' ({self._type_name})"
+        return ''
 
 
-def _short(type_name: str) -> str:
-    return type_name.rsplit('/', 1)[-1]
+def message_class(type_name: str) -> Any:
+    """Import the class of a message type such as ``vision_msgs/msg/Detection3DArray``.
+
+    Raises
+    ------
+    ParameterError
+        If its package is not installed.
+
+    """
+    package, _, name = type_name.split('/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except ImportError as error:
+        raise ParameterError(
+            f'{type_name} needs the package {package}: '
+            f'apt install ros-jazzy-{package.replace("_", "-")}'
+        ) from error

@@ -145,6 +145,7 @@ class Outputs:
                 twist=twist,
             )
         )
+
     def _publish_estimates(self, stamp_ns: int) -> None:
         ids = self._estimator.landmark_ids
         if np.any(ids >= FLOAT32_ID_LIMIT):

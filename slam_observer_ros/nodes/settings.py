@@ -9,6 +9,8 @@ from slam_observer_ros.parameters import parameter
 AUTO = 'auto'
 """Message type parameter: take the type that is found on the topic."""
 
+Pose6 = tuple[float, float, float, float, float, float]
+
 
 @dataclass(frozen=True)
 class ObserverNodeSettings:
@@ -17,16 +19,80 @@ class ObserverNodeSettings:
     velocity_type: str = parameter(
         AUTO,
         'Message type on twist; auto takes the type found on the topic',
-        choices=(AUTO, 'Twist', 'TwistStamped', 'Odometry'),
+        choices=(AUTO, 'Twist', 'TwistStamped', 'TwistWithCovarianceStamped', 'Odometry'),
+    )
+    velocity_source: str = parameter(
+        'twist',
+        'What of Odometry is used: its twist, or the differences of its poses',
+        choices=('twist', 'pose_differences'),
+    )
+    use_imu: bool = parameter(
+        False, 'Whether the angular velocity comes from the Imu on imu, the linear one from twist'
     )
     landmarks_type: str = parameter(
         AUTO,
-        'Message type on landmarks; auto takes the type found on the topic',
-        choices=(AUTO, 'PointCloud', 'PointCloud2'),
+        'Message type on landmarks; auto takes the type found on the topic; tf takes fiducials '
+        'that a detector publishes on /tf',
+        choices=(
+            AUTO,
+            'PointCloud',
+            'PointCloud2',
+            'PoseArray',
+            'Detection3DArray',
+            'AprilTagDetectionArray',
+            'tf',
+        ),
+    )
+    tag_frame_prefix: str = parameter(
+        'tag_', "Name of a fiducial's frame before its id; family:id, as of apriltag_ros, fits too"
+    )
+    twist_qos: str = parameter(
+        'best_effort',
+        'Reliability asked of twist and imu; best_effort hears any publisher',
+        choices=('best_effort', 'reliable'),
+    )
+    landmarks_qos: str = parameter(
+        'best_effort',
+        'Reliability asked of landmarks; best_effort hears any publisher',
+        choices=('best_effort', 'reliable'),
+    )
+    queue_depth: int = parameter(
+        100, 'Messages of each input kept while the node is busy', minimum=1, maximum=10_000
     )
     map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks')
-    base_frame: str = parameter(
-        'base_link', 'Frame of the robot, in which velocity and landmarks are measured'
+    odom_frame: str = parameter(
+        'odom',
+        'Odometry frame: if /tf has odom_frame to base_frame, map_frame to odom_frame is '
+        'published; empty for never',
+    )
+    base_frame: str = parameter('base_link', 'Frame of the robot, whose pose is estimated')
+    sensor_frame: str = parameter(
+        '', "Frame of the landmarks; empty takes each message's own, base_frame needs no transform"
+    )
+    sensor_pose: Pose6 = parameter(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        "Pose of the landmarks' sensor in base_frame, x y z and roll pitch yaw, in place of /tf; "
+        'all zeros: from /tf',
+        unit='m, rad',
+    )
+    transform_timeout: float = parameter(
+        0.5, 'How long a message waits for a transform', unit='s', minimum=0.0, maximum=60.0
+    )
+    transform_tolerance: float = parameter(
+        0.1,
+        'How far map_frame to odom_frame is post-dated, so that it holds until the next one',
+        unit='s',
+        minimum=0.0,
+        maximum=10.0,
+    )
+    max_clock_offset: float = parameter(
+        1.0,
+        'Stamps that are further than this from the time of reception come from another clock',
+        unit='s',
+        minimum=1e-3,
+    )
+    correct_clock_offset: bool = parameter(
+        False, "Whether stamps from another clock are moved to this machine's time"
     )
     publish_rate: float = parameter(
         50.0,
@@ -35,7 +101,12 @@ class ObserverNodeSettings:
         minimum=0.1,
         maximum=1000.0,
     )
-    publish_tf: bool = parameter(True, 'Whether map_frame to base_frame is published on /tf')
+    publish_tf: bool = parameter(
+        True, 'Whether map_frame to odom_frame or base_frame is published on /tf'
+    )
+    invert_tf: bool = parameter(
+        False, 'Whether the transform on /tf is published as its inverse, with map_frame below'
+    )
     path_length: int = parameter(
         2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
     )

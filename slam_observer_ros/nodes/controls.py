@@ -1,0 +1,68 @@
+"""Services and topics by which a person or another node steers the observer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rclpy.node import Node
+from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.nodes.intake import Intake
+from slam_observer_ros.nodes.qos import RELIABLE_QOS
+
+
+class Controls:
+    """``~/reset``, ``~/pause``, ``~/resume`` and ``~/forget_landmark``.
+
+    Parameters
+    ----------
+    node : Node
+        Node that offers them.
+    estimator : Estimator
+        What is steered.
+    intake : Intake
+        What is paused.
+    on_reset : callable
+        Called after the estimate has begun anew.
+
+    """
+
+    def __init__(
+        self, node: Node, estimator: Estimator, intake: Intake, on_reset: Callable[[], None]
+    ) -> None:
+        self._node = node
+        self._estimator = estimator
+        self._intake = intake
+        self._on_reset = on_reset
+        node.create_service(Trigger, '~/reset', self._reset)
+        node.create_service(Trigger, '~/pause', self._pause)
+        node.create_service(Trigger, '~/resume', self._resume)
+        node.create_subscription(Int64, '~/forget_landmark', self._forget, RELIABLE_QOS)
+
+    def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._estimator.reset()
+        self._on_reset()
+        return self._answer(response, 'pose and what was mapped are forgotten')
+
+    def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._estimator.flush()  # what has come before the pause counts
+        self._intake.is_paused = True
+        return self._answer(response, 'paused: the pose is held, and all that comes in is dropped')
+
+    def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._intake.is_paused = False
+        return self._answer(response, 'resumed')
+
+    def _answer(self, response: Trigger.Response, text: str) -> Trigger.Response:
+        self._node.get_logger().info(text)
+        response.success = True
+        response.message = text
+        return response
+
+    def _forget(self, message: Int64) -> None:
+        was_known = self._estimator.forget(message.data)
+        self._node.get_logger().info(
+            f'landmark {message.data} is {"forgotten" if was_known else "not known"}'
+        )

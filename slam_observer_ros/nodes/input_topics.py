@@ -1,0 +1,131 @@
+"""The observer's input topics, as the parameters ask for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, TypeVar
+
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from slam_observer_ros.nodes.inputs import Decoder, Input
+from slam_observer_ros.nodes.intake import Intake
+from slam_observer_ros.nodes.settings import AUTO, ObserverNodeSettings
+from slam_observer_ros.recording.cdr import Buffer
+from slam_observer_ros.recording.detections import (
+    decode_apriltags,
+    decode_detections,
+    decode_pose_array,
+    observed_tags,
+)
+from slam_observer_ros.recording.messages import (
+    decode_imu,
+    decode_odometry_pose,
+    decode_odometry_twist,
+    decode_transforms,
+    decode_twist,
+    decode_twist_stamped,
+    decode_twist_with_covariance_stamped,
+    ImuMessage,
+    PoseMessage,
+    VelocityMessage,
+)
+from slam_observer_ros.recording.point_clouds import (
+    decode_point_cloud,
+    decode_point_cloud2,
+    ObservationMessage,
+)
+
+ODOMETRY = 'nav_msgs/msg/Odometry'
+APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+IMU = 'sensor_msgs/msg/Imu'
+
+VELOCITY_DECODERS: dict[str, Decoder[VelocityMessage]] = {
+    'geometry_msgs/msg/TwistStamped': decode_twist_stamped,
+    'geometry_msgs/msg/TwistWithCovarianceStamped': decode_twist_with_covariance_stamped,
+    'geometry_msgs/msg/Twist': decode_twist,
+    ODOMETRY: decode_odometry_twist,
+}
+"""Types that give a velocity, the preferred one first where a topic carries several."""
+
+CLOUD_DECODERS: dict[str, Decoder[ObservationMessage]] = {
+    'sensor_msgs/msg/PointCloud2': decode_point_cloud2,
+    'sensor_msgs/msg/PointCloud': decode_point_cloud,
+    'geometry_msgs/msg/PoseArray': decode_pose_array,
+}
+"""Types that give landmarks, likewise."""
+
+DETECTION_DECODERS: dict[str, Decoder[ObservationMessage]] = {
+    'vision_msgs/msg/Detection3DArray': decode_detections
+}
+"""Types of packages that are imported only if they are asked for."""
+
+ValueT = TypeVar('ValueT')
+
+
+def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> list[Input[Any]]:
+    """Subscribe to what the parameters name.
+
+    Raises
+    ------
+    ParameterError
+        If the package of a message type is not installed.
+
+    """
+    inputs = [_velocity_input(node, settings, intake), _landmark_input(node, settings, intake)]
+    if settings.use_imu:
+        qos = _qos(settings.twist_qos, settings.queue_depth)
+        inputs.append(Input(node, 'imu', {IMU: _decode_imu}, intake.add_imu, qos))
+    return inputs
+
+
+def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+    qos = _qos(settings.twist_qos, settings.queue_depth)
+    if settings.velocity_source == 'pose_differences':
+        return Input(node, 'twist', {ODOMETRY: _decode_odometry_pose}, intake.add_pose, qos)
+    decoders = _chosen(VELOCITY_DECODERS, settings.velocity_type)
+    return Input(node, 'twist', decoders, intake.add_velocity, qos)
+
+
+def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+    qos = _qos(settings.landmarks_qos, settings.queue_depth)
+    if settings.landmarks_type == 'tf':
+        decode = partial(_decode_tags, settings.tag_frame_prefix)
+        return Input(node, '/tf', {TRANSFORMS: decode}, intake.add_observations, qos)
+    if settings.landmarks_type == 'AprilTagDetectionArray':
+        return Input(node, 'landmarks', {APRILTAGS: decode_apriltags}, intake.add_tags, qos)
+    if settings.landmarks_type == AUTO:
+        return Input(node, 'landmarks', CLOUD_DECODERS, intake.add_observation, qos)
+    decoders = _chosen(CLOUD_DECODERS | DETECTION_DECODERS, settings.landmarks_type)
+    return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+
+
+def _chosen(decoders: Mapping[str, ValueT], type_choice: str) -> dict[str, ValueT]:
+    """Return the decoders of a short type name, or all of them."""
+    return {
+        name: decoder
+        for name, decoder in decoders.items()
+        if type_choice in (AUTO, name.rsplit('/', 1)[-1])
+    }
+
+
+def _qos(reliability: str, depth: int) -> QoSProfile:
+    return QoSProfile(
+        reliability=ReliabilityPolicy[reliability.upper()],
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+    )
+
+
+def _decode_imu(raw: Buffer, _receive_ns: int) -> ImuMessage:
+    return decode_imu(raw)
+
+
+def _decode_odometry_pose(raw: Buffer, _receive_ns: int) -> PoseMessage:
+    return decode_odometry_pose(raw)
+
+
+def _decode_tags(prefix: str, raw: Buffer, _receive_ns: int) -> list[ObservationMessage]:
+    return observed_tags(decode_transforms(raw), prefix)

@@ -1,0 +1,119 @@
+"""The parts of the observer node, put together on any node, plain or managed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.nodes.controls import Controls
+from slam_observer_ros.nodes.diagnostics import Diagnostics
+from slam_observer_ros.nodes.frames import BaseFrame, open_transforms
+from slam_observer_ros.nodes.initial_pose import InitialPose
+from slam_observer_ros.nodes.input_topics import open_inputs
+from slam_observer_ros.nodes.intake import Intake
+from slam_observer_ros.nodes.maps import Maps
+from slam_observer_ros.nodes.outputs import Outputs
+from slam_observer_ros.nodes.parameters import read_settings
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.settings import Settings
+
+OVERVIEW_PERIOD_S = 0.5
+DIAGNOSTICS_PERIOD_S = 1.0
+LOOK_PERIOD_S = 0.25
+RETRY_PERIOD_S = 0.02
+
+
+class ObserverCore:
+    """Feeds what a node receives to an :class:`Estimator` and publishes the estimate.
+
+    Parameters
+    ----------
+    node : Node
+        Node that communicates; the parameters are declared.
+
+    Raises
+    ------
+    SlamObserverError
+        If a parameter, or a file that it names, can't be used.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._before = _entities(node)
+        settings = read_settings(node, ObserverNodeSettings)
+        estimator_settings = read_settings(node, Settings)
+        self._estimator = Estimator(estimator_settings)
+        self._transforms = open_transforms(node)
+        self._intake = Intake(
+            node, settings, self._estimator, BaseFrame(settings, self._transforms)
+        )
+        self._outputs = Outputs(node, settings, self._estimator, self._transforms)
+        self._inputs = open_inputs(node, settings, self._intake)
+        self._diagnostics = Diagnostics(node, self._estimator, self._intake, self._inputs)
+        self._maps = Maps(node, settings, self._estimator, self._outputs.begin_anew)
+        InitialPose(node, settings.map_frame, self._estimator, self._outputs.begin_anew)
+        Controls(node, self._estimator, self._intake, self._outputs.begin_anew)
+        node.add_post_set_parameters_callback(self._apply_parameters)
+        self._create_timers(settings.publish_rate)
+        # The clock forgets a handle that nobody holds.
+        self._jump_handle = node.get_clock().create_jump_callback(
+            JumpThreshold(
+                min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+            ),
+            post_callback=self._restart_time,
+        )
+        node.get_logger().info(
+            f"estimating '{settings.base_frame}' in '{settings.map_frame}' with "
+            f'{estimator_settings.gains} gains'
+        )
+
+    def close(self) -> None:
+        """Save the map if that was asked for, and take all away from the node again."""
+        self._maps.save_at_end()
+        self._jump_handle.unregister()
+        self._node.remove_post_set_parameters_callback(self._apply_parameters)
+        for kind, entities in _entities(self._node).items():
+            for entity in entities - self._before[kind]:
+                getattr(self._node, f'destroy_{kind}')(entity)
+
+    def _create_timers(self, publish_rate_hz: float) -> None:
+        # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        for period_s, callback in (
+            (1.0 / publish_rate_hz, self._publish_state),
+            (OVERVIEW_PERIOD_S, self._outputs.publish_overview),
+            (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
+            (RETRY_PERIOD_S, self._intake.retry),
+            *((LOOK_PERIOD_S, source.look) for source in self._inputs),
+        ):
+            self._node.create_timer(period_s, callback, clock=clock)
+
+    def _publish_state(self) -> None:
+        self._outputs.publish_state()
+        if self._intake.is_paused:
+            self._outputs.repeat_transform()
+
+    def _restart_time(self, _jump: object) -> None:
+        self._intake.forget()
+        self._transforms.clear()
+        self._estimator.restart_time()
+        self._outputs.begin_anew()
+
+    def _apply_parameters(self, _changes: list[Parameter]) -> None:
+        self._estimator.change_settings(read_settings(self._node, Settings))
+
+
+def _entities(node: Node) -> dict[str, set[Any]]:
+    """Return what a node communicates with, by kind."""
+    return {
+        'timer': set(node.timers),
+        'subscription': set(node.subscriptions),
+        'service': set(node.services),
+        'publisher': set(node.publishers),
+    }

@@ -1,0 +1,167 @@
+"""Landmark observations from messages of detectors: poses, boxes and fiducials.
+
+As in :mod:`slam_observer_ros.recording.messages`, messages are read from their bytes, so that
+none of the packages that define them is needed here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+import re
+
+import numpy as np
+
+from slam_observer_ros.errors import MessageError
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.recording.cdr import Buffer, CdrReader
+from slam_observer_ros.recording.messages import PoseMessage
+from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.types import FloatArray
+
+_POSE = 7
+_COVARIANCE = 36
+_SIZE = 3
+_CORNERS = 10
+_HOMOGRAPHY = 9
+_TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d{1,18})')
+
+
+@dataclass(frozen=True, slots=True)
+class TagDetections:
+    """Fiducials that a detector has seen; where they are is on /tf.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    frame_id : str
+        Frame of the camera.
+    ids : tuple of int
+    families : tuple of str
+        Family of each fiducial, for example ``tag36h11``.
+
+    """
+
+    stamp_ns: int
+    frame_id: str
+    ids: tuple[int, ...]
+    families: tuple[str, ...]
+
+
+def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
+    """Decode the positions of a geometry_msgs/PoseArray, whose landmarks have no ids."""
+    reader = CdrReader(raw)
+    stamp_ns, frame_id = reader.header()
+    poses = reader.float64(_POSE * reader.uint32()).reshape(-1, _POSE)
+    reader.finish()
+    ids = np.full(len(poses), UNKNOWN_ID, dtype=np.int64)
+    return ObservationMessage(frame_id, ObservationEvent(stamp_ns, ids, poses[:, :3]))
+
+
+def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
+    """Decode a vision_msgs/Detection3DArray.
+
+    The id of a landmark is the number that ends its detection's ``id``, or else its first
+    result's ``class_id``: both are strings. Its position, with covariance if it is known of all,
+    is the first result's, or else the centre of the box.
+    """
+    reader = CdrReader(raw)
+    stamp_ns, frame_id = reader.header()
+    detections = [_read_detection(reader) for _ in range(reader.uint32())]
+    reader.finish()
+    ids = np.array([landmark_id for landmark_id, _, _ in detections], dtype=np.int64)
+    points = np.array([point for _, point, _ in detections]).reshape(-1, 3)
+    known = [covariance for _, _, covariance in detections if covariance.any()]
+    covariances = np.array(known) if known and len(known) == len(detections) else None
+    return ObservationMessage(frame_id, ObservationEvent(stamp_ns, ids, points, covariances))
+
+
+def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:
+    """Decode an apriltag_msgs/AprilTagDetectionArray."""
+    reader = CdrReader(raw)
+    stamp_ns, frame_id = reader.header()
+    tags = [_read_apriltag(reader) for _ in range(reader.uint32())]
+    reader.finish()
+    return TagDetections(
+        stamp_ns, frame_id, tuple(number for number, _ in tags), tuple(name for _, name in tags)
+    )
+
+
+def observed_tags(
+    transforms: Iterable[PoseMessage], tag_frame_prefix: str
+) -> list[ObservationMessage]:
+    """Return what of /tf are sightings of fiducials: transforms from a camera to a tag.
+
+    Parameters
+    ----------
+    transforms : iterable of PoseMessage
+        Of one message.
+    tag_frame_prefix : str
+        A tag's frame is this and its id, or, as apriltag_ros has it, ``family:id``.
+
+    Returns
+    -------
+    list of ObservationMessage
+        One for each camera and stamp.
+
+    """
+    pattern = re.compile(rf'(?:{re.escape(tag_frame_prefix)}|\w+:)(\d{{1,18}})')
+    seen = [
+        (message, int(match[1]))
+        for message in transforms
+        if (match := pattern.fullmatch(message.child_frame_id))
+    ]
+    seen.sort(key=_camera_and_stamp)
+    return [
+        _observation(frame_id, stamp_ns, list(group))
+        for (frame_id, stamp_ns), group in groupby(seen, key=_camera_and_stamp)
+    ]
+
+
+def _camera_and_stamp(sighting: tuple[PoseMessage, int]) -> tuple[str, int]:
+    return sighting[0].frame_id, sighting[0].stamp_ns
+
+
+def _observation(
+    frame_id: str, stamp_ns: int, sightings: Sequence[tuple[PoseMessage, int]]
+) -> ObservationMessage:
+    ids = np.array([landmark_id for _, landmark_id in sightings], dtype=np.int64)
+    points = np.array([message.position for message, _ in sightings])
+    return ObservationMessage(frame_id, ObservationEvent(stamp_ns, ids, points))
+
+
+def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
+    """Read a vision_msgs/Detection3D: id, position (3,) and covariance (3, 3)."""
+    reader.header()
+    results = [_read_result(reader) for _ in range(reader.uint32())]
+    centre = reader.float64(_POSE + _SIZE)[:3]
+    names = [reader.string(), *(name for name, _, _ in results)]
+    matches = (_TRAILING_NUMBER.fullmatch(name) for name in names)
+    landmark_id = next((int(match[1]) for match in matches if match), UNKNOWN_ID)
+    if not results:
+        return landmark_id, centre, np.zeros((3, 3))
+    _, point, covariance = results[0]
+    return landmark_id, point, covariance
+
+
+def _read_result(reader: CdrReader) -> tuple[str, FloatArray, FloatArray]:
+    """Read a vision_msgs/ObjectHypothesisWithPose: class, position (3,), covariance (3, 3)."""
+    name = reader.string()
+    values = reader.float64(1 + _POSE + _COVARIANCE)  # the score comes first
+    covariance = values[1 + _POSE :].reshape(6, 6)[:3, :3]
+    if covariance[0, 0] < 0.0:  # unknown
+        covariance = np.zeros((3, 3))
+    return name, values[1:4], covariance
+
+
+def _read_apriltag(reader: CdrReader) -> tuple[int, str]:
+    """Read an apriltag_msgs/AprilTagDetection: id and family."""
+    family = reader.string()
+    landmark_id = reader.uint32()
+    reader.uint32()  # hamming distance
+    reader.float32(2)  # goodness, decision margin
+    reader.float64(_CORNERS + _HOMOGRAPHY)
+    if landmark_id >= 2**31:
+        raise MessageError('negative tag id')
+    return landmark_id, family
