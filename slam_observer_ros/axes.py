@@ -39,6 +39,12 @@ class Axes:
         full[self.pose] = error
         return full
 
+    def full_pose_covariance(self, covariance: FloatArray) -> FloatArray:
+        """Return that of ε (6, 6) with zeros on the axes that are not estimated."""
+        full = np.zeros((6, 6))
+        full[np.ix_(self.pose, self.pose)] = covariance
+        return full
+
     def full_points(self, errors: FloatArray) -> FloatArray:
         """Return (m, 3) points from (m · point,) coordinates, with zeros elsewhere."""
         full = np.zeros((errors.size // self.point, 3))

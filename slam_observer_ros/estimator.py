@@ -283,11 +283,12 @@ class Estimator:
 
     @property
     def pose_covariance(self) -> FloatArray | None:
-        """(6, 6) covariance of the pose after the last observation: rotation vector, position.
+        """(6, 6) covariance of the pose at ``stamp_ns``: rotation vector, then position.
 
         Both along the world's axes, rad² and m². None where the gains know none.
         """
-        return self._slam.pose_covariance
+        start_ns, end_ns = self._state_ns or 0, self._stamp_ns or 0
+        return self._slam.pose_covariance(self._velocities.held(start_ns, end_ns))
 
     @property
     def body_velocity(self) -> FloatArray:

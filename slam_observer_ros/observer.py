@@ -148,8 +148,8 @@ class Observer:
         e = se3.transform(self.A, points) - self.a[indices]  # (29)
         return e, e - self.y_ref[indices]
 
-    def propagate(self, body_velocities: FloatArray, dt_s: FloatArray) -> FloatArray:
-        """Advance along k held velocities, exactly: Â ← Â exp(V_1 dt_1) … exp(V_k dt_k) (27).
+    def path(self, body_velocities: FloatArray, dt_s: FloatArray) -> FloatArray:
+        """Return Â along k held velocities, exactly: Â exp(V_1 dt_1) … exp(V_k dt_k) (27).
 
         Parameters
         ----------
@@ -165,10 +165,12 @@ class Observer:
 
         """
         motions = se3.exp(body_velocities * dt_s[:, None])
-        path = np.array(list(accumulate(motions, np.matmul, initial=self.A)))
-        path[-1, :3, :3] = so3.normalise(path[-1, :3, :3])
+        return np.array(list(accumulate(motions, np.matmul, initial=self.A)))
+
+    def propagate(self, path: FloatArray) -> None:
+        """Advance Â to the end of a ``path`` (k + 1, 4, 4)."""
         self.A = path[-1]
-        return path
+        self.A[:3, :3] = so3.normalise(self.A[:3, :3])
 
     def set_landmark_velocities(self, indices: IntArray, velocities: FloatArray) -> None:
         """Let landmarks move from now on.

@@ -73,16 +73,17 @@ class Slam:
         world: FloatArray = R @ covariances @ R.T
         return world
 
-    @property
-    def pose_covariance(self) -> FloatArray | None:
-        """(6, 6) covariance of rotation vector and position along the world's axes, rad² and m².
+    def pose_covariance(self, held: HeldVelocities) -> FloatArray | None:
+        """Return the covariance (6, 6) of the pose after ``held``, along the world's axes.
 
-        The gains know that of ε in Â = exp(ε) A; None where they know none.
+        Of its rotation vector and its position, rad² and m²; the gains know that of ε in
+        Â = exp(ε) A. None where they know none.
         """
-        covariance = self.gains.pose_covariance
+        motion = self._motion(held)
+        covariance = self.gains.pose_covariance_after(motion)
         if covariance is None:
             return None
-        turn = self._turn_to_world()
+        turn = self._turn_to_world(motion.path[-1])
         world: FloatArray = turn @ covariance @ turn.T
         return world
 
@@ -94,13 +95,13 @@ class Slam:
         pose : FloatArray
             (4, 4) body to world.
         covariance : FloatArray or None
-            (6, 6) as :attr:`pose_covariance` gives it; None for an exact pose.
+            (6, 6) as :meth:`pose_covariance` gives it; None for an exact pose.
 
         """
         observer = self.observer
         A = se3.inverse(observer.reference_pose) @ pose
         observer.rebase(A, observer.y_ref + observer.a)
-        back = np.linalg.inv(self._turn_to_world())
+        back = np.linalg.inv(self._turn_to_world(A))
         given = np.zeros((6, 6)) if covariance is None else covariance
         self.gains.set_pose_covariance(back @ given @ back.T)
         self.gains.restart(observer)
@@ -122,11 +123,15 @@ class Slam:
 
     def advance(self, held: HeldVelocities) -> None:
         """Move the state on along ``held``."""
-        path = self.observer.propagate(self.gains.calibrated(held.body_velocities), held.dt_s)
+        motion = self._motion(held)
+        self.observer.propagate(motion.path)
         self.observer.move_landmarks(float(np.sum(held.dt_s + held.gap_s)))
-        noise = self._noise.motion(held)
-        motion = Motion(path, held.body_velocities, held.dt_s, held.gap_s, noise)
         self.gains.predict(motion)
+
+    def _motion(self, held: HeldVelocities) -> Motion:
+        path = self.observer.path(self.gains.calibrated(held.body_velocities), held.dt_s)
+        noise = self._noise.motion(held)
+        return Motion(path, held.body_velocities, held.dt_s, held.gap_s, noise)
 
     def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the state's instant.
@@ -184,10 +189,10 @@ class Slam:
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
 
-    def _turn_to_world(self) -> FloatArray:
+    def _turn_to_world(self, A: FloatArray) -> FloatArray:
         """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
         J = np.eye(6)
-        J[3:, :3] = -so3.hat(self.observer.A[:3, 3])
+        J[3:, :3] = -so3.hat(A[:3, 3])
         return np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
 
     def _innovate(self, event: ObservationEvent, rows: IntArray) -> FloatArray:

@@ -52,7 +52,7 @@ def integrate_paper_ode(sign_of_landmarks, sign_of_pose, duration_s, dt_s=1e-3):
         Delta, _ = paper_innovation(gain_k, gain_l, e, r, observer.a)
         Delta = sign_of_pose * Delta
         delta = observer.a @ Delta[:3, :3].T + sign_of_landmarks * 0.25 * r
-        observer.propagate(PAPER_VELOCITY[None], np.array([dt_s]))
+        observer.propagate(observer.path(PAPER_VELOCITY[None], np.array([dt_s])))
         observer.A = se3.exp(se3.vee(Delta) * dt_s) @ observer.A
         observer.a = observer.a + delta * dt_s
     return level
@@ -91,7 +91,7 @@ def test_residual_vanishes_exactly_where_the_output_fits_for_any_reference_pose(
     observer.A = se3.exp(rng.normal(size=6))
     points = rng.normal(size=(3, 3))
     observer.add_landmarks(points)
-    observer.propagate(rng.normal(size=(2, 6)), np.array([0.1, 0.7]))
+    observer.propagate(observer.path(rng.normal(size=(2, 6)), np.array([0.1, 0.7])))
     predicted = se3.transform(se3.inverse(observer.pose), observer.world_points)
     _, r = observer.errors(slice(None), predicted)
     np.testing.assert_allclose(r, 0.0, atol=1e-10)
@@ -142,7 +142,7 @@ def test_any_reference_pose_gives_the_same_configuration(reference_pose):
             e, r = observer.errors(slice(None), y)
             innovation = Innovation(np.arange(4), e, r, observer.a, np.zeros((4, 3, 3)), 0.1)
             observer.correct(gains.correct(innovation)[0])
-            observer.propagate(PAPER_VELOCITY[None], np.array([0.1]))
+            observer.propagate(observer.path(PAPER_VELOCITY[None], np.array([0.1])))
         return se3.transform(se3.inverse(observer.pose), observer.world_points)
 
     np.testing.assert_allclose(final_output(reference_pose), final_output(np.eye(4)), atol=1e-8)

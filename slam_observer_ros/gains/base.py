@@ -160,6 +160,9 @@ class GainDesign(Protocol):
     def pose_covariance(self) -> FloatArray | None:
         """(6, 6) covariance of the error ε of Â = exp(ε) A, (Ω, v) order; None if unknown."""
 
+    def pose_covariance_after(self, motion: Motion) -> FloatArray | None:
+        """Return what the pose's covariance (6, 6) will be after a motion yet to be predicted."""
+
     @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, reference frame, m²; None if unknown."""

@@ -68,6 +68,9 @@ class ConstantGains:
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Do nothing: constant gains know no noise."""
 
+    def pose_covariance_after(self, motion: Motion) -> None:
+        """Return None: constant gains know no noise."""
+
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Do nothing: constant gains know no noise."""
 

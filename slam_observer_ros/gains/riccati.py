@@ -77,9 +77,13 @@ class RiccatiGains:
     @property
     def pose_covariance(self) -> FloatArray:
         """(6, 6) covariance of the pose error ε; zero on axes that are not estimated."""
-        covariance = np.zeros((6, 6))
-        covariance[np.ix_(self._axes.pose, self._axes.pose)] = self._P[: self._p, : self._p]
-        return covariance
+        return self._axes.full_pose_covariance(self._P[: self._p, : self._p])
+
+    def pose_covariance_after(self, motion: Motion) -> FloatArray:
+        """Return what it will be after a motion yet to be predicted (6, 6)."""
+        P = self._P[: self._first, : self._first].copy()
+        predict(P, self._axes, self._calibration, motion)
+        return self._axes.full_pose_covariance(P[: self._p, : self._p])
 
     @property
     def landmark_covariances(self) -> FloatArray:

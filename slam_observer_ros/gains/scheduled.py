@@ -85,6 +85,9 @@ class ScheduledGains:
         """Append landmarks (m,) as certain as the map has them, or exact in a fixed map."""
         self._L = np.concatenate([self._L, self._map_variances(covariances)])
 
+    def pose_covariance_after(self, motion: Motion) -> None:
+        """Return None: the covariance that sets the gains is too small to be published."""
+
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε."""
         p, pose = len(self._axes.pose), self._axes.pose
