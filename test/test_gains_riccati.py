@@ -31,7 +31,8 @@ class Filter:
         self.gains = RiccatiGains(settings)
 
     def move(self, body_velocities, dt_s, covariances):
-        path = self.observer.propagate(self.gains.calibrated(body_velocities), dt_s)
+        path = self.observer.path(self.gains.calibrated(body_velocities), dt_s)
+        self.observer.propagate(path)
         no_gaps = np.zeros(len(dt_s))
         self.gains.predict(Motion(path, body_velocities, dt_s, no_gaps, covariances))
 
