@@ -11,6 +11,9 @@ from slam_observer_ros.types import FloatArray
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 """Relative error of a covariance whose message has it in single precision."""
 
+LARGEST = 1e6
+"""Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
+
 
 def check_event(event: Event) -> None:
     """Check an event's shapes and values.
@@ -19,7 +22,7 @@ def check_event(event: Event) -> None:
     ------
     InvalidEventError
         With the reason ``'negative_stamp'``, ``'wrong_shape'``, ``'not_finite'``,
-        ``'repeated_id'``, ``'negative_id'`` or ``'bad_covariance'``.
+        ``'too_large'``, ``'repeated_id'``, ``'negative_id'`` or ``'bad_covariance'``.
 
     """
     if event.stamp_ns < 0:
@@ -32,6 +35,7 @@ def check_event(event: Event) -> None:
 
 def _check_velocity(event: VelocityEvent) -> None:
     _check_array('body velocity', event.body_velocity, (6,))
+    _check_size('body velocity', event.body_velocity)
     if event.covariance is not None:
         _check_array('velocity covariance', event.covariance, (6, 6))
         _check_definite('velocity covariance', event.covariance)
@@ -40,6 +44,7 @@ def _check_velocity(event: VelocityEvent) -> None:
 def _check_observation(event: ObservationEvent) -> None:
     m = len(event.points)
     _check_array('landmark points', event.points, (m, 3))
+    _check_size('landmark points', event.points)
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'{len(event.ids)} ids for {m} landmark points')
     known = event.ids[event.ids != UNKNOWN_ID]
@@ -52,6 +57,7 @@ def _check_observation(event: ObservationEvent) -> None:
         _check_definite('landmark covariances', event.covariances)
     if event.velocities is not None:
         _check_array('landmark velocities', event.velocities, (m, 3))
+        _check_size('landmark velocities', event.velocities)
 
 
 def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
@@ -59,6 +65,11 @@ def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
         raise InvalidEventError('wrong_shape', f'{name} have shape {array.shape}, not {shape}')
     if not np.isfinite(array).all():
         raise InvalidEventError('not_finite', f'{name} have a NaN or infinite entry')
+
+
+def _check_size(name: str, array: FloatArray) -> None:
+    if np.abs(array).max(initial=0.0) > LARGEST:
+        raise InvalidEventError('too_large', f'{name} have an entry beyond {LARGEST:g}')
 
 
 def _check_definite(name: str, covariances: FloatArray) -> None:

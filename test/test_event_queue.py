@@ -1,0 +1,132 @@
+"""The event queue: stamp order whatever the order of arrival, duplicates, jumps of the clock."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.event_queue import CONFIRMATIONS, EventQueue
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+
+SECOND = 1_000_000_000
+START_NS = 1_700_000_000 * SECOND
+
+
+def velocity(stamp_ns):
+    return VelocityEvent(START_NS + stamp_ns, np.zeros(6))
+
+
+def observation(stamp_ns, ids=(1,)):
+    return ObservationEvent(START_NS + stamp_ns, np.array(ids), np.zeros((len(ids), 3)))
+
+
+def make_queue(window_ns=100, max_jump_ns=1000, late_limit_ns=500):
+    return EventQueue(window_ns, max_jump_ns, late_limit_ns)
+
+
+def filled(*events, **limits):
+    queue = make_queue(**limits)
+    for event in events:
+        assert not queue.push(event)
+    return queue
+
+
+def key(event):
+    ids = event.ids.tobytes() if isinstance(event, ObservationEvent) else b''
+    return event.stamp_ns, type(event).__name__, ids
+
+
+def stamps(events):
+    return [event.stamp_ns - START_NS for event in events]
+
+
+def test_events_are_held_back_until_they_leave_the_window():
+    queue = filled(velocity(0), velocity(60), velocity(110))
+    assert stamps(queue.pop_ready()) == [0]
+    assert stamps(queue.pop_ready()) == []
+    queue.push(velocity(160))
+    assert stamps(queue.pop_ready()) == [60]
+    assert stamps(queue.pop_all()) == [110, 160]
+    assert queue.newest_ns == START_NS + 160
+
+
+def test_without_a_window_events_come_out_at_once():
+    queue = filled(velocity(5), window_ns=0)
+    assert stamps(queue.pop_ready()) == [5]
+
+
+@given(st.permutations(range(12)))
+def test_the_order_of_arrival_within_the_window_does_not_matter(order):
+    events = [velocity(10 * k) for k in range(4)]
+    events += [observation(10 * k, ids) for k in range(4) for ids in ([1], [2, 3])]
+    queue = filled(*(events[place] for place in order))
+    given_out = [key(event) for event in queue.pop_all()]
+    assert given_out == [key(event) for event in filled(*events).pop_all()]
+    assert [stamp_ns for stamp_ns, *_ in given_out] == sorted(event.stamp_ns for event in events)
+
+
+def test_of_one_stamp_the_velocity_comes_first():
+    queue = filled(observation(7), velocity(7))
+    assert [type(event) for event in queue.pop_all()] == [VelocityEvent, ObservationEvent]
+
+
+@pytest.mark.parametrize('event', [velocity(3), observation(3), observation(3, [])])
+@pytest.mark.parametrize('is_given_out', [False, True])
+def test_an_event_that_comes_twice_is_refused(event, is_given_out):
+    queue = filled(event, velocity(150 if is_given_out else 50))
+    assert len(list(queue.pop_ready())) == is_given_out
+    with pytest.raises(InvalidEventError) as error:
+        queue.push(event)
+    assert error.value.reason == 'duplicate'
+
+
+def test_two_sensors_may_see_different_landmarks_at_one_instant():
+    queue = filled(observation(3, [1, 2]), observation(3, [4]))
+    assert len(list(queue.pop_all())) == 2
+
+
+def test_keys_of_old_events_are_forgotten():
+    queue = make_queue()
+    for k in range(2000):
+        queue.push(velocity(100 * k))
+        list(queue.pop_ready())
+    assert len(queue._known) < 20
+
+
+@pytest.mark.parametrize(
+    ('stamp_ns', 'reason'), [(1601, 'stamp_jump'), (-1, 'too_late'), (-START_NS, 'too_late')]
+)
+def test_stamps_far_from_all_others_are_refused(stamp_ns, reason):
+    queue = filled(velocity(0), velocity(600))
+    list(queue.pop_ready())
+    with pytest.raises(InvalidEventError) as error:
+        queue.push(velocity(stamp_ns))
+    assert error.value.reason == reason
+    assert '\n' not in str(error.value)
+    assert queue.newest_ns == START_NS + 600
+
+
+@pytest.mark.parametrize('stamp_ns', [1600, 600, 599, 1])
+def test_stamps_at_the_limits_are_taken(stamp_ns):
+    queue = filled(velocity(0), velocity(600))
+    assert not queue.push(observation(stamp_ns))
+
+
+@pytest.mark.parametrize('jump_ns', [10**15, -(10**15)])
+def test_a_jump_of_the_clock_is_believed_when_enough_events_agree(jump_ns):
+    queue = filled(velocity(0))
+    for k in range(CONFIRMATIONS - 1):
+        with pytest.raises(InvalidEventError):
+            queue.push(velocity(jump_ns + k))
+    assert queue.push(velocity(jump_ns + CONFIRMATIONS))
+
+
+def test_strays_among_good_events_never_add_up():
+    queue = filled(velocity(0))
+    for k in range(1, 50):
+        with pytest.raises(InvalidEventError):
+            queue.push(velocity(10**15 + k))
+        assert not queue.push(velocity(k))

@@ -1,0 +1,201 @@
+"""The noise model: physical units, gaps, covariances from messages, directions of each sensor."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from strategies import generators
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.velocity_history import HeldVelocities
+
+
+def held(velocities, dt_s, gap_s=None, covariances=None):
+    velocities = np.array(velocities, dtype=float)
+    return HeldVelocities(
+        velocities,
+        covariances or [None] * len(velocities),
+        np.array(dt_s, dtype=float),
+        np.zeros(len(velocities)) if gap_s is None else np.array(gap_s, dtype=float),
+    )
+
+
+def observed(points, **settings):
+    points = np.array(points, dtype=float)
+    event = ObservationEvent(0, np.arange(len(points)), points)
+    return NoiseModel(Settings(**settings)).observation(event)
+
+
+def deviation(covariance, direction):
+    direction = np.array(direction) / np.linalg.norm(direction)
+    return np.sqrt(direction @ covariance @ direction)
+
+
+@pytest.mark.parametrize('pieces', [1, 10, 1000])
+def test_densities_are_the_standard_deviation_after_one_second(pieces):
+    settings = Settings(
+        angular_velocity_noise=(0.1, 0.2, 0.3), linear_velocity_noise=(0.4, 0.5, 0.6)
+    )
+    covariances = NoiseModel(settings).motion(
+        held(np.ones((pieces, 6)), np.full(pieces, 1.0 / pieces))
+    )
+    expected = np.diag(np.arange(1, 7) * 0.1) ** 2
+    np.testing.assert_allclose(covariances.sum(axis=0), expected, atol=1e-12)
+
+
+def test_scale_noise_grows_with_speed_and_is_none_at_rest():
+    settings = Settings(
+        angular_velocity_noise=(0.0,) * 3,
+        linear_velocity_noise=(0.0,) * 3,
+        angular_scale_noise=(0.0, 0.0, 0.1),
+        linear_scale_noise=(0.2, 0.0, 0.0),
+    )
+    moving, still = NoiseModel(settings).motion(
+        held([[1.0, 1.0, -2.0, 3.0, 1.0, 1.0], np.zeros(6)], [1.0, 1.0])
+    )
+    np.testing.assert_allclose(np.sqrt(np.diag(moving)), [0.0, 0.0, 0.2, 0.6, 0.0, 0.0])
+    np.testing.assert_array_equal(still, 0.0)
+
+
+def test_in_a_gap_the_robot_may_do_what_the_settings_allow():
+    settings = Settings(unknown_angular_motion=0.3, unknown_linear_motion=0.7)
+    covariance = NoiseModel(settings).motion(held(np.zeros((1, 6)), [0.0], [4.0]))[0]
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [0.6] * 3 + [1.4] * 3)
+
+
+@given(generators(), st.floats(0.01, 1.0), st.floats(0.0, 1.0))
+def test_a_messages_covariance_stands_for_the_settings_while_the_velocity_is_held(
+    rng, dt_s, gap_s
+):
+    root = rng.normal(size=(6, 6))
+    given_covariance = root @ root.T
+    model = NoiseModel(Settings())
+    stated, silent = model.motion(
+        held(rng.normal(size=(2, 6)), [dt_s, dt_s], [gap_s, 0.0], [given_covariance, None])
+    )
+    gap = np.diag([0.25] * 6) * gap_s
+    np.testing.assert_allclose(stated, given_covariance * dt_s**2 + gap, atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(silent) / dt_s), [0.03] * 3 + [0.02] * 3)
+
+
+def test_no_motion_has_no_covariances():
+    assert NoiseModel(Settings()).motion(held(np.empty((0, 6)), [])).shape == (0, 6, 6)
+
+
+@given(generators(), st.floats(-1.0, 2.0))
+def test_range_and_bearing_err_along_and_across_the_line_of_sight(rng, log_range):
+    turn, range_m = so3.exp(rng.normal(size=3)), 10.0**log_range
+    sight, left, up = turn.T
+    covariance = observed(
+        [range_m * sight], range_noise=0.3, range_scale_noise=0.1, bearing_noise=0.02
+    )[0]
+    along = deviation(covariance, sight)
+    assert along == pytest.approx(np.hypot(0.3, 0.1 * range_m), rel=1e-3)
+    for across in (left, up, left + up):
+        expected = pytest.approx(0.02 * range_m, rel=1e-3, abs=1e-3)
+        assert deviation(covariance, across) == expected
+
+
+@given(generators(), st.floats(-1.0, 2.0))
+def test_stereo_errs_with_the_square_of_the_range_in_depth(rng, log_range):
+    turn, range_m = so3.exp(rng.normal(size=3)), 10.0**log_range
+    sight, left, _ = turn.T
+    covariance = observed(
+        [range_m * sight],
+        observation_model='stereo',
+        stereo_focal_length=400.0,
+        stereo_baseline=0.1,
+        pixel_noise=2.0,
+        disparity_noise=0.5,
+    )[0]
+    # Depth z = f b / disparity, so σ_z = z² σ_disparity / (f b).
+    depth = pytest.approx(range_m**2 * 0.5 / 40.0, rel=1e-3, abs=1e-3 * range_m)
+    assert deviation(covariance, sight) == depth
+    across = pytest.approx(range_m * 2.0 / 400.0, rel=1e-3, abs=1e-3 * range_m**2)
+    assert deviation(covariance, left) == across
+
+
+def test_cartesian_noise_is_the_same_everywhere():
+    covariances = observed(
+        [[0, 0, 0], [1, 2, 3], [1e4, 0, 0]], observation_model='cartesian', point_noise=0.2
+    )
+    np.testing.assert_allclose(covariances, np.tile(0.04 * np.eye(3), (3, 1, 1)), rtol=1e-5)
+
+
+def test_a_point_at_the_sensor_is_known_as_well_as_its_range():
+    covariance = observed([[0.0, 0.0, 0.0]], range_noise=0.3)[0]
+    np.testing.assert_allclose(covariance, 0.09 * np.eye(3), rtol=1e-5)
+
+
+def test_covariances_of_messages_are_used_as_they_are():
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(5, 3, 3))
+    stated = roots @ roots.swapaxes(1, 2) + 0.1 * np.eye(3)
+    event = ObservationEvent(0, np.arange(5), rng.normal(size=(5, 3)), stated)
+    np.testing.assert_allclose(NoiseModel(Settings()).observation(event), stated, rtol=1e-3)
+
+
+def awkward_observations():
+    """Points and covariances that are within the rules but leave some direction exact."""
+    turned = so3.exp(np.array([0.3, 0.2, 0.5]))
+    on_a_line = (turned @ np.diag([1.0, 0.0, 0.0]) @ turned.T).astype(np.float32)
+    return {
+        'at the sensor': ([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0]], None),
+        'next to the sensor': ([[1e-9, 0.0, 0.0], [1.0, 2.0, 0.0]], None),
+        'straight above': ([[0.0, 0.0, 2.0], [1.0, 2.0, 0.0]], None),
+        'very far': ([[1e6, 1e6, 0.0], [1.0, 2.0, 0.0]], None),
+        'all exact': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], np.zeros((3, 3))),
+        'exact height': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], np.diag([0.1, 0.1, 0.0])),
+        'known but for a line': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], on_a_line.astype(float)),
+    }
+
+
+@pytest.mark.parametrize('case', awkward_observations())
+@pytest.mark.parametrize('model', ['range_bearing', 'stereo', 'cartesian'])
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_no_observation_is_so_exact_that_it_ends_the_estimator(case, model, gains, two_d_mode):
+    points, covariance = awkward_observations()[case]
+    settings = Settings(gains=gains, two_d_mode=two_d_mode, observation_model=model)
+    covariances = None if covariance is None else np.tile(covariance, (2, 1, 1))
+    estimator = Estimator(settings)
+    for step in range(4):
+        stamp_ns = 10**9 + step * 10**8
+        assert estimator.add(VelocityEvent(stamp_ns, np.array([0, 0, 0.1, 0.1, 0, 0])))
+        assert estimator.add(
+            ObservationEvent(stamp_ns, np.arange(2), np.array(points), covariances)
+        )
+    estimator.flush()
+    assert np.all(np.isfinite(estimator.pose))
+    assert np.all(np.isfinite(estimator.world_points))
+
+
+def test_distances_and_speeds_that_only_stand_for_none_are_refused():
+    estimator = Estimator(Settings())
+    none = float(np.finfo(np.float32).max)
+    assert not estimator.add(ObservationEvent(0, np.array([1]), np.array([[none, 0.0, 0.0]])))
+    assert not estimator.add(VelocityEvent(0, np.full(6, none)))
+    assert estimator.dropped == {'too_large': 2}
+
+
+@pytest.mark.parametrize(
+    'covariance',
+    [
+        np.array([[1.0, 5.0, 0.0], [5.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.diag([1.0, 1.0, -0.1]),
+    ],
+)
+def test_what_is_no_covariance_matrix_is_refused(covariance):
+    estimator = Estimator(Settings())
+    points = np.ones((1, 3))
+    assert not estimator.add(ObservationEvent(0, np.array([1]), points, covariance[None]))
+    six = np.kron(np.eye(2), covariance)
+    assert not estimator.add(VelocityEvent(0, np.zeros(6), six))
+    assert estimator.dropped == {'bad_covariance': 2}
