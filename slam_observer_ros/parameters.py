@@ -187,7 +187,7 @@ def read_parameter_file(path: Path) -> dict[str, object]:
 
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+        content = yaml.safe_load(path.read_bytes())
     except OSError as error:
         raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
     except yaml.YAMLError as error:
