@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import difflib
 import math
 from pathlib import Path
+import re
 from typing import Any, cast, ClassVar, Protocol, TypeAlias, TypeVar
 
 import yaml
@@ -21,7 +22,7 @@ from slam_observer_ros.errors import ParameterError
 Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
 
-NODE_NAMES = ('observer_node', 'simulator_node')
+OBSERVER_NODE = 'observer_node'
 
 
 class Dataclass(Protocol):
@@ -187,7 +188,7 @@ def read_parameter_file(path: Path) -> dict[str, object]:
 
     """
     try:
-        content = yaml.safe_load(path.read_bytes())
+        content = yaml.load(path.read_bytes(), _RosLoader)
     except OSError as error:
         raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
     except yaml.YAMLError as error:
@@ -196,16 +197,25 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     values: dict[str, object] = {}
     found = False
     for section, body in content.items() if isinstance(content, dict) else ():
-        is_ours = section == '/**' or str(section).rsplit('/', 1)[-1] == NODE_NAMES[0]
+        is_ours = section == '/**' or str(section).rsplit('/', 1)[-1] == OBSERVER_NODE
         if is_ours and isinstance(body, dict) and isinstance(body.get('ros__parameters'), dict):
             found = True
             values.update(_flatten(body['ros__parameters']))
     if not found:
         raise ParameterError(
             f"parameter file {path} has no '/**: ros__parameters:' or "
-            f"'{NODE_NAMES[0]}: ros__parameters:' section"
+            f"'{OBSERVER_NODE}: ros__parameters:' section"
         )
     return values
+
+
+class _RosLoader(yaml.SafeLoader):
+    """Reads numbers as ROS does: 1e-3 is one, though YAML 1.1 wants 1.0e-3."""
+
+
+_RosLoader.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'^[-+]?\d+[eE][-+]?\d+$'), list('-+0123456789')
+)
 
 
 def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:

@@ -36,6 +36,13 @@ class Settings:
         choices=('exponential', 'paper'),
         read_only=False,
     )
+    max_innovation_time: float = parameter(
+        0.2,
+        'Constant gains: longest time that one observation acts, since it was unseen before',
+        unit='s',
+        minimum=1e-3,
+        read_only=False,
+    )
     velocity_timeout: float = parameter(
         1.0,
         'How long a velocity is held; after that the pose is held and flagged as stale',

@@ -53,6 +53,7 @@ class ConstantGains:
         self.gain_k = settings.gain_k
         self.gain_l = 0.0 if settings.localization_mode == 'fixed' else settings.gain_l
         self.step_mode = settings.step_mode
+        self.max_time_s = settings.max_innovation_time
 
     def predict(self, motion: Motion) -> None:
         """Do nothing: constant gains know no noise."""
@@ -98,9 +99,10 @@ class ConstantGains:
         k = np.full(len(innovation.r), self.gain_k)
         step_on = paper_step if self.step_mode == 'paper' else centroid_step
         step = partial(step_on, axes=self._axes)
-        D = safe_step(step, k, innovation.e, innovation.r, innovation.dt_s)
+        dt_s = min(innovation.dt_s, self.max_time_s)
+        D = safe_step(step, k, innovation.e, innovation.r, dt_s)
         remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
-        d = -np.expm1(-self.gain_l / self.gain_k * innovation.dt_s) * remaining  # (31)
+        d = -np.expm1(-self.gain_l / self.gain_k * dt_s) * remaining  # (31)
         return Correction(D, innovation.indices, d), np.ones(len(k))
 
     def distances(self, innovation: Innovation) -> FloatArray:
