@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import time
 
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
+import numpy as np
 from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
+    transform_message,
     twist_message,
 )
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.recording.messages import pose_matrices
 from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.simulation import Simulation
 
@@ -28,9 +33,11 @@ class Robot:
         cloud_class=PointCloud2,
         namespace='',
         frame_id='base_link',
+        sensor_frame_id=None,
     ):
         self.ros = ros
         self.frame_id = frame_id
+        self.sensor_frame_id = sensor_frame_id or frame_id
         self.twist_class = twist_class
         self.cloud_class = cloud_class
         self.twist = ros.node.create_publisher(twist_class, f'{namespace}/twist', 1000)
@@ -76,10 +83,47 @@ class Robot:
         return message
 
     def _observation(self, event):
-        contents = (event.stamp_ns, self.frame_id, event.ids, event.points)
+        contents = (event.stamp_ns, self.sensor_frame_id, event.ids, event.points)
         if self.cloud_class is PointCloud:
             return encode_point_cloud(*contents)
         return point_cloud2_message(*contents, velocities=event.velocities)
+
+
+class TransformSender:
+    """Publishes on a robot's /tf and /tf_static, to which the node's are remapped."""
+
+    def __init__(self, ros, namespace):
+        self.ros = ros
+        self.dynamic = ros.node.create_publisher(TFMessage, f'{namespace}/tf', 1000)
+        self.static = ros.node.create_publisher(TFMessage, f'{namespace}/tf_static', LATCHED_QOS)
+
+    def send(self, *poses, stamp_ns=0):
+        """Publish (parent, child, pose) in one message; without stamp they are static."""
+        publisher = self.dynamic if stamp_ns else self.static
+        publisher.publish(
+            TFMessage(
+                transforms=[
+                    TransformStamped(
+                        header=header_message(stamp_ns, parent),
+                        child_frame_id=child,
+                        transform=transform_message(pose),
+                    )
+                    for parent, child, pose in poses
+                ]
+            )
+        )
+
+
+def own_topics(namespace):
+    """Return the arguments that give a node a namespace and a /tf of its own."""
+    remaps = [f'__ns:={namespace}', f'/tf:={namespace}/tf', f'/tf_static:={namespace}/tf_static']
+    return [argument for remap in remaps for argument in ('-r', remap)]
+
+
+def pose_of(transform):
+    """Return a geometry_msgs/Transform as a pose (4, 4)."""
+    t, q = transform.translation, transform.rotation
+    return pose_matrices(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
 def stamp_ns(message):
