@@ -1,0 +1,144 @@
+"""The benchmark of accuracy and consistency: ``make benchmark-accuracy``.
+
+Every estimator gets the same events and the same noise figures, those of config/*.yaml.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Collection, Iterator
+from concurrent.futures import as_completed, Future, ProcessPoolExecutor
+import json
+import logging
+import multiprocessing
+import os
+from pathlib import Path
+import sys
+from typing import TypeVar
+
+import estimators
+from jobs import GTSAM_JOB, Job, run_job, run_seed, SeedJob
+import monte_carlo
+import numpy as np
+import report
+from rich.console import Console
+from rich.progress import track
+import worlds
+
+from slam_observer_ros.types import FloatArray
+
+DOCS = worlds.CHECKOUT / 'docs'
+QUICK_S = 60.0
+QUICK_RUNS = 4
+RUNS = 50
+
+ResultT = TypeVar('ResultT')
+
+
+def main() -> None:
+    """Run the benchmark and print its tables."""
+    args = parse_arguments()
+    logging.basicConfig(format='benchmark: %(message)s')
+    # Worker processes, side by side, would slow each other down with threads of their own.
+    os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
+    if not worlds.data_folder().is_dir():
+        logging.warning(
+            'no recordings in %s (SLAM_OBSERVER_DATA names their folder): simulation only',
+            worlds.data_folder(),
+        )
+    chosen = [name for name in worlds.names() if args.only.lower() in name.lower()]
+    loops = [] if args.only else list(monte_carlo.LOOPS)
+    runs = QUICK_RUNS if args.quick else RUNS
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
+        tables = run_jobs(pool, list(list_jobs(chosen, QUICK_S if args.quick else None)))
+        consistency = run_monte_carlo(pool, loops, runs)
+    results = report.Results(tables, consistency, runs)
+    sys.stdout.write(report.tables(results))
+    if args.json:
+        args.json.write_text(json.dumps(report.to_json(results), indent=1) + '\n')
+    if args.write_docs:
+        (DOCS / 'images').mkdir(parents=True, exist_ok=True)
+        (DOCS / 'benchmark.md').write_text(report.document(results), encoding='utf-8')
+        report.draw(results, DOCS / 'images' / 'benchmark.png')
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write all numbers to FILE')
+    parser.add_argument(
+        '--only', default='', metavar='NAME', help='only data sets whose name contains NAME'
+    )
+    parser.add_argument(
+        '--quick', action='store_true', help='only the first minute and few Monte Carlo runs'
+    )
+    parser.add_argument(
+        '--write-docs', action='store_true', help='write docs/benchmark.md and its figure anew'
+    )
+    return parser.parse_args()
+
+
+def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:
+    """Yield all jobs on the worlds of these names, the longest first."""
+    for name in names:
+        yield Job(report.CLEAN, name, GTSAM_JOB, first_s)
+    for name in names:
+        for column in (*estimators.ONLINE, estimators.SMOOTHED):
+            yield Job(report.CLEAN, name, column, first_s)
+        for column in report.OUTLIER_COLUMNS:
+            yield Job(report.OUTLIERS, name, column, first_s)
+        if 'MRCLAM' in name:
+            yield Job(report.NO_IDS, name, 'riccati', first_s)
+
+
+def run_jobs(pool: ProcessPoolExecutor, jobs: list[Job]) -> report.Tables:
+    """Run jobs side by side; return table → world → column → scores."""
+    tables: report.Tables = {
+        variant: {job.world: {} for job in jobs if job.variant == variant}
+        for variant in report.VARIANTS
+    }
+    futures = {pool.submit(run_job, job): job for job in jobs}
+    for future in show_progress('data sets', futures):
+        job = futures[future]
+        tables[job.variant][job.world].update(future.result())
+    return tables
+
+
+def run_monte_carlo(
+    pool: ProcessPoolExecutor, loops: list[str], runs: int
+) -> dict[str, dict[str, monte_carlo.Consistency]]:
+    """Return loop → estimator → consistency."""
+    jobs = [
+        SeedJob(loop, estimator, seed)
+        for seed in range(runs)
+        for loop in loops
+        for estimator in monte_carlo.ESTIMATORS
+    ]
+    futures = {pool.submit(run_seed, job): job for job in jobs}
+    nees: dict[tuple[str, str], list[FloatArray]] = {}
+    for future in show_progress('Monte Carlo', futures):
+        job = futures[future]
+        nees.setdefault((job.loop, job.estimator), []).append(future.result())
+    return {
+        loop: {
+            estimator: monte_carlo.summarise(loop, np.array(nees[loop, estimator]))
+            for estimator in monte_carlo.ESTIMATORS
+        }
+        for loop in loops
+    }
+
+
+def show_progress(title: str, futures: Collection[Future[ResultT]]) -> Iterator[Future[ResultT]]:
+    """Yield futures as they finish, with a progress bar on standard error."""
+    console = Console(stderr=True)
+    yield from track(
+        as_completed(futures),
+        title,
+        total=len(futures),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,100 @@
+"""Units of work for the benchmark's worker processes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+import logging
+
+import estimators
+from estimators import BATCH, ISAM2, Run
+from gtsam_baselines import IndeterminateError
+import monte_carlo
+import outliers
+import report
+from scores import FAILED, score, Scores
+import worlds
+from worlds import World
+
+from slam_observer_ros.types import FloatArray
+
+OUTLIER_SEED = 1
+GTSAM_JOB = 'GTSAM'
+"""iSAM2 and batch in one job, since one starts from the other."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One estimator on one world.
+
+    Attributes
+    ----------
+    variant : str
+        The table that the scores go to.
+    world, column : str
+        Names of the world and of the estimator.
+    first_s : float or None
+        Only so many seconds of the world.
+
+    """
+
+    variant: str
+    world: str
+    column: str
+    first_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class SeedJob:
+    """One Monte Carlo run of an estimator."""
+
+    loop: str
+    estimator: str
+    seed: int
+
+
+def run_job(job: Job) -> dict[str, Scores]:
+    """Return the scores by column."""
+    logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
+    world = _load(job.world) if job.first_s is None else _load(job.world).first(job.first_s)
+    if job.variant == report.NO_IDS:
+        return {job.column: _score_without_ids(world)}
+    if job.variant == report.OUTLIERS:
+        world = outliers.with_outliers(world, OUTLIER_SEED)
+    try:
+        runs = _run(job.column, world)
+    except IndeterminateError as error:
+        logger.warning('%s: %s failed %s', job.world, job.column, error)
+        failed = (ISAM2, BATCH) if job.column == GTSAM_JOB else (job.column,)
+        return dict.fromkeys(failed, FAILED)
+    return {column: score(run, world) for column, run in runs.items()}
+
+
+def run_seed(job: SeedJob) -> FloatArray:
+    """Return what :func:`monte_carlo.run_once` does."""
+    logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
+    return monte_carlo.run_once(job.loop, job.estimator, job.seed)
+
+
+def _run(column: str, world: World) -> dict[str, Run]:
+    if column == GTSAM_JOB:
+        return estimators.run_gtsam(world.settings, world.events)
+    if column == estimators.SMOOTHED:
+        return {column: estimators.run_smoothed(world.settings, world.events)}
+    estimator = estimators.ONLINE[column](world.settings)
+    return {column: estimators.run_online(estimator, world.events)}
+
+
+def _score_without_ids(world: World) -> Scores:
+    estimator = estimators.observer('riccati')(world.settings)
+    run = estimators.run_online(estimator, outliers.without_ids(world).events)
+    if (estimator.landmark_ids < 0).any():
+        return FAILED  # no data association: all points became one landmark
+    return score(run, world, outliers.true_labels(run, world))
+
+
+@cache
+def _load(name: str) -> World:
+    return worlds.load(name)

@@ -1,0 +1,57 @@
+"""Velocities between two observations made one motion: the common input of the baselines."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import numpy as np
+
+from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray
+from slam_observer_ros.velocity_history import VelocityHistory
+
+
+class Odometry:
+    """Integrates velocities as the estimator does: each held until the next, same noise figures.
+
+    Parameters
+    ----------
+    settings : Settings
+        Noise figures and ``velocity_timeout``.
+
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._velocities = VelocityHistory(round(settings.velocity_timeout * 1e9))
+        self._noise = NoiseModel(settings)
+        self._stamp_ns: int | None = None
+
+    def add(self, event: VelocityEvent) -> None:
+        """Take in a velocity; stamps must not decrease."""
+        self._velocities.append(event)
+        if self._stamp_ns is None:
+            self._stamp_ns = event.stamp_ns
+
+    def motion_to(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return the motion since the call before this one.
+
+        Returns
+        -------
+        motion : FloatArray
+            (4, 4) pose at ``stamp_ns`` in the body frame of the last call.
+        covariance : FloatArray
+            (6, 6) covariance of η in ``motion`` · exp(η), (Ω, v) order, rad² and m².
+
+        """
+        start_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
+        held = self._velocities.held(start_ns, stamp_ns)
+        steps = se3.exp(held.body_velocities * (held.dt_s)[:, None])
+        path = np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
+        Ad = se3.adjoint(se3.inverse(path[-1]) @ path[:-1])
+        covariances = Ad @ self._noise.motion(held) @ Ad.swapaxes(1, 2)
+        self._velocities.forget_before(stamp_ns)
+        self._stamp_ns = stamp_ns
+        return path[-1], covariances.sum(axis=0)

@@ -1,0 +1,81 @@
+"""Worse data: outliers added to observations, ids taken from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from estimators import Run
+import numpy as np
+from worlds import World
+
+from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.types import FloatArray, IntArray
+
+GROSS_SHARE = 0.05
+GROSS_M = (0.5, 20.0)
+SWAPPED_SHARE = 0.01
+
+
+def with_outliers(world: World, seed: int) -> World:
+    """Displace 5 % of the points by 0.5–20 m in any direction, and swap 1 % of the ids.
+
+    An id is swapped for that of another landmark seen before, as when two markers look alike.
+    """
+    rng = np.random.default_rng(seed)
+    seen: set[int] = set()
+    events: list[Event] = []
+    for event in world.events:
+        if isinstance(event, ObservationEvent):
+            seen.update(event.ids.tolist())
+            points = _displaced(event.points, world.settings.two_d_mode, rng)
+            event = replace(event, points=points, ids=_swapped(event.ids, sorted(seen), rng))
+        events.append(event)
+    return replace(world, events=events)
+
+
+def without_ids(world: World) -> World:
+    """Take the ids away."""
+    return replace(world, events=[_anonymous(event) for event in world.events])
+
+
+def true_labels(run: Run, world: World) -> dict[int, int]:
+    """Return which true landmark each of an estimator's own ids means.
+
+    It is the one that was observed nearest to where the new landmark was put when it appeared.
+    """
+    observations = [event for event in world.events if isinstance(event, ObservationEvent)]
+    labels: dict[int, int] = {}
+    for observation, snapshot in zip(observations, run.snapshots, strict=True):
+        seen = se3.transform(se3.inverse(snapshot.pose), snapshot.world_points)
+        for own_id, point in zip(snapshot.ids.tolist(), seen, strict=True):
+            if own_id not in labels:
+                distances = np.linalg.norm(observation.points - point, axis=1)
+                labels[own_id] = int(observation.ids[np.argmin(distances)])
+    return labels
+
+
+def _displaced(points: FloatArray, planar: bool, rng: np.random.Generator) -> FloatArray:
+    m = len(points)
+    directions = rng.standard_normal((m, 3))
+    if planar:
+        directions[:, 2] = 0.0
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    distances = np.where(rng.random(m) < GROSS_SHARE, rng.uniform(*GROSS_M, m), 0.0)
+    moved: FloatArray = points + distances[:, None] * directions
+    return moved
+
+
+def _swapped(ids: IntArray, seen: list[int], rng: np.random.Generator) -> IntArray:
+    ids = ids.copy()
+    for i in np.flatnonzero(rng.random(len(ids)) < SWAPPED_SHARE):
+        other = rng.choice(seen)
+        ids[ids == other] = ids[i]  # no id may occur twice in one observation
+        ids[i] = other
+    return ids
+
+
+def _anonymous(event: Event) -> Event:
+    if not isinstance(event, ObservationEvent):
+        return event
+    return replace(event, ids=np.full_like(event.ids, UNKNOWN_ID))

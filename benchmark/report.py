@@ -1,0 +1,289 @@
+"""Tables, document and figure of the benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import estimators
+from estimators import BATCH, EKF, ISAM2, ISAM2_DEFAULT, SMOOTHED, UNCALIBRATED
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from monte_carlo import Consistency
+import numpy as np
+from scores import Scores
+
+from slam_observer_ros.gains import DESIGNS
+from slam_observer_ros.types import FloatArray
+
+CLEAN, OUTLIERS, NO_IDS = 'accuracy', 'with_outliers', 'without_ids'
+VARIANTS = (CLEAN, OUTLIERS, NO_IDS)
+OUTLIER_COLUMNS = (*DESIGNS, EKF, ISAM2_DEFAULT)
+
+STARRY_NIGHT = 'Starry Night'
+
+Table: TypeAlias = dict[str, dict[str, Scores]]
+"""World → column → scores."""
+
+Tables: TypeAlias = dict[str, Table]
+"""Variant → table."""
+
+AIMS = (
+    ('riccati', ISAM2, 'configuration_rmse_m', '≤ 1'),
+    (UNCALIBRATED, ISAM2, 'configuration_rmse_m', ''),
+    ('scheduled', 'riccati', 'configuration_rmse_m', '≤ 1.2'),
+    (EKF, 'riccati', 'configuration_rmse_m', '≥ 0.98'),
+    ('riccati', ISAM2, 'ate_rmse_m', '≤ 1'),
+    (SMOOTHED, BATCH, 'ate_rmse_m', '≤ 1.02'),
+    ('riccati', ISAM2, 'cpu_s', '≤ 0.2'),
+    ('riccati', ISAM2_DEFAULT, 'cpu_s', ''),
+)
+"""Ratios of two estimators in one metric, and what they should be."""
+
+METRICS: dict[str, tuple[str, int]] = {
+    'configuration_rmse_m': ('Configuration error, m', 3),
+    'ate_rmse_m': ('Position ATE RMSE, m', 3),
+    'heading_rmse_rad': ('Heading RMSE, rad', 3),
+    'landmark_rmse_m': ('Landmark RMSE, m', 3),
+    'cpu_s': ('CPU time, s', 2),
+}
+"""Title and decimals of each table."""
+
+OUTLIERS_TITLE = 'Growth of the configuration error with 5 % gross outliers and 1 % swapped ids'
+NO_IDS_TITLE = 'Configuration error with and without ids, m'
+
+INTRODUCTION = """\
+# Accuracy, consistency and cost, compared
+
+Written by `make benchmark-accuracy` (`python benchmark/accuracy.py --write-docs`). One run, the
+same events and the same noise figures for all: those of `config/wheeled_bearing_range.yaml` and
+`config/stereo_inertial.yaml`, which come from descriptions of the sensors and not from these
+recordings. The simulated worlds are made with the noise that these files state.
+
+- **constant, scheduled, riccati**: this project's gain designs. The wheeled configuration also
+  lets `scheduled` and `riccati` estimate the scale of the odometry, which GTSAM and the EKF don't
+  do here; `riccati, no calibration` has that switched off, for a comparison on equal terms.
+- **textbook EKF**: world-frame errors and absolute landmarks (`benchmark/ekf_slam.py`), with the
+  observer's gate and Huber weights.
+- **iSAM2**: GTSAM, updated and read out in full after each observation; relinearizeSkip 1,
+  threshold 0.01 (the more accurate setting), and beside it GTSAM's default parameters. One
+  odometry factor from one observation to the next, bearing-range factors with Huber's loss,
+  Pose2/Point2 for planar data.
+- **smoothed** and **GTSAM batch** know the future: `riccati` and then Gauss–Newton over
+  everything; Levenberg–Marquardt from iSAM2's last estimate.
+
+Configuration error: after each observation, the RMS over all landmarks known so far of
+|P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. ATE and heading are those
+of the poses right after the observations, after one rigid alignment of their positions. CPU time
+is that of the estimator's own calls; integrating the velocities, which all but the observer do by
+the same code, costs what dead reckoning costs. `failed`: GTSAM gave up with a singular system.
+
+![Configuration error and consistency](images/benchmark.png)
+
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Results:
+    """All that the benchmark measured.
+
+    Attributes
+    ----------
+    tables : Tables
+        Scores.
+    consistency : dict
+        Loop → estimator → ANEES over time; empty if it was left out.
+    runs : int
+        Monte Carlo runs.
+
+    """
+
+    tables: Tables
+    consistency: dict[str, dict[str, Consistency]]
+    runs: int
+
+
+def tables(results: Results) -> str:
+    """Return all tables as Markdown."""
+    clean = results.tables[CLEAN]
+    sections = [_table('In short', _summary(results), ('measured', 'aim'))]
+    for metric, (title, decimals) in METRICS.items():
+        sections.append(_table(title, _cells(clean, metric, decimals), estimators.COLUMNS))
+    sections.append(_table(OUTLIERS_TITLE, _growth(results.tables), OUTLIER_COLUMNS))
+    if results.tables[NO_IDS]:
+        sections.append(_table(NO_IDS_TITLE, _without_ids(results.tables), ('with', 'without')))
+    for loop, columns in results.consistency.items():
+        title = f'ANEES of {results.runs} runs: {loop}'
+        sections.append(_table(title, _consistency(columns), ('inside', 'pose', 'landmarks')))
+    return '\n'.join(sections)
+
+
+def document(results: Results) -> str:
+    """Return the text of docs/benchmark.md."""
+    return INTRODUCTION + tables(results)
+
+
+def to_json(results: Results) -> dict[str, Any]:
+    """Return all numbers as JSON's types; null where an estimator failed."""
+    converted: dict[str, Any] = {
+        variant: {
+            world: {
+                column: {name: _or_null(value) for name, value in asdict(scores).items()}
+                for column, scores in columns.items()
+            }
+            for world, columns in table.items()
+        }
+        for variant, table in results.tables.items()
+    }
+    converted['monte_carlo_runs'] = results.runs
+    converted['consistency'] = {
+        loop: {
+            name: {
+                'times_s': consistency.times_s.tolist(),
+                'pose_anees': consistency.pose.tolist(),
+                'landmark_anees': consistency.landmarks.tolist(),
+                'band': consistency.band,
+                'inside': consistency.inside,
+            }
+            for name, consistency in columns.items()
+        }
+        for loop, columns in results.consistency.items()
+    }
+    return converted
+
+
+def draw(results: Results, path: Path) -> None:
+    """Draw the configuration errors as bars and the ANEES over time."""
+    loops = results.consistency
+    figure = Figure(figsize=(11.0, 4.0 + 3.0 * bool(loops)), layout='constrained')
+    grid = figure.add_gridspec(1 + bool(loops), max(len(loops), 1))
+    _draw_bars(figure.add_subplot(grid[0, :]), results.tables[CLEAN])
+    for i, (loop, columns) in enumerate(loops.items()):
+        _draw_consistency(figure.add_subplot(grid[1, i]), loop, columns)
+    figure.savefig(path, dpi=120)
+
+
+def _table(title: str, rows: dict[str, dict[str, str]], columns: tuple[str, ...]) -> str:
+    """Return a Markdown table with a heading."""
+    lines = [f'## {title}', '', f'| | {" | ".join(columns)} |', '|---' * (len(columns) + 1) + '|']
+    for name, cells in rows.items():
+        lines.append(f'| {name} | {" | ".join(cells.get(column, "") for column in columns)} |')
+    return '\n'.join([*lines, ''])
+
+
+def _or_null(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _number(value: float, decimals: int) -> str:
+    return f'{value:.{decimals}f}' if np.isfinite(value) else 'failed'
+
+
+def _percent(ratio: float) -> str:
+    return f'{100.0 * (ratio - 1.0):+.0f} %' if np.isfinite(ratio) else 'failed'
+
+
+def _values(table: Table, worlds: Iterable[str], column: str, metric: str) -> FloatArray:
+    """Return one metric of one estimator on some worlds."""
+    return np.array([getattr(table[world][column], metric) for world in worlds])
+
+
+def _mrclam(table: Table) -> list[str]:
+    return [world for world in table if 'MRCLAM' in world]
+
+
+def _cells(table: Table, metric: str, decimals: int) -> dict[str, dict[str, str]]:
+    """Return the rows of one metric's table: all worlds, and the mean of MRCLAM's robots."""
+    rows = {
+        world: {
+            column: _number(getattr(scores, metric), decimals)
+            for column, scores in columns.items()
+        }
+        for world, columns in table.items()
+    }
+    robots = _mrclam(table)
+    if len(robots) > 1:
+        rows['**MRCLAM 6, mean**'] = {
+            column: _number(float(_values(table, robots, column, metric).mean()), decimals)
+            for column in estimators.COLUMNS
+        }
+    return rows
+
+
+def _growth(tables: Tables) -> dict[str, dict[str, str]]:
+    return {
+        world: {
+            column: _percent(
+                scores.configuration_rmse_m / tables[CLEAN][world][column].configuration_rmse_m
+            )
+            for column, scores in columns.items()
+        }
+        for world, columns in tables[OUTLIERS].items()
+    }
+
+
+def _without_ids(tables: Tables) -> dict[str, dict[str, str]]:
+    return {
+        world: {
+            'with': _number(tables[CLEAN][world]['riccati'].configuration_rmse_m, 3),
+            'without': _number(columns['riccati'].configuration_rmse_m, 3),
+        }
+        for world, columns in tables[NO_IDS].items()
+    }
+
+
+def _consistency(columns: dict[str, Consistency]) -> dict[str, dict[str, str]]:
+    """Return, for each estimator, how often its pose is in the band, and its ANEES' range."""
+    rows = {}
+    for name, consistency in columns.items():
+        lower, upper = consistency.band
+        pose, landmarks = consistency.pose, consistency.landmarks
+        rows[name] = {
+            'inside': f'{consistency.inside} of {len(pose)} in {lower:.2f}–{upper:.2f}',
+            'pose': f'{pose.mean():.2f} ({pose.min():.2f}–{pose.max():.2f})',
+            'landmarks': f'{landmarks.mean():.2f} ({landmarks.min():.2f}–{landmarks.max():.2f})',
+        }
+    return rows
+
+
+def _summary(results: Results) -> dict[str, dict[str, str]]:
+    """Return what the project aims at, beside what was measured."""
+    clean = results.tables[CLEAN]
+    groups = {'Starry Night': [STARRY_NIGHT] if STARRY_NIGHT in clean else []}
+    groups['MRCLAM 6, mean'] = _mrclam(clean)
+    rows: dict[str, dict[str, str]] = {}
+    for group, worlds in groups.items():
+        if not worlds:
+            continue
+        for top, bottom, metric, aim in AIMS:
+            ratios = _values(clean, worlds, top, metric), _values(clean, worlds, bottom, metric)
+            ratio = float(ratios[0].mean() / ratios[1].mean())
+            label = f'{METRICS[metric][0].split(",")[0]}, {group}: {top} / {bottom}'
+            rows[label] = {'measured': _number(ratio, 3), 'aim': aim}
+    return rows
+
+
+def _draw_bars(axes: Axes, table: Table) -> None:
+    shown = (*DESIGNS, EKF, ISAM2)
+    places = np.arange(len(table))
+    width = 0.8 / len(shown)
+    for i, column in enumerate(shown):
+        heights = _values(table, table, column, 'configuration_rmse_m')
+        axes.bar(places + (i - 0.5 * (len(shown) - 1)) * width, heights, width, label=column)
+    axes.set_yscale('log')
+    axes.set_xticks(places, [world.replace(', ', '\n') for world in table], fontsize=8)
+    axes.set_ylabel('configuration error, m')
+    axes.legend(ncols=len(shown), fontsize=8, frameon=False)
+
+
+def _draw_consistency(axes: Axes, loop: str, columns: dict[str, Consistency]) -> None:
+    for name, consistency in columns.items():
+        axes.plot(consistency.times_s, consistency.pose, marker='.', label=name)
+        axes.axhspan(*consistency.band, color='#DDDDDD', zorder=0)
+    axes.set_yscale('log')
+    axes.set_xlabel('time, s')
+    axes.set_ylabel("pose's ANEES")
+    axes.set_title(f'{loop}; grey: 95 % of honest estimators', fontsize=9)
+    axes.legend(fontsize=8, frameon=False)

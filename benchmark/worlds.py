@@ -1,0 +1,288 @@
+"""What the estimators are compared on: real recordings and simulated worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
+from slam_observer_ros.recording.datasets.data_set import DataSet
+from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.recording.datasets.starry_night import load_starry_night
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.simulation import Scenario, Simulation
+from slam_observer_ros.types import FloatArray
+from slam_observer_ros.velocity_history import HeldVelocities
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+CONFIG_FOLDER = CHECKOUT / 'config'
+VELOCITY_RATE_HZ = 20
+SPEED = 0.5
+MAX_SEEN = 5
+DETECTED_SHARE = 0.7
+
+CIRCLE = Scenario(
+    duration=120.0,
+    observation_rate=10.0,
+    initial_bias=0.0,
+    angular_velocity_noise=0.1,
+    linear_velocity_noise=0.1,
+    point_noise=0.1,
+)
+"""Section VI's run with noise; its bias on the first sighting is an error that no model knows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """One run with its truth.
+
+    Attributes
+    ----------
+    settings : Settings
+        Noise figures that every estimator is given.
+    events : list of Event
+        In stamp order; at equal stamps the velocity comes first.
+    truth : Trajectory
+        True poses.
+    landmarks : LandmarkTruth
+        True landmarks.
+
+    """
+
+    settings: Settings
+    events: list[Event]
+    truth: Trajectory
+    landmarks: LandmarkTruth
+
+    def first(self, duration_s: float) -> World:
+        """Return only the beginning of the run."""
+        end_ns = self.events[0].stamp_ns + round(duration_s * 1e9)
+        return replace(self, events=[event for event in self.events if event.stamp_ns <= end_ns])
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A closed course of one lap with landmarks beside it, driven for a while.
+
+    Attributes
+    ----------
+    config : str
+        Name of the shipped configuration whose noise is simulated.
+    lap_s, duration_s : float
+        Seconds of one lap and of the run, at 0.5 m/s.
+    landmarks : int
+        How many there are.
+    max_range_m : float
+        How far the sensor sees. It looks at the nearest five, and misses three in ten of them.
+    observation_rate_hz : int
+        A divisor of the velocities' rate, 20 Hz.
+
+    """
+
+    config: str
+    lap_s: float
+    duration_s: float
+    landmarks: int
+    max_range_m: float
+    observation_rate_hz: int
+
+
+STEREO_LOOP = Loop('stereo_inertial', 300.0, 390.0, 100, 6.0, 5)
+WHEELED_LOOP = Loop('wheeled_bearing_range', 300.0, 390.0, 100, 6.0, 2)
+
+
+def names() -> list[str]:
+    """Return the names of all worlds, in the order of the tables; real ones if they are there."""
+    return [*(_RECORDED if data_folder().is_dir() else ()), *_SIMULATED]
+
+
+def load(name: str) -> World:
+    """Return the world of that name."""
+    return (_RECORDED | _SIMULATED)[name]()
+
+
+def data_folder() -> Path:
+    """Return the folder of the real recordings."""
+    return Path(os.environ.get('SLAM_OBSERVER_DATA', CHECKOUT.parent / 'shared' / 'data'))
+
+
+def shipped_settings(config: str) -> Settings:
+    """Return the settings of ``config/<config>.yaml``, with events used as they come."""
+    values = read_parameter_file(CONFIG_FOLDER / f'{config}.yaml')
+    names_known = {row.name for row in table(Settings)}
+    values = {name: value for name, value in values.items() if name in names_known}
+    return replace(from_parameters(Settings, values), reorder_window=0.0)
+
+
+def without_calibration(settings: Settings) -> Settings:
+    """Return settings that estimate neither scale nor bias of the velocity."""
+    zero = (0.0, 0.0, 0.0)
+    return replace(
+        settings,
+        angular_scale_error=zero,
+        linear_scale_error=zero,
+        angular_bias_error=zero,
+        linear_bias_error=zero,
+    )
+
+
+def mrclam(robot: int) -> World:
+    """Return a robot's run of MRCLAM 6."""
+    folder = data_folder() / 'mrclam' / 'MRCLAM_Dataset6'
+    return _recorded(load_mrclam(folder, robot), shipped_settings('wheeled_bearing_range'))
+
+
+def starry_night() -> World:
+    """Return Starry Night."""
+    data_set = load_starry_night(data_folder() / 'starry_night' / 'dataset3.mat')
+    return _recorded(data_set, shipped_settings('stereo_inertial'))
+
+
+def circle() -> World:
+    """Return the paper's circle with noise, whose figures the estimators know."""
+    simulation = Simulation(CIRCLE)
+    per_root_second = CIRCLE.velocity_rate**-0.5
+    settings = Settings(
+        reorder_window=0.0,
+        angular_velocity_noise=(CIRCLE.angular_velocity_noise * per_root_second,) * 3,
+        linear_velocity_noise=(CIRCLE.linear_velocity_noise * per_root_second,) * 3,
+        observation_model='cartesian',
+        point_noise=CIRCLE.point_noise,
+    )
+    arrivals = [delivery.event for delivery in simulation.deliveries()]
+    events = [event for event in arrivals if isinstance(event, VelocityEvent | ObservationEvent)]
+    stamps_ns = np.unique([event.stamp_ns for event in events])
+    truth = Trajectory(stamps_ns, simulation.pose(stamps_ns))
+    return World(settings, events, truth, simulation.landmark_truth(0))
+
+
+def drive(loop: Loop, settings: Settings, seed: int) -> World:
+    """Drive a loop with noise that is just what ``settings`` say.
+
+    Observations state their covariances, computed where the landmarks really are: computed where
+    a noisy sensor saw them they would be wrong, and no estimator could be consistent.
+    """
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(round(loop.duration_s * VELOCITY_RATE_HZ) + 1) / VELOCITY_RATE_HZ
+    course = _course(loop, t_s, settings.two_d_mode)
+    poses = se3.inverse(course[0]) @ course
+    stamps_ns = np.rint(t_s * 1e9).astype(np.int64)
+    points = se3.transform(se3.inverse(course[0]), _roadside(loop, settings.two_d_mode, rng))
+    landmarks = LandmarkTruth(np.arange(loop.landmarks), points)
+    velocities = _measured_velocities(poses, settings, rng)
+    events: list[Event] = []
+    for k, stamp_ns in enumerate(stamps_ns.tolist()):
+        events.append(VelocityEvent(stamp_ns, velocities[min(k, len(velocities) - 1)]))
+        if k % (VELOCITY_RATE_HZ // loop.observation_rate_hz) == 0:
+            seen = _look(stamp_ns, poses[k], landmarks, loop.max_range_m, rng)
+            if len(seen.ids):
+                events.append(_measured(seen, settings, rng))
+    return World(settings, events, Trajectory(stamps_ns, poses), landmarks)
+
+
+def _drive_shipped(loop: Loop) -> World:
+    return drive(loop, shipped_settings(loop.config), seed=0)
+
+
+def _recorded(data_set: DataSet, settings: Settings) -> World:
+    velocities = [
+        VelocityEvent(stamp_ns, body_velocity)
+        for stamp_ns, body_velocity in zip(
+            data_set.velocity_stamps_ns.tolist(), data_set.body_velocities, strict=True
+        )
+    ]
+    events: list[Event] = [*velocities, *data_set.observations]
+    events.sort(key=lambda event: event.stamp_ns)  # stable: velocities stay first
+    truth = Trajectory(data_set.truth_stamps_ns, data_set.true_poses)
+    return World(settings, events, truth, data_set.landmarks)
+
+
+def _course(loop: Loop, t_s: FloatArray, planar: bool) -> FloatArray:
+    """Return the poses (k, 4, 4) at times (k,): a wavy ring, in 3D also rising and banking."""
+    phi = 2.0 * math.pi * t_s / loop.lap_s
+    positions = _ring(loop, phi, planar)
+    ahead = _ring(loop, phi + 1e-4, planar) - positions
+    angles = np.zeros_like(positions)
+    angles[:, 2] = np.arctan2(ahead[:, 1], ahead[:, 0])
+    rotations = so3.exp(angles)
+    if not planar:
+        tilt = 0.2 * np.stack([np.sin(7.0 * phi), np.cos(5.0 * phi), np.zeros_like(phi)], axis=-1)
+        rotations = rotations @ so3.exp(tilt)
+    return se3.pose(rotations, positions)
+
+
+def _ring(loop: Loop, phi: FloatArray, planar: bool) -> FloatArray:
+    """Return points (k, 3) of the course at angles (k,)."""
+    mean_radius = SPEED * loop.lap_s / (2.0 * math.pi)
+    radius = mean_radius * (1.0 + 0.1 * np.sin(3.0 * phi))
+    height = np.zeros_like(phi) if planar else 0.05 * mean_radius * np.sin(4.0 * phi)
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), height], axis=-1)
+
+
+def _roadside(loop: Loop, planar: bool, rng: np.random.Generator) -> FloatArray:
+    """Return landmarks (n, 3), spread along the course and up to 3 m beside it."""
+    phi = 2.0 * math.pi * (np.arange(loop.landmarks) + rng.uniform(size=loop.landmarks))
+    offsets = rng.uniform(-3.0, 3.0, (loop.landmarks, 3))
+    points: FloatArray = _ring(loop, phi / loop.landmarks, planar) + offsets
+    return points * np.array([1.0, 1.0, 0.0]) if planar else points
+
+
+def _measured_velocities(
+    poses: FloatArray, settings: Settings, rng: np.random.Generator
+) -> FloatArray:
+    """Return the velocities (k − 1, 6) that lead from pose to pose, with white noise."""
+    dt_s = 1.0 / VELOCITY_RATE_HZ
+    velocities = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / dt_s
+    k = len(velocities)
+    held = HeldVelocities(velocities, [None] * k, np.full(k, dt_s), np.zeros(k))
+    variances = np.diagonal(NoiseModel(settings).motion(held), axis1=1, axis2=2) / dt_s**2
+    return velocities + np.sqrt(variances) * rng.standard_normal(velocities.shape)
+
+
+def _look(
+    stamp_ns: int,
+    pose: FloatArray,
+    landmarks: LandmarkTruth,
+    max_range_m: float,
+    rng: np.random.Generator,
+) -> ObservationEvent:
+    """Return where the landmarks that are seen really are, in the body frame."""
+    points = se3.transform(se3.inverse(pose), landmarks.world_points)
+    range_m = np.linalg.norm(points, axis=1)
+    nearest = np.argsort(range_m)[:MAX_SEEN]
+    seen = (range_m[nearest] <= max_range_m) & (rng.random(len(nearest)) < DETECTED_SHARE)
+    rows = np.sort(nearest[seen])
+    return ObservationEvent(stamp_ns, landmarks.ids[rows], points[rows])
+
+
+def _measured(
+    seen: ObservationEvent, settings: Settings, rng: np.random.Generator
+) -> ObservationEvent:
+    covariances = NoiseModel(settings).observation(seen)
+    roots = np.linalg.cholesky(covariances)
+    noise = (roots @ rng.standard_normal((len(seen.ids), 3, 1)))[:, :, 0]
+    if settings.two_d_mode:
+        noise[:, 2] = 0.0
+    return replace(seen, points=seen.points + noise, covariances=covariances)
+
+
+_RECORDED: dict[str, Callable[[], World]] = {
+    'Starry Night': starry_night,
+    **{f'MRCLAM 6, robot {robot}': partial(mrclam, robot) for robot in range(1, 6)},
+}
+
+_SIMULATED: dict[str, Callable[[], World]] = {
+    "the paper's circle with noise": circle,
+    'simulated loop, 3D stereo': partial(_drive_shipped, STEREO_LOOP),
+    'simulated loop, wheeled': partial(_drive_shipped, WHEELED_LOOP),
+}
