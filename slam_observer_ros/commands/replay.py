@@ -24,7 +24,12 @@ from slam_observer_ros.evaluation.plots import plot_errors, plot_map, plot_resid
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.map_file import read_map, write_map
-from slam_observer_ros.recording.reader import open_recording, Recording, Truth
+from slam_observer_ros.recording.reader import (
+    open_recording,
+    Recording,
+    TAG_FRAME_PREFIX,
+    Truth,
+)
 from slam_observer_ros.recording.topics import SelectedTopics, TopicNames
 from slam_observer_ros.replay import (
     Accuracy,
@@ -62,11 +67,24 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     for option, what in (
         ('--velocity-topic', 'Twist, TwistStamped, TwistWithCovarianceStamped or Odometry'),
-        ('--landmarks-topic', 'PointCloud or PointCloud2 with ids'),
+        ('--landmarks-topic', 'PointCloud or PointCloud2 with ids, or /tf with fiducials'),
         ('--pose-truth-topic', 'true pose'),
         ('--landmark-truth-topic', 'true landmarks'),
     ):
         topics.add_argument(option, metavar='TOPIC', help=what)
+    topics.add_argument(
+        '--base-frame',
+        metavar='FRAME',
+        help='frame whose pose is estimated; other sensors are placed in it by /tf_static '
+        '(default: that of the velocities)',
+    )
+    topics.add_argument(
+        '--tag-frame-prefix',
+        metavar='PREFIX',
+        default=TAG_FRAME_PREFIX,
+        help="fiducials on /tf: a tag's frame before its id (default: %(default)s); family:id "
+        'is known, too',
+    )
     parser.add_argument(
         '--load-map',
         type=Path,
@@ -116,10 +134,12 @@ def run(args: argparse.Namespace) -> None:
         if recording.warning:
             logger.warning('%s', recording.warning)
         selected = recording.find_topics(names)
-        _check_frames(recording, selected)
+        base_frame = _base_frame(args, recording, selected)
         truth = recording.truth(selected)
         events = show_progress(
-            recording.events(selected), 'replaying', recording.event_count(selected)
+            recording.events(selected, base_frame, args.tag_frame_prefix),
+            'replaying',
+            recording.event_count(selected),
         )
         result = replay(events, settings, truth, landmark_map)
         outcome = _outcome(recording, selected, result, truth)
@@ -132,14 +152,21 @@ def run(args: argparse.Namespace) -> None:
         _print_summary(args, selected, outcome)
 
 
-def _check_frames(recording: Recording, selected: SelectedTopics) -> None:
-    velocity_frame, landmarks_frame = recording.frames(selected)
-    if velocity_frame and landmarks_frame and velocity_frame != landmarks_frame:
+def _base_frame(args: argparse.Namespace, recording: Recording, selected: SelectedTopics) -> str:
+    """Return the base frame; warn of sensors whose place in it is unknown."""
+    frames = recording.frames(selected, args.tag_frame_prefix)
+    base_frame: str = args.base_frame or frames[0]
+    for frame, what in zip(frames, ('velocities', 'landmarks'), strict=True):
+        if not base_frame or frame in ('', base_frame) or recording.connects(base_frame, frame):
+            continue
         logger.warning(
-            'Velocities are in frame %s and landmarks in %s; they are taken to be the same.',
-            velocity_frame,
-            landmarks_frame,
+            'The %s are in frame %s, which /tf_static does not connect with %s; they are taken '
+            'to be the same.',
+            what,
+            frame,
+            base_frame,
         )
+    return base_frame
 
 
 def _outcome(

@@ -16,6 +16,7 @@ from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_f
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.nodes.transforms import TFMessage
 from slam_observer_ros.recording.detections import TagDetections
+from slam_observer_ros.recording.frames import insert_transforms
 from slam_observer_ros.recording.messages import (
     decode_transforms,
     ImuMessage,
@@ -82,14 +83,7 @@ class TopicTransforms:
                     f"malformed message on '{topic}' dropped: {error}", throttle_duration_sec=10.0
                 )
                 return
-            for transform in transforms:
-                self._buffer.insert(
-                    transform.frame_id,
-                    transform.child_frame_id,
-                    transform.stamp_ns,
-                    transform.pose,
-                    is_static=is_static,
-                )
+            insert_transforms(self._buffer, transforms, is_static=is_static)
 
         self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 import logging
@@ -13,9 +13,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from slam_observer_ros.errors import MessageError, RecordingError
+from slam_observer_ros.errors import MessageError, RecordingError, TransformError
 from slam_observer_ros.events import Event, LandmarkTruth, UNKNOWN_ID
+from slam_observer_ros.recording.detections import observed_tags
+from slam_observer_ros.recording.frames import event_in_frame, insert_transforms
 from slam_observer_ros.recording.messages import (
+    decode_transforms,
     LANDMARK_DECODERS,
     POSE_DECODERS,
     pose_matrices,
@@ -25,8 +28,17 @@ from slam_observer_ros.recording.messages import (
 )
 from slam_observer_ros.recording.point_clouds import has_ids, ObservationMessage
 from slam_observer_ros.recording.sources import open_source, RawMessage, Topic
-from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
+from slam_observer_ros.recording.topics import (
+    select_topics,
+    SelectedTopics,
+    TopicNames,
+    TRANSFORMS_TYPE,
+)
+from slam_observer_ros.transform_buffer import TransformBuffer
 from slam_observer_ros.types import FloatArray, IntArray
+
+TAG_FRAME_PREFIX = 'tag_'
+"""What a fiducial's frame is called before its id; ``family:id`` is known, too."""
 
 _NANOSECOND = 1e-9
 _logger = logging.getLogger(__name__)
@@ -123,16 +135,26 @@ class Recording:
         """Count the messages that :meth:`events` reads, for a progress bar."""
         return selected.velocity.count + selected.landmarks.count
 
-    def events(self, selected: SelectedTopics) -> Iterator[Event]:
+    def events(
+        self,
+        selected: SelectedTopics,
+        base_frame: str = '',
+        tag_frame_prefix: str = TAG_FRAME_PREFIX,
+    ) -> Iterator[Event]:
         """Yield velocities and observations in the order in which they were received.
 
         Stamps are those of the messages' headers; an unstamped Twist has its receive time.
-        Malformed messages are left out and counted in :attr:`malformed`.
+        Malformed messages are left out and counted in :attr:`malformed`. What is measured in
+        other frames than the base's is brought into it where /tf_static connects the two.
 
         Parameters
         ----------
         selected : SelectedTopics
             From :meth:`find_topics`.
+        base_frame : str
+            Frame of the robot; empty to leave all as it was measured.
+        tag_frame_prefix : str
+            Where landmarks come from /tf: name of a fiducial's frame before its id.
 
         Raises
         ------
@@ -140,17 +162,29 @@ class Recording:
             If the file turns out to be damaged.
 
         """
+        transforms = self._static_transforms() if base_frame else TransformBuffer()
         for raw in self._source.messages((selected.velocity, selected.landmarks)):
-            message = self._decoded(raw, _decode_event)
-            if message is not None:
-                yield message.event
+            messages = self._decoded(raw, lambda raw: _decode_events(raw, tag_frame_prefix))
+            for message in messages or ():
+                yield event_in_frame(base_frame, message, transforms)
 
-    def frames(self, selected: SelectedTopics) -> tuple[str, str]:
+    def frames(
+        self, selected: SelectedTopics, tag_frame_prefix: str = TAG_FRAME_PREFIX
+    ) -> tuple[str, str]:
         """Give the frames of the first velocity and of the first observation.
 
         A frame is empty if the message names none, as a Twist.
         """
-        return self._frame(selected.velocity), self._frame(selected.landmarks)
+        velocity_frame = self._frame(selected.velocity, tag_frame_prefix)
+        return velocity_frame, self._frame(selected.landmarks, tag_frame_prefix)
+
+    def connects(self, frame: str, other_frame: str) -> bool:
+        """Tell whether /tf_static says where one frame is in the other."""
+        try:
+            self._static_transforms().lookup(frame, other_frame, 0)
+        except TransformError:
+            return False
+        return True
 
     def truth(self, selected: SelectedTopics) -> Truth:
         """Read the true poses and landmarks.
@@ -190,9 +224,24 @@ class Recording:
     def _identifies(self, topic: Topic) -> bool:
         return self._first(topic, lambda raw: has_ids(raw.data, topic.message_type)) or False
 
-    def _frame(self, topic: Topic) -> str:
-        message = self._first(topic, _decode_event)
-        return message.frame_id if message else ''
+    def _frame(self, topic: Topic, tag_frame_prefix: str) -> str:
+        for raw in self._source.messages((topic,)):
+            with suppress(MessageError):
+                for message in _decode_events(raw, tag_frame_prefix):
+                    return message.frame_id
+        return ''
+
+    def _static_transforms(self) -> TransformBuffer:
+        buffer = TransformBuffer()
+        topics = [
+            topic
+            for topic in self.topics
+            if topic.message_type == TRANSFORMS_TYPE and topic.name.endswith('/tf_static')
+        ]
+        for raw in self._source.messages(topics):
+            messages = self._decoded(raw, lambda raw: decode_transforms(raw.data))
+            insert_transforms(buffer, messages or (), is_static=True)
+        return buffer
 
     def _true_poses(self, topic: Topic | None) -> tuple[IntArray, FloatArray]:
         messages: list[PoseMessage] = []
@@ -241,11 +290,15 @@ def open_recording(path: Path | str) -> Recording:
     return Recording(Path(path))
 
 
-def _decode_event(raw: RawMessage) -> VelocityMessage | ObservationMessage:
+def _decode_events(
+    raw: RawMessage, tag_frame_prefix: str
+) -> Sequence[VelocityMessage | ObservationMessage]:
+    if raw.topic.message_type == TRANSFORMS_TYPE:
+        return observed_tags(decode_transforms(raw.data), tag_frame_prefix)
     decoder = VELOCITY_DECODERS.get(raw.topic.message_type)
     if decoder is None:
-        return _decode_observation(raw)
-    return decoder(raw.data, raw.receive_stamp_ns)
+        return [_decode_observation(raw)]
+    return [decoder(raw.data, raw.receive_stamp_ns)]
 
 
 def _decode_observation(raw: RawMessage) -> ObservationMessage:

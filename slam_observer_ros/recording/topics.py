@@ -20,6 +20,10 @@ ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
 """Landmarks that an observer publishes, and does not measure."""
 
 
+TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
+"""Type of /tf, which holds landmarks if they are fiducials; taken only if chosen by name."""
+
+
 @dataclass(frozen=True, slots=True)
 class TopicNames:
     """Names that the user gives; None where the topic is to be found.
@@ -146,7 +150,8 @@ def _last_part(name: str) -> str:
 
 def _named(topics: Sequence[Topic], role: _Role, name: str) -> Topic:
     same_name = [topic for topic in topics if topic.name.strip('/') == name.strip('/')]
-    fitting = [topic for topic in same_name if topic.message_type in role.message_types]
+    types = {*role.message_types, *((TRANSFORMS_TYPE,) if role is _LANDMARKS else ())}
+    fitting = [topic for topic in same_name if topic.message_type in types]
     if fitting:
         return fitting[0]
     if same_name:
