@@ -77,6 +77,7 @@ class Observer:
         self.a: FloatArray = np.empty((0, 3))
         self.y_ref: FloatArray = np.empty((0, 3))
         self.u: FloatArray = np.empty((0, 3))
+        self._some_move = False
         self.shifts: FloatArray = np.empty((0, 3))
 
     @property
@@ -184,11 +185,13 @@ class Observer:
 
         """
         self.u[indices] = se3.rotate(self.A, velocities)
+        self._some_move = True
 
     def move_landmarks(self, duration_s: float) -> None:
         """Add R_Â v_i dt to â_i: the lift of the landmarks' own velocities (19)."""
-        self.a += self.u * duration_s
-        self.shifts += self.u * duration_s
+        if self._some_move:  # else this would cost O(n) at every step
+            self.a += self.u * duration_s
+            self.shifts += self.u * duration_s
 
     def correct(self, correction: Correction) -> None:
         """Move the state from the left by (D, d_i); see the module's text."""
@@ -197,6 +200,7 @@ class Observer:
         self.a[indices] = self.a[indices] @ D[:3, :3].T + correction.d
         if correction.u is not None:
             self.u[indices] = self.u[indices] @ D[:3, :3].T + correction.u
+            self._some_move = True
 
 
 def lyapunov(gain_k: FloatArray | float, r: FloatArray) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import tracemalloc
 
 from gain_worlds import drive, estimate
 from hypothesis import given
@@ -150,6 +151,21 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     # A rate's noise is taken to act at the piece's beginning, not throughout: hence 2 %.
     difference = np.linalg.norm(slam.gains.pose_covariance - expected)
     assert difference < 0.02 * np.linalg.norm(expected)
+
+
+def test_prediction_costs_the_same_however_large_the_map():
+    def peak_bytes(landmarks):
+        slam, rng = Filter(), np.random.default_rng(0)
+        slam.add(rng.normal(size=(landmarks, 3)), random_covariances(rng, landmarks, 3))
+        V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
+        tracemalloc.start()
+        slam.move(V, np.full(3, 0.1), Q)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    peak_bytes(5)  # what the first call alone needs
+    assert peak_bytes(500) < 2 * peak_bytes(5)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])

@@ -1,0 +1,212 @@
+"""Outliers: gross ones, at first sight, swapped ids, landmarks that move; Huber's weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gain_worlds import configuration_error_m, drive, estimate, position_error_m
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from strategies import generators
+
+from slam_observer_ros.gains.robust import (
+    block_diagonal,
+    huber_weights,
+    mahalanobis,
+    observation_weights,
+)
+from slam_observer_ros.settings import Settings
+
+designs = pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+modes = pytest.mark.parametrize('two_d_mode', [False, True])
+
+
+def random_problem(rng, m=4, k=3):
+    roots = rng.normal(size=(m, k, k))
+    noise = roots @ roots.swapaxes(1, 2) + 0.1 * np.eye(k)
+    root = rng.normal(size=(m * k, m * k))
+    return rng.normal(size=(m, k)), root @ root.T, noise
+
+
+def body_shift(world, event, world_shift):
+    return world.true_pose(event.stamp_ns)[:3, :3].T @ np.array(world_shift)
+
+
+@given(generators(), st.floats(0.5, 4.0))
+def test_huber_weights_are_one_within_the_threshold_and_fall_off_beyond(rng, threshold):
+    r, _, noise = random_problem(rng, m=20)
+    distances, weights = mahalanobis(r, noise), huber_weights(r, noise, threshold)
+    within = distances <= threshold
+    np.testing.assert_array_equal(weights[within], 1.0)
+    np.testing.assert_allclose(weights[~within] * distances[~within], threshold)
+
+
+@given(generators())
+def test_threshold_zero_is_plain_least_squares(rng):
+    r, predicted, noise = random_problem(rng)
+    settings = Settings(huber_threshold=0.0, rejection_distance=1e9)
+    weights = observation_weights(100.0 * r, predicted, noise, settings)
+    np.testing.assert_array_equal(weights, 1.0)
+
+
+@given(generators())
+def test_reweighted_least_squares_settles_on_hubers_estimate(rng):
+    """Weights are those of what is left of the residuals once the correction is made."""
+    r, predicted, noise = random_problem(rng)
+    r[0] *= 5.0
+    settings = Settings(huber_threshold=1.345, rejection_distance=1e9)
+    weights = observation_weights(r, 1e-3 * predicted, noise, settings)
+    R = block_diagonal(noise / weights[:, None, None])
+    left = (R @ np.linalg.solve(1e-3 * predicted + R, r.ravel())).reshape(r.shape)
+    np.testing.assert_allclose(weights, huber_weights(left, noise, 1.345), rtol=0.05)
+
+
+@given(generators(), st.integers(0, 3), st.sampled_from([2, 3]))
+def test_the_gate_rejects_the_one_observation_that_is_far_off(rng, outlier, k):
+    r, predicted, noise = random_problem(rng, k=k)
+    r[outlier] = 1e3
+    weights = observation_weights(0.1 * r, predicted, noise, Settings())
+    assert weights[outlier] == 0.0
+    assert np.all(np.delete(weights, outlier) > 0.0)
+
+
+@designs
+@modes
+def test_gross_outliers_do_not_throw_the_pose(gains, two_d_mode):
+    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+    clean, disturbed, rejected = [], [], 0
+    for seed in range(3):
+        world = drive(settings, 20.0, seed, seen=5)
+        random = np.random.default_rng(seed)
+
+        def throw(index, event, random=random):
+            """One point in twenty lies 3 to 20 m off, to any side."""
+            is_off = random.random((len(event.ids), 1)) < 0.05
+            sides = random.normal(size=event.points.shape)
+            shifts = random.uniform(3.0, 20.0) * sides / np.linalg.norm(sides, axis=1)[:, None]
+            return replace(event, points=event.points + is_off * shifts) if index else event
+
+        estimator = estimate(world.with_observations(throw), settings)
+        clean.append(configuration_error_m(estimate(world, settings), world))
+        disturbed.append(configuration_error_m(estimator, world))
+        rejected += estimator.counts['rejected_landmark']
+    assert rejected > 20
+    assert np.mean(disturbed) < 1.5 * np.mean(clean)
+
+
+@designs
+@modes
+def test_an_outlier_at_first_sight_does_not_survive(gains, two_d_mode):
+    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+    world = drive(settings, 20.0)
+    first = world.observations()[0].ids[0]
+
+    def throw(index, event):
+        is_off = (event.ids == first) & (index == 0)
+        return replace(event, points=event.points + is_off[:, None] * [8.0, -8.0, 0.0])
+
+    estimator = estimate(world.with_observations(throw), settings)
+    clean = estimate(world, settings)
+    assert estimator.counts['moved_landmark'] == 1
+    row = list(estimator.landmark_ids).index(first)
+    assert np.linalg.norm(estimator.world_points[row] - world.world_points[first]) < 0.6
+    assert position_error_m(estimator, world) < position_error_m(clean, world) + 0.2
+
+
+@designs
+def test_an_unconfirmed_landmark_gives_way_to_the_first_contradiction(gains):
+    """Seen twice at a wrong place and once at the right one, then out of view."""
+    settings = Settings(gains=gains, confirmations=3)
+    world = drive(settings, 5.0, landmarks=5, seen=5)
+
+    def throw(index, event):
+        is_off = (event.ids == 2) & (index < 2)
+        kept = (event.ids != 2) | (index < 3)
+        points = event.points + is_off[:, None] * body_shift(world, event, [8.0, -8.0, 0.0])
+        return replace(event, ids=event.ids[kept], points=points[kept])
+
+    estimator = estimate(world.with_observations(throw), settings)
+    row = list(estimator.landmark_ids).index(2)
+    assert np.linalg.norm(estimator.world_points[row] - world.world_points[2]) < 1.0
+
+
+@designs
+@modes
+def test_a_landmark_that_moved_is_recognised_and_started_anew(gains, two_d_mode, caplog):
+    settings = Settings(
+        gains=gains, two_d_mode=two_d_mode, hindsight_interval=10, hindsight_turn=0.0
+    )
+    world = drive(settings, 20.0, landmarks=5, seen=5)
+
+    def move(index, event):
+        shift = body_shift(world, event, [4.0, 3.0, 0.0])
+        has_moved = (event.ids == 2) & (index >= 40)
+        return replace(event, points=event.points + has_moved[:, None] * shift)
+
+    estimator = estimate(world.with_observations(move), settings)
+    clean = estimate(world, settings)
+    assert estimator.counts['moved_landmark'] == 1
+    assert estimator.counts['rejected_landmark'] >= settings.max_rejections
+    assert '[2]' in caplog.text
+    row = list(estimator.landmark_ids).index(2)
+    moved = world.world_points[2] + [4.0, 3.0, 0.0]
+    assert np.linalg.norm(estimator.world_points[row] - moved) < 1.0
+    assert position_error_m(estimator, world) < position_error_m(clean, world) + 0.2
+    assert estimator.landmark_counts[row] == len(world.observations()) - 40 - 4
+
+
+@designs
+@modes
+def test_swapped_ids_do_no_harm(gains, two_d_mode):
+    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+    world = drive(settings, 20.0, landmarks=5, seen=5)
+
+    def swap(index, event):
+        """Every tenth time two landmarks are taken for each other."""
+        if index % 10 != 5:
+            return event
+        ids = event.ids.copy()
+        ids[[0, 1]] = ids[[1, 0]]
+        return replace(event, ids=ids)
+
+    estimator = estimate(world.with_observations(swap), settings)
+    clean = estimate(world, settings)
+    assert estimator.counts['moved_landmark'] == 0
+    error_m, clean_m = (configuration_error_m(run, world) for run in (estimator, clean))
+    assert error_m < 1.3 * clean_m + 0.02
+
+
+@designs
+def test_outliers_at_ever_other_places_are_not_taken_for_a_landmark_that_moved(gains):
+    settings = Settings(gains=gains)
+    world = drive(settings, 20.0, landmarks=5, seen=5)
+    random = np.random.default_rng(0)
+
+    def scatter(index, event):
+        shifts = random.uniform(5.0, 30.0, 3) * random.choice([-1.0, 1.0], 3)
+        is_off = (event.ids == 2) & (index >= 20) & (index < 50)
+        return replace(event, points=event.points + is_off[:, None] * shifts)
+
+    estimator = estimate(world.with_observations(scatter), settings)
+    assert estimator.counts['rejected_landmark'] >= 30
+    assert estimator.counts['moved_landmark'] == 0
+    row = list(estimator.landmark_ids).index(2)
+    assert np.linalg.norm(estimator.world_points[row] - world.world_points[2]) < 0.6
+
+
+@designs
+def test_all_landmarks_moved_together_are_followed_again(gains):
+    """As when the robot was carried: none of them can be told from another by its residual."""
+    settings = Settings(gains=gains)
+    world = drive(settings, 25.0, landmarks=5, seen=5)
+
+    def carry(index, event):
+        shift = body_shift(world, event, [6.0, 0.0, 0.0]) * (index >= 40)
+        return replace(event, points=event.points + shift)
+
+    estimator = estimate(world.with_observations(carry), settings)
+    assert estimator.counts['moved_landmark'] >= 1
+    moved = replace(world, world_points=world.world_points + [6.0, 0.0, 0.0])
+    assert configuration_error_m(estimator, moved) < 1.0
