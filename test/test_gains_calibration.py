@@ -1,0 +1,172 @@
+"""Scale and bias of the velocity: found where they are looked for, left alone elsewhere."""
+
+from __future__ import annotations
+
+from gain_worlds import configuration_error_m, drive, estimate, true_velocities
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from strategies import generators
+
+from slam_observer_ros.axes import PLANAR, SPATIAL
+from slam_observer_ros.gains.base import Motion
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.prediction import initial_covariance, predict
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.settings import Settings
+
+EVERYTHING = Settings(
+    angular_scale_error=(0.1, 0.1, 0.1),
+    linear_scale_error=(0.1, 0.1, 0.1),
+    angular_bias_error=(0.01, 0.01, 0.01),
+    linear_bias_error=(0.1, 0.1, 0.1),
+)
+
+WHEELS = Settings(
+    two_d_mode=True,
+    angular_scale_error=(0.0, 0.0, 0.1),
+    linear_scale_error=(0.1, 0.0, 0.0),
+)
+WHEEL_SCALE = np.array([1.0, 1.0, 0.95, 1.05, 1.0, 1.0])
+
+GYROSCOPE = Settings(angular_bias_error=(0.05, 0.05, 0.05), angular_velocity_noise=(0.01,) * 3)
+GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
+
+
+def scale_and_bias(estimator):
+    """Estimated factors (6,) and biases (6,), as they are applied to a velocity."""
+    calibrated = estimator._slam.gains.calibrated
+    bias = calibrated(np.zeros((1, 6)))[0]
+    return calibrated(np.ones((1, 6)))[0] - bias, bias
+
+
+def deviations(estimator, count):
+    """Standard deviations of the ``count`` estimated entries."""
+    gains = estimator._slam.gains
+    return np.sqrt(np.diag(gains._P)[gains._p : gains._p + count])
+
+
+def with_gains(settings, gains):
+    return Settings(**{**vars(settings), 'gains': gains})
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('hindsight_interval', [0, 20])
+def test_a_wheels_scale_is_found_within_three_sigma(seed, hindsight_interval):
+    settings = Settings(**{**vars(WHEELS), 'hindsight_interval': hindsight_interval})
+    world = drive(settings, 60.0, seed, scale=WHEEL_SCALE)
+    estimator = estimate(world, settings)
+    found, bias = scale_and_bias(estimator)
+    sigma = deviations(estimator, 2)
+    errors = (found - WHEEL_SCALE)[[2, 3]]
+    assert np.all(np.abs(errors) < 3.0 * sigma)
+    assert np.all(sigma < 0.03)
+    np.testing.assert_array_equal(np.delete(found, [2, 3]), 1.0)
+    np.testing.assert_array_equal(bias, 0.0)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_gyroscopes_bias_is_found_within_three_sigma(seed):
+    world = drive(GYROSCOPE, 60.0, seed, bias=GYROSCOPE_BIAS)
+    estimator = estimate(world, GYROSCOPE)
+    scale, found = scale_and_bias(estimator)
+    sigma = deviations(estimator, 3)
+    assert np.all(np.abs(found - GYROSCOPE_BIAS)[:3] < 3.0 * sigma)
+    assert np.all(sigma < 0.01)
+    np.testing.assert_allclose(scale, 1.0)
+    np.testing.assert_array_equal(found[3:], 0.0)
+
+
+def test_scheduled_gains_find_them_too():
+    settings = with_gains(WHEELS, 'scheduled')
+    world = drive(settings, 60.0, scale=WHEEL_SCALE)
+    found, _ = scale_and_bias(estimate(world, settings))
+    np.testing.assert_allclose(found, WHEEL_SCALE, atol=0.025)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_calibration_makes_the_map_better_where_the_wheels_are_off(gains):
+    def mean_error_m(settings):
+        errors = []
+        for seed in range(4):
+            world = drive(settings, 30.0, seed, scale=WHEEL_SCALE, seen=2)
+            errors.append(configuration_error_m(estimate(world, settings), world))
+        return np.mean(errors)
+
+    off = Settings(gains=gains, two_d_mode=True)
+    assert mean_error_m(with_gains(WHEELS, gains)) < mean_error_m(off)
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
+    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+    estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
+    V = true_velocities(5, planar=False)
+    np.testing.assert_array_equal(estimator._slam.gains.calibrated(V), V)
+
+
+@pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 12), (PLANAR, 6)])
+def test_only_axes_of_the_motion_are_calibrated(axes, count):
+    calibration = Calibration(EVERYTHING, axes)
+    assert calibration.count == count
+    calibration.shift(np.full(count, 0.5))
+    fixed = np.setdiff1d(np.arange(6), axes.pose)
+    V = np.ones((1, 6))
+    np.testing.assert_array_equal(calibration.apply(V)[0, fixed], 1.0)
+    np.testing.assert_array_equal(calibration.apply(V)[0, axes.pose], 2.0)
+
+
+@given(generators(), st.sampled_from([SPATIAL, PLANAR]))
+def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
+    calibration, pieces, dt_s = Calibration(EVERYTHING, axes), 5, 0.01
+    V = np.zeros((pieces, 6))
+    V[:, axes.pose] = rng.normal(size=(pieces, len(axes.pose)))
+    start = se3.exp(axes.full_pose(rng.normal(size=len(axes.pose))))
+
+    def path(change):
+        calibration.shift(change)
+        steps = se3.exp(calibration.apply(V) * dt_s)
+        calibration.shift(-change)
+        poses = [start]
+        for step in steps:
+            poses.append(poses[-1] @ step)
+        return np.array(poses)
+
+    nominal = path(np.zeros(calibration.count))
+    motion = Motion(nominal, V, np.full(pieces, dt_s), np.zeros(pieces), np.zeros((pieces, 6, 6)))
+    Ad = se3.adjoint(nominal[:-1])[:, axes.pose]
+    F = calibration.sensitivity(Ad, motion)
+    h = 1e-6
+    for column, unit in enumerate(np.eye(calibration.count)):
+        error = se3.log(path(h * unit)[-1] @ se3.inverse(nominal[-1]))[axes.pose] / h
+        np.testing.assert_allclose(F[:, column], error, atol=0.03 * dt_s * pieces)
+
+
+def test_drift_lets_the_uncertainty_grow_with_time():
+    settings = Settings(
+        angular_bias_error=(0.0, 0.0, 0.02),
+        linear_scale_error=(0.1, 0.0, 0.0),
+        calibration_drift=0.5,
+    )
+    calibration = Calibration(settings, SPATIAL)
+    P = initial_covariance(SPATIAL, calibration)
+    still = Motion(
+        np.tile(np.eye(4), (5, 1, 1)),
+        np.zeros((4, 6)),
+        np.ones(4),
+        np.zeros(4),
+        np.zeros((4, 6, 6)),
+    )
+    predict(P, SPATIAL, calibration, still)
+    # Four seconds at half the initial standard deviation per √s: σ² (1 + 4 · 0.25).
+    np.testing.assert_allclose(np.diag(P)[6:], np.array([0.1, 0.02]) ** 2 * 2.0)
+
+
+def test_a_bias_that_drifts_is_followed():
+    settings = Settings(**{**vars(GYROSCOPE), 'calibration_drift': 0.3})
+    ramp = np.linspace(0.0, 1.0, round(60.0 / 0.05))[:, None] * GYROSCOPE_BIAS
+    world = drive(settings, 60.0, bias=ramp)
+    _, found = scale_and_bias(estimate(world, settings))
+    np.testing.assert_allclose(found[:3], GYROSCOPE_BIAS[:3], atol=0.02)
