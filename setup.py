@@ -24,6 +24,7 @@ setup(
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
         (f'share/{PACKAGE}/config', glob('config/*.yaml')),
         (f'share/{PACKAGE}/rviz', glob('rviz/*.rviz')),
+        (f'share/{PACKAGE}/foxglove', glob('foxglove/*.json')),
     ],
     zip_safe=True,
     python_requires='>=3.10,<3.14',
@@ -66,11 +67,13 @@ setup(
             'setuptools<80',  # later ones break colcon's --symlink-install
         ],
         'benchmark': ['gtsam'],
+        'docs': ['mkdocs', 'mkdocs-material'],
     },
     entry_points={
         'console_scripts': [
             f'slam-observer = {PACKAGE}.cli:main',
             f'observer_node = {PACKAGE}.nodes.observer_node:main',
+            f'lifecycle_observer_node = {PACKAGE}.nodes.lifecycle_observer_node:main',
             f'simulator_node = {PACKAGE}.nodes.simulator_node:main',
             f'demo = {PACKAGE}.nodes.demo:main',
         ],

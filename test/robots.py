@@ -34,8 +34,10 @@ class Robot:
         namespace='',
         frame_id='base_link',
         sensor_frame_id=None,
+        subscribers=True,
     ):
         self.ros = ros
+        self.subscribers = subscribers
         self.frame_id = frame_id
         self.sensor_frame_id = sensor_frame_id or frame_id
         self.twist_class = twist_class
@@ -44,7 +46,8 @@ class Robot:
         self.landmarks = ros.node.create_publisher(cloud_class, f'{namespace}/landmarks', 1000)
 
     def __enter__(self):
-        self.ros.wait_for_subscriber(self.twist, self.landmarks)
+        if self.subscribers:
+            self.ros.wait_for_subscriber(self.twist, self.landmarks)
         return self
 
     def __exit__(self, *_error):

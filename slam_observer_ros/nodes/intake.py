@@ -63,8 +63,10 @@ class Intake:
         Messages that did not become events, by reason.
     clocks : dict of str to ClockOffset
         How far off the stamps are, by input.
+    is_active : bool
+        Whether what comes in is looked at at all.
     is_paused : bool
-        Whether all that comes in is dropped.
+        Whether all that comes in is dropped and counted.
 
     """
 
@@ -92,6 +94,7 @@ class Intake:
             name: ClockOffset(round(settings.max_clock_offset * 1e9))
             for name in ('twist', 'imu', 'landmarks')
         }
+        self.is_active = False
         self.is_paused = False
 
     def add_velocity(self, message: VelocityMessage, receive_ns: int) -> None:
@@ -207,6 +210,8 @@ class Intake:
         return replace(measured, stamp_ns=stamp_ns)
 
     def _is_usable(self, source: str, stamp_ns: int, receive_ns: int) -> bool:
+        if not self.is_active:
+            return False
         if self.is_paused:
             self.dropped['paused'] += 1
             return False

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.timer import Timer
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.controls import Controls
 from slam_observer_ros.nodes.diagnostics import Diagnostics
+from slam_observer_ros.nodes.entities import Entities
 from slam_observer_ros.nodes.frames import BaseFrame, open_transforms
 from slam_observer_ros.nodes.initial_pose import InitialPose
 from slam_observer_ros.nodes.input_topics import open_inputs
@@ -45,7 +45,7 @@ class ObserverCore:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._before = _entities(node)
+        self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings)
         estimator_settings = read_settings(node, Settings)
         self._estimator = Estimator(estimator_settings)
@@ -60,7 +60,8 @@ class ObserverCore:
         InitialPose(node, settings.map_frame, self._estimator, self._outputs.begin_anew)
         Controls(node, self._estimator, self._intake, self._outputs.begin_anew)
         node.add_post_set_parameters_callback(self._apply_parameters)
-        self._create_timers(settings.publish_rate)
+        self._timers = self._create_timers(settings.publish_rate)
+        self.stop()
         # The clock forgets a handle that nobody holds.
         self._jump_handle = node.get_clock().create_jump_callback(
             JumpThreshold(
@@ -73,26 +74,39 @@ class ObserverCore:
             f'{estimator_settings.gains} gains'
         )
 
+    def start(self) -> None:
+        """Begin to use what comes in and to publish; a new core waits for this."""
+        self._intake.is_active = True
+        for timer in self._timers:
+            timer.reset()
+
+    def stop(self) -> None:
+        """Drop what comes in and publish nothing, until the next start."""
+        self._intake.is_active = False
+        self._intake.forget()
+        for timer in self._timers:
+            timer.cancel()
+
     def close(self) -> None:
         """Save the map if that was asked for, and take all away from the node again."""
         self._maps.save_at_end()
         self._jump_handle.unregister()
         self._node.remove_post_set_parameters_callback(self._apply_parameters)
-        for kind, entities in _entities(self._node).items():
-            for entity in entities - self._before[kind]:
-                getattr(self._node, f'destroy_{kind}')(entity)
+        self._entities.remove_new()
 
-    def _create_timers(self, publish_rate_hz: float) -> None:
+    def _create_timers(self, publish_rate_hz: float) -> list[Timer]:
         # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
         clock = Clock(clock_type=ClockType.STEADY_TIME)
-        for period_s, callback in (
-            (1.0 / publish_rate_hz, self._publish_state),
-            (OVERVIEW_PERIOD_S, self._outputs.publish_overview),
-            (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
-            (RETRY_PERIOD_S, self._intake.retry),
-            *((LOOK_PERIOD_S, source.look) for source in self._inputs),
-        ):
+        return [
             self._node.create_timer(period_s, callback, clock=clock)
+            for period_s, callback in (
+                (1.0 / publish_rate_hz, self._publish_state),
+                (OVERVIEW_PERIOD_S, self._outputs.publish_overview),
+                (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
+                (RETRY_PERIOD_S, self._intake.retry),
+                *((LOOK_PERIOD_S, source.look) for source in self._inputs),
+            )
+        ]
 
     def _publish_state(self) -> None:
         self._outputs.publish_state()
@@ -107,13 +121,3 @@ class ObserverCore:
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
         self._estimator.change_settings(read_settings(self._node, Settings))
-
-
-def _entities(node: Node) -> dict[str, set[Any]]:
-    """Return what a node communicates with, by kind."""
-    return {
-        'timer': set(node.timers),
-        'subscription': set(node.subscriptions),
-        'service': set(node.services),
-        'publisher': set(node.publishers),
-    }

@@ -22,6 +22,7 @@ class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         forward_logging(self.get_logger())
         declare_settings(self, Settings, ObserverNodeSettings)
         self._core = ObserverCore(self)
+        self._core.start()
 
     def destroy_node(self) -> None:
         """Save the map if that was asked for, and end."""

@@ -1,0 +1,37 @@
+"""What a node communicates with, so that parts of it can be taken away again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.node import Node
+
+
+class Entities:
+    """Remembers the publishers, subscriptions, services and timers of a node.
+
+    Parameters
+    ----------
+    node : Node
+        Node as it is now.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._known = self._present()
+
+    def remove_new(self) -> None:
+        """Destroy what the node has got since."""
+        for kind, entities in self._present().items():
+            for entity in entities - self._known[kind]:
+                getattr(self._node, f'destroy_{kind}')(entity)
+
+    def _present(self) -> dict[str, set[Any]]:
+        node = self._node
+        return {
+            'timer': set(node.timers),
+            'subscription': set(node.subscriptions),
+            'service': set(node.services),
+            'publisher': set(node.publishers),
+        }

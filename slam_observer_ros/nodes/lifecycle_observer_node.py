@@ -1,0 +1,82 @@
+"""The SLAM observer as a managed node, whose start and stop others command."""
+
+from __future__ import annotations
+
+import sys
+
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from slam_observer_ros.errors import SlamObserverError
+from slam_observer_ros.nodes.entities import Entities
+from slam_observer_ros.nodes.log_bridge import forward_logging
+from slam_observer_ros.nodes.observer_core import ObserverCore
+from slam_observer_ros.nodes.parameters import declare_settings
+from slam_observer_ros.nodes.runner import run
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.settings import Settings
+
+
+class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes untyped
+    """Estimates while it is active.
+
+    Configured, it has its topics, services and map; inactive, it drops what comes in and
+    publishes nothing; cleaned up, it has forgotten all but its parameters.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('observer_node')
+        forward_logging(self.get_logger())
+        declare_settings(self, Settings, ObserverNodeSettings)
+        self._core: ObserverCore | None = None
+
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Create all parts."""
+        entities = Entities(self)
+        try:
+            self._core = ObserverCore(self)
+        except SlamObserverError as error:
+            entities.remove_new()
+            self.get_logger().error(f'not configured: {error}')
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to estimate and to publish, or go on."""
+        if self._core is not None:
+            self._core.start()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Hold the estimate."""
+        if self._core is not None:
+            self._core.stop()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Save the map if that was asked for, and forget all."""
+        self._close()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Save the map if that was asked for, and end for good."""
+        self._close()
+        return TransitionCallbackReturn.SUCCESS
+
+    def destroy_node(self) -> None:
+        """End, whatever the state."""
+        self._close()
+        super().destroy_node()
+
+    def _close(self) -> None:
+        core, self._core = self._core, None
+        if core is not None:
+            core.close()
+
+
+def main() -> int:
+    """Run the managed node until it is asked to stop; return the exit code."""
+    return run(LifecycleObserverNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
