@@ -14,7 +14,12 @@ from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.localisation import enter_map, is_lost, start_in_map
+from slam_observer_ros.localisation import (
+    enter_map,
+    is_lost,
+    shape_covariances,
+    start_in_map,
+)
 from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
@@ -255,9 +260,17 @@ class Estimator:
 
     @property
     def landmark_map(self) -> LandmarkMap:
-        """The present map, as it can be saved and loaded."""
+        """The present map, as it can be saved and loaded.
+
+        Its covariances are those in its own frame: without the error of how it lies to where
+        the robot started, unless the frame is that of a map that was loaded.
+        """
+        in_own_frame = self._map is None
         return LandmarkMap(
-            self.landmark_ids, self.world_points, self.landmark_covariances, self.landmark_counts
+            self.landmark_ids,
+            self.world_points,
+            shape_covariances(self._slam) if in_own_frame else self.landmark_covariances,
+            self.landmark_counts,
         )
 
     @property

@@ -16,7 +16,7 @@ from slam_observer_ros.gains.fixed_map import FixedMapGains
 from slam_observer_ros.gains.gauge import fit_gauge, GaugeFit, JITTER_M2
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import block_diagonal
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.slam import Slam
@@ -88,6 +88,30 @@ def is_lost(slam: Slam, seen_ids: IntArray) -> bool:
     just_now = rejections[slam.landmarks.indices_of(seen_ids)]
     often = np.sum(rejections >= slam.settings.max_rejections) >= _axes(slam).point
     return not slam.is_mapping and bool(often and len(just_now) and just_now.all())
+
+
+def shape_covariances(slam: Slam) -> FloatArray | None:
+    """Return covariances (n, 3, 3) of the landmarks in a frame that is their own, world axes, m².
+
+    A map's frame starts where the robot did, and all landmarks share the error of how they lie to
+    that pose. Who loads the map knows it by its landmarks alone: what remains is the error of
+    its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.gains.gauge`. None
+    where the gains know no covariances.
+    """
+    n, axes, observer = len(slam.landmarks), _axes(slam), slam.observer
+    k, R = axes.point, observer.reference_pose[:3, :3]
+    P = slam.gains.joint_covariance(np.arange(n))
+    if slam.landmark_covariances is None or P is None or n == 0:
+        return slam.landmark_covariances
+    points = observer.y_ref + observer.a
+    G = axes.output_matrix(points - points.mean(axis=0)).reshape(n * k, -1)
+    fit = fit_gauge(G, P + JITTER_M2 * np.eye(n * k), np.zeros(n * k))
+    G_each = G.reshape(n, k, -1)
+    common = G_each @ np.linalg.pinv(fit.information, hermitian=True) @ so3.transpose(G_each)
+    own = np.zeros((n, 3, 3))
+    i = np.arange(n)
+    own[:, :k, :k] = P.reshape(n, k, n, k)[i, :, i] - common
+    return _without_negative(R @ own @ R.T)
 
 
 def find_transform(
@@ -182,6 +206,13 @@ def _find_frame(
         covariance = slam.settings.point_noise**2 * np.eye(axes.point * len(rows))
     covariances = known.covariances_or(slam.settings.map_noise)
     return find_transform(points, covariance, known.world_points, covariances, axes)
+
+
+def _without_negative(covariances: FloatArray) -> FloatArray:
+    """Return covariances (n, 3, 3) whose variances rounding has not made negative."""
+    variances, U = np.linalg.eigh(0.5 * (covariances + so3.transpose(covariances)))
+    clipped: FloatArray = (U * np.maximum(variances, 0.0)[:, None, :]) @ so3.transpose(U)
+    return clipped
 
 
 def _axes(slam: Slam) -> Axes:
