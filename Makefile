@@ -17,7 +17,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon benchmark-accuracy venv clean
+.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy venv clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
@@ -43,6 +43,11 @@ pytest: $(READY)  ## the tests alone
 colcon: $(READY)  ## build, install and test as a ROS workspace does
 	scripts/colcon_check.sh $(VENV)
 
+docs: $(READY)  ## write the tables anew, build the site into site/, check its links
+	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[docs]'
+	$(PYTHON_IN_VENV) scripts/write_docs.py
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --quiet --strict
+
 benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
@@ -54,5 +59,5 @@ $(READY): setup.py constraints.txt $(wildcard scripts/setup_venv.sh scripts/buil
 	touch $@
 
 clean:  ## remove all that make made, but demo_output
-	rm -rf $(VENV) build install log *.egg-info .hypothesis
+	rm -rf $(VENV) build install log site *.egg-info .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write the tables of the documentation: parameters from their typed tables, topics from the nodes.
+"""Write the documentation's tables: parameters from their typed tables, topics from the nodes.
 
 Between ``<!-- table: NAME -->`` and ``<!-- end -->`` a page holds what is generated here.
 """
@@ -36,14 +36,15 @@ BLOCK = re.compile(r'(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)', re.
 NAMESPACE = '/robot'
 SUBSCRIBE_AT_ONCE = ('velocity_type:=Twist', 'landmarks_type:=PointCloud2', 'use_imu:=true')
 OF_EVERY_NODE = ('/rosout', '/parameter_events', '/clock')
+PACKAGES_OF_EVERY_NODE = ('rcl_interfaces/', 'type_description_interfaces/')
 
 INPUTS = {
     'twist': 'the velocity of the robot in its own frame',
     'imu': 'the angular velocity, if `use_imu` is set; the linear one then comes from `twist`',
-    'landmarks': 'the landmarks seen at one instant in the sensor\'s frame, each with its id',
+    'landmarks': "the landmarks seen at one instant in the sensor's frame, each with its id",
     '/tf': 'where sensors are; `odom_frame` → `base_frame`; fiducials, if asked for',
     '/tf_static': 'where sensors are',
-    'initialpose': 'where the robot is in the map, as RViz\'s *2D Pose Estimate* gives it',
+    'initialpose': "where the robot is in the map, as RViz's *2D Pose Estimate* gives it",
     '~/set_pose': 'the same, for programs',
     '~/forget_landmark': 'the id of a landmark to forget',
 }
@@ -52,7 +53,7 @@ TYPE_PARAMETERS = {'twist': 'velocity_type', 'landmarks': 'landmarks_type'}
 """Inputs of several types, and the parameters that list these."""
 
 OUTPUTS = {
-    'odometry': 'pose in the map, velocity in the robot\'s frame',
+    'odometry': "pose in the map, velocity in the robot's frame",
     'pose': 'pose in the map with its covariance',
     'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
     'map': 'landmarks with ids; with covariances where the gains know them',
@@ -119,7 +120,8 @@ def main() -> int:
 def interface_of(make_node: Callable[[], Node], *parameters: str) -> Interface:
     """Start a node, and return what it has on its topics and services."""
     assignments = [argument for text in parameters for argument in ('-p', text)]
-    rclpy.init(args=['--ros-args', '-r', f'__ns:={NAMESPACE}', *assignments])
+    quiet = ['--log-level', 'warn', '--disable-external-lib-logs']
+    rclpy.init(args=['--ros-args', '-r', f'__ns:={NAMESPACE}', *quiet, *assignments])
     node = make_node()
     try:
         return Interface(
@@ -132,14 +134,16 @@ def interface_of(make_node: Callable[[], Node], *parameters: str) -> Interface:
                 if publisher.topic_name not in OF_EVERY_NODE
             },
             {
-                relative_name(subscription.topic_name, node): Topic(type_name(subscription.msg_type))
+                relative_name(subscription.topic_name, node): Topic(
+                    type_name(subscription.msg_type)
+                )
                 for subscription in node.subscriptions
                 if subscription.topic_name not in OF_EVERY_NODE
             },
             {
                 relative_name(service.srv_name, node): Topic(type_name(service.srv_type))
                 for service in node.services
-                if not type_name(service.srv_type).startswith(('rcl_', 'type_description'))
+                if not type_name(service.srv_type).startswith(PACKAGES_OF_EVERY_NODE)
             },
         )
     finally:
@@ -200,7 +204,8 @@ def topic_table(kind: str, topics: dict[str, Topic], texts: dict[str, str]) -> s
 def expect_same_names(found: Iterable[str], described: Iterable[str]) -> None:
     """Stop unless exactly those that the node has are described."""
     for name in sorted(set(found) ^ set(described)):
-        raise SystemExit(f'{name} {"has no text" if name in set(found) else "is gone"}: {__file__}')
+        what = 'has no text' if name in set(found) else 'is gone'
+        raise SystemExit(f'{name} {what}: {__file__}')
 
 
 def parameter_table(settings_class: type[Dataclass]) -> str:
