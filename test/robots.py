@@ -60,6 +60,12 @@ class Robot:
         elif isinstance(event, ObservationEvent):
             self.landmarks.publish(self._observation(event))
 
+    def send_zeros(self):
+        """Stand still for long enough that nothing is held back by the reorder window."""
+        for _ in range(3):
+            self.send(VelocityEvent(time.time_ns(), np.zeros(6)))
+            self.ros.spin_for(0.06)
+
     def run(self, scenario):
         """Publish a simulated run in real time; return its events in order of arrival."""
         start_ns, start_s = time.time_ns(), time.monotonic()

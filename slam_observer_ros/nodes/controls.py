@@ -62,6 +62,7 @@ class Controls:
         return response
 
     def _forget(self, message: Int64) -> None:
+        self._estimator.flush()  # else a sighting that is held back would bring it back
         was_known = self._estimator.forget(message.data)
         self._node.get_logger().info(
             f'landmark {message.data} is {"forgotten" if was_known else "not known"}'

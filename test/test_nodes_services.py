@@ -1,0 +1,232 @@
+"""Services, topics and diagnostics by which the observer is steered and watched."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+import os
+from pathlib import Path
+import re
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
+from node_processes import client, running
+import numpy as np
+import pytest
+from rclpy.serialization import serialize_message
+from robots import own_topics, pose_of, Robot, stamp_ns, TransformSender
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
+
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.nodes.conversions import header_message
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.recording.point_clouds import decode_point_cloud2
+from slam_observer_ros.simulation import Scenario
+
+pytestmark = pytest.mark.ros
+
+RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=0.6)
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def ros(ros_domain_id):
+    with client() as opened:
+        yield opened
+
+
+class Diagnostics:
+    """The latest status of a node."""
+
+    def __init__(self, ros, namespace):
+        self.ros = ros
+        self.namespace = namespace
+        self.messages = ros.collect(DiagnosticArray, '/diagnostics')
+
+    @property
+    def status(self):
+        own = [m.status[0] for m in self.messages if m.status[0].hardware_id == self.namespace]
+        return own[-1] if own else DiagnosticStatus()
+
+    @property
+    def values(self):
+        return {value.key: value.value for value in self.status.values}
+
+    def wait(self, condition, what):
+        self.ros.spin_until(lambda: condition(self), what)
+
+
+def ids(maps):
+    return sorted(decode_point_cloud2(serialize_message(maps[-1])).event.ids) if maps else []
+
+
+def test_paused_observer_holds_its_pose_and_counts_what_it_drops(ros, tmp_path):
+    poses = ros.collect(PoseWithCovarianceStamped, '/paused/pose')
+    diagnostics = Diagnostics(ros, '/paused')
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/paused'),
+        Robot(ros, namespace='/paused') as robot,
+    ):
+        robot.run(RUN)
+        assert ros.call(Trigger, '/paused/observer_node/pause', Trigger.Request()).success
+        ros.spin_for(0.2)
+        held = poses[-1]
+        poses.clear()
+        robot.run(RUN)
+        diagnostics.wait(lambda d: int(d.values.get('dropped: paused', 0)) > 10, 'the count')
+        assert diagnostics.status.level == DiagnosticStatus.WARN
+        assert 'paused' in diagnostics.status.message
+        assert not poses
+        ros.call(Trigger, '/paused/observer_node/resume', Trigger.Request())
+        robot.send_zeros()
+        ros.spin_until(lambda: poses, 'a pose')
+    # The velocity from before the pause is held for velocity_timeout at most.
+    assert poses[-1].pose.pose.position.x < held.pose.pose.position.x + 1.1
+
+
+def test_correction_of_the_odometry_holds_while_paused(ros, tmp_path):
+    if TFMessage is None:
+        pytest.skip('tf2_msgs is not installed')
+    transforms = ros.collect(TFMessage, '/parked/tf')
+    sender = TransformSender(ros, '/parked')
+    with (
+        running('observer_node', tmp_path / 'log', *own_topics('/parked')),
+        Robot(ros, namespace='/parked') as robot,
+    ):
+        ros.wait_for_subscriber(sender.dynamic)
+
+        def corrections():
+            sent = [t for m in transforms for t in m.transforms]
+            return [t for t in sent if t.header.frame_id == 'map']
+
+        start_ns = time.time_ns()
+        for step in range(20):
+            stamp = start_ns + step * SECOND // 20
+            sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=stamp)
+            robot.send(VelocityEvent(stamp, np.array([0.0, 0, 0, 1.0, 0, 0])))
+            ros.spin_for(0.05)
+        ros.spin_until(corrections, 'a correction')
+        ros.call(Trigger, '/parked/observer_node/pause', Trigger.Request())
+        ros.spin_for(0.3)
+        before = corrections()[-1]
+        ros.spin_for(0.5)
+        after = corrections()[-1]
+    assert stamp_ns(after) > stamp_ns(before)
+    np.testing.assert_array_equal(pose_of(after.transform), pose_of(before.transform))
+    stamps = [stamp_ns(t) for t in corrections()]
+    assert len(set(stamps)) == len(stamps)
+
+
+def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
+    maps = ros.collect(PointCloud2, '/forgetful/map', LATCHED_QOS)
+    forget = ros.node.create_publisher(Int64, '/forgetful/observer_node/forget_landmark', 10)
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/forgetful') as node,
+        Robot(ros, namespace='/forgetful') as robot,
+    ):
+        robot.run(RUN)
+        ros.spin_until(lambda: ids(maps) == [0, 1, 2, 3], 'four landmarks')
+        ros.wait_for_subscriber(forget)
+        forget.publish(Int64(data=2))
+        forget.publish(Int64(data=77))
+        node.wait_for_output('landmark 2 is forgotten')
+        node.wait_for_output('landmark 77 is not known')
+        robot.send_zeros()
+        ros.spin_until(lambda: ids(maps) == [0, 1, 3], 'three landmarks')
+        robot.send(ObservationEvent(time.time_ns(), np.array([2]), np.ones((1, 3))))
+        robot.send_zeros()
+        ros.spin_until(lambda: ids(maps) == [0, 1, 2, 3], 'it again')
+
+
+def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
+    diagnostics = Diagnostics(ros, '/watched')
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/watched'),
+        Robot(ros, namespace='/watched') as robot,
+    ):
+        robot.run(Scenario(velocity_rate=40.0, observation_rate=20.0, duration=3.0))
+        diagnostics.wait(lambda d: float(d.values['/watched/twist rate [Hz]']) > 5.0, 'a rate')
+        values = diagnostics.values
+        assert float(values['/watched/landmarks rate [Hz]']) > 2.0
+        assert float(values['/watched/twist age [s]']) < 30.0
+        assert values['landmarks known'] == values['known landmarks seen last'] == '4'
+        assert float(values['processing time, mean [ms]']) > 0.0
+        assert int(values['used: observation']) > 5
+        now_ns = time.time_ns()
+        bad = VelocityEvent(now_ns, np.full(6, np.nan))
+        diagnostics.wait(
+            lambda d: robot.send(bad) or d.status.level == DiagnosticStatus.ERROR,
+            'an error while nothing can be used',
+        )
+        assert int(diagnostics.values['dropped: not_finite']) > 0
+
+
+SENT = {
+    '/idle': (),
+    '/blind': ('twist',),
+    '/numb': ('landmarks',),
+}
+
+
+def test_what_is_missing_is_said_once_with_topic_and_type(ros, tmp_path):
+    with ExitStack() as stack:
+        nodes, robots = {}, {}
+        for namespace in SENT:
+            log = tmp_path / namespace.strip('/')
+            node = running('observer_node', log, '-r', f'__ns:={namespace}')
+            nodes[namespace] = stack.enter_context(node)
+            robots[namespace] = OneSidedRobot(ros, namespace, SENT[namespace])
+        ros.spin_until(
+            lambda: all(
+                robots[namespace].send() or is_told(node, namespace)
+                for namespace, node in nodes.items()
+            ),
+            'all to be told',
+        )
+        busy_s = {namespace: cpu_seconds(node) for namespace, node in nodes.items()}
+        ros.spin_for(2.0)
+        for namespace, node in nodes.items():
+            assert cpu_seconds(node) - busy_s[namespace] < 1.0, 'it burns CPU'
+            said = re.findall('nothing publishes on', node.output)
+            assert len(said) == 2 - len(SENT[namespace])
+
+
+WANTED = {'twist': r'geometry_msgs/msg/TwistStamped', 'landmarks': r'sensor_msgs/msg/PointCloud2'}
+
+
+def is_told(node, namespace):
+    return all(
+        re.search(
+            rf"nothing publishes on '{namespace}/{topic}' \({wanted} .*is needed\)", node.output
+        )
+        for topic, wanted in WANTED.items()
+        if topic not in SENT[namespace]
+    )
+
+
+class OneSidedRobot:
+    """A robot of whose topics some have no publisher."""
+
+    def __init__(self, ros, namespace, topics):
+        self.ros = ros
+        self.publishers = [
+            ros.node.create_publisher(
+                TwistStamped if topic == 'twist' else PointCloud2, f'{namespace}/{topic}', 10
+            )
+            for topic in topics
+        ]
+
+    def send(self):
+        header = header_message(time.time_ns(), 'base_link')
+        for publisher in self.publishers:
+            publisher.publish(publisher.msg_type(header=header))
+        self.ros.spin_for(0.02)
+
+
+def cpu_seconds(node):
+    stat = Path(f'/proc/{node.process.pid}/stat').read_text()
+    fields = stat.rsplit(')', 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
