@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import logging
 
 import numpy as np
 
 from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.estimates import Hindsight, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
@@ -33,55 +34,6 @@ MAX_PENDING_VELOCITIES = 64
 """Velocities that may wait for an observation before the state is moved on without one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Update:
-    """The state right after an observation was used.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the state, nanoseconds.
-    pose : FloatArray
-        (4, 4) estimated pose, body to world.
-    ids : IntArray
-        (m,) ids of the known landmarks that were seen.
-    residuals : FloatArray
-        (m, 3) their residuals r_i before the correction, metres, along the world's axes.
-    lyapunov : float
-        L (34) of these residuals.
-
-    """
-
-    stamp_ns: int
-    pose: FloatArray
-    ids: IntArray
-    residuals: FloatArray
-    lyapunov: float
-
-
-@dataclass(frozen=True, slots=True)
-class Hindsight:
-    """Trajectory and map, each pose estimated from all that was seen before and after.
-
-    Attributes
-    ----------
-    stamps_ns : IntArray
-        (s,) stamps of the observations, nanoseconds.
-    poses : FloatArray
-        (s, 4, 4) poses at these stamps, body to world.
-    world_points : FloatArray
-        (n, 3) landmarks, metres, world.
-    ids : IntArray
-        (n,) their ids.
-
-    """
-
-    stamps_ns: IntArray
-    poses: FloatArray
-    world_points: FloatArray
-    ids: IntArray
-
-
 class Estimator:
     """Pose and landmark map from time-stamped velocities and observations.
 
@@ -103,7 +55,8 @@ class Estimator:
         Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``),
         observations made before the place in a loaded map was found (``'not_localised'``), how
         often it was lost again (``'lost'``), and what became of landmarks
-        (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``).
+        (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``, and
+        ``'unknown_id'``, which are not used).
     dropped : Counter
         Events refused, by reason.
 
@@ -240,7 +193,8 @@ class Estimator:
             If the gain design keeps no history.
 
         """
-        return Hindsight(*self._slam.smooth(), self._slam.landmarks.ids)
+        stamps_ns, poses, world_points = self._slam.smooth()
+        return Hindsight(stamps_ns, poses, world_points[self._slam.confirmed], self.landmark_ids)
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""
@@ -265,11 +219,12 @@ class Estimator:
         Its covariances are those in its own frame: without the error of how it lies to where
         the robot started, unless the frame is that of a map that was loaded.
         """
-        in_own_frame = self._map is None
+        slam = self._slam
+        covariances = shape_covariances(slam) if self._map is None else slam.landmark_covariances
         return LandmarkMap(
             self.landmark_ids,
             self.world_points,
-            shape_covariances(self._slam) if in_own_frame else self.landmark_covariances,
+            None if covariances is None else covariances[slam.confirmed],
             self.landmark_counts,
         )
 
@@ -316,29 +271,30 @@ class Estimator:
 
     @property
     def landmark_ids(self) -> IntArray:
-        """(n,) ids of the known landmarks."""
-        return self._slam.landmarks.ids
+        """(n,) ids of the landmarks in the map: those seen ``confirmations`` times or more."""
+        return self._slam.landmarks.ids[self._slam.confirmed]
 
     @property
     def landmark_counts(self) -> IntArray:
         """(n,) number of observations of each landmark."""
-        return self._slam.landmarks.counts
+        return self._slam.landmarks.counts[self._slam.confirmed]
 
     @property
     def world_points(self) -> FloatArray:
         """(n, 3) estimated landmarks, metres, world."""
-        return self._slam.observer.world_points
+        return self._slam.observer.world_points[self._slam.confirmed]
 
     @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
-        return self._slam.landmark_covariances
+        covariances = self._slam.landmark_covariances
+        return None if covariances is None else covariances[self._slam.confirmed]
 
     @property
     def landmark_velocities(self) -> FloatArray:
         """(n, 3) velocities of landmarks that move, known or estimated, m/s, world."""
         observer = self._slam.observer
-        return se3.rotate(observer.reference_pose, observer.u)
+        return se3.rotate(observer.reference_pose, observer.u[self._slam.confirmed])
 
     @property
     def last_update(self) -> Update | None:

@@ -10,7 +10,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.riccati import RiccatiGains
@@ -62,6 +62,15 @@ class Slam:
         self._counts = counts
         self._noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
+
+    @property
+    def confirmed(self) -> IntArray:
+        """Rows of the landmarks seen often enough to be in the map.
+
+        One that was seen once or twice may still be an outlier; it helps to tell the pose, but
+        nobody is told of it.
+        """
+        return np.flatnonzero(self.landmarks.counts >= self.settings.confirmations)
 
     @property
     def landmark_covariances(self) -> FloatArray | None:
@@ -144,6 +153,10 @@ class Slam:
             (m, 3) their residuals before the correction, metres, reference frame.
 
         """
+        identified = event.ids != UNKNOWN_ID
+        if not identified.all():
+            self._counts['unknown_id'] += int(np.sum(~identified))
+            event = _select(event, identified)
         rows = self.landmarks.indices_of(event.ids)
         known = rows >= 0
         if not self.is_mapping:

@@ -38,7 +38,8 @@ def observation(time_s, ids=range(5), noise=None):
 
 
 def run(events, **changes):
-    estimator = Estimator(Settings(**changes))
+    """Run events; landmarks are in the map from their first sighting unless changed."""
+    estimator = Estimator(Settings(**{'confirmations': 1, **changes}))
     for event in events:
         estimator.add(event)
     estimator.flush()
@@ -68,6 +69,12 @@ def test_first_sight_initialises_a_landmark_from_the_current_pose():
     estimator = run([velocity(0.0), observation(1.0, [2])], velocity_timeout=5.0)
     np.testing.assert_allclose(estimator.world_points, LANDMARKS[[2]], atol=1e-9)
     np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
+
+
+def test_a_landmark_is_in_the_map_once_it_was_seen_often_enough():
+    events = [velocity(0.0), *(observation(0.1 * step, [2]) for step in range(3))]
+    assert len(run(events[:3], confirmations=3).landmark_ids) == 0
+    np.testing.assert_allclose(run(events, confirmations=3).world_points, LANDMARKS[[2]])
 
 
 def test_seen_again_a_landmark_corrects_the_drift_of_the_velocity():
@@ -280,3 +287,12 @@ def test_told_of_a_jump_the_estimator_starts_again_at_once():
     assert len(estimator.landmark_ids) == 0
     assert estimator.stamp_ns is None
     assert estimator.add(velocity(-1e6))
+
+
+def test_points_without_id_are_counted_and_not_taken_for_one_landmark():
+    estimator = run([observation(0.0, [1, 2])])
+    event = observation(0.1, [1, 2, 3])
+    estimator.add(replace(event, ids=np.array([1, -1, -1])))
+    estimator.flush()
+    assert estimator.landmark_ids.tolist() == [1, 2]
+    assert estimator.counts['unknown_id'] == 2
