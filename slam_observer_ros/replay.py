@@ -15,7 +15,8 @@ import time
 
 import numpy as np
 
-from slam_observer_ros.estimator import Estimator, Hindsight, Update
+from slam_observer_ros.estimates import Hindsight, Update
+from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import (
     anchored_average_nees,

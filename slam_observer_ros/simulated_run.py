@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.estimator import Estimator, Update
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import PoseTruth
 from slam_observer_ros.observer import lyapunov

@@ -74,7 +74,9 @@ def test_first_sight_initialises_a_landmark_from_the_current_pose():
 def test_a_landmark_is_in_the_map_once_it_was_seen_often_enough():
     events = [velocity(0.0), *(observation(0.1 * step, [2]) for step in range(3))]
     assert len(run(events[:3], confirmations=3).landmark_ids) == 0
-    np.testing.assert_allclose(run(events, confirmations=3).world_points, LANDMARKS[[2]])
+    np.testing.assert_allclose(
+        run(events, confirmations=3).world_points, LANDMARKS[[2]], atol=1e-9
+    )
 
 
 def test_seen_again_a_landmark_corrects_the_drift_of_the_velocity():

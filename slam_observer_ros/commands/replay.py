@@ -18,7 +18,7 @@ from slam_observer_ros.commands.outputs import (
     check_plots,
     filled_directory,
 )
-from slam_observer_ros.estimator import Hindsight
+from slam_observer_ros.estimates import Hindsight
 from slam_observer_ros.evaluation.metrics import Report, TrajectoryErrors
 from slam_observer_ros.evaluation.plots import plot_errors, plot_map, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum

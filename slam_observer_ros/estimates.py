@@ -1,0 +1,56 @@
+"""What the estimator gives out: after each observation, and in hindsight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """The state right after an observation was used.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the state, nanoseconds.
+    pose : FloatArray
+        (4, 4) estimated pose, body to world.
+    ids : IntArray
+        (m,) ids of the known landmarks that were seen.
+    residuals : FloatArray
+        (m, 3) their residuals r_i before the correction, metres, along the world's axes.
+    lyapunov : float
+        L (34) of these residuals.
+
+    """
+
+    stamp_ns: int
+    pose: FloatArray
+    ids: IntArray
+    residuals: FloatArray
+    lyapunov: float
+
+
+@dataclass(frozen=True, slots=True)
+class Hindsight:
+    """Trajectory and map, each pose estimated from all that was seen before and after.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (s,) stamps of the observations, nanoseconds.
+    poses : FloatArray
+        (s, 4, 4) poses at these stamps, body to world.
+    world_points : FloatArray
+        (n, 3) landmarks, metres, world.
+    ids : IntArray
+        (n,) their ids.
+
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+    world_points: FloatArray
+    ids: IntArray
