@@ -1,0 +1,252 @@
+"""Maps of the real node: save, kill, load, localise; surveyed landmarks; ``/initialpose``."""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
+from nav_msgs.msg import Odometry
+from node_processes import client, NodeProcess, running
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from scipy.stats import chi2
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.nodes.conversions import (
+    header_message,
+    point_cloud2_message,
+    pose_covariance_field,
+    pose_message,
+    twist_message,
+)
+from slam_observer_ros.recording.map_file import read_map
+from slam_observer_ros.recording.messages import pose_matrices
+
+pytestmark = pytest.mark.ros
+
+NOISE_M = 0.02
+PARAMETERS = {
+    'observation_model': 'cartesian',
+    'point_noise': NOISE_M,
+    'reorder_window': 0.0,
+    'publish_rate': 200.0,
+}
+SURVEYED = """\
+format: slam_observer_ros map
+version: 1
+frame: map
+landmarks:
+"""
+
+
+@pytest.fixture
+def ros(ros_domain_id):
+    with client() as opened:
+        yield opened
+
+
+class Robot:
+    """Stands somewhere among 50 landmarks and tells what it sees."""
+
+    def __init__(self, ros):
+        self.ros = ros
+        self.random = np.random.default_rng(0)
+        self.points = self.random.uniform([-8, -8, 0], [8, 8, 3], (50, 3))
+        self.odometry = ros.collect(Odometry, '/odometry')
+        self.twist = ros.node.create_publisher(TwistStamped, '/twist', 100)
+        self.landmarks = ros.node.create_publisher(PointCloud2, '/landmarks', 100)
+        self.initialpose = ros.node.create_publisher(PoseWithCovarianceStamped, '/initialpose', 10)
+
+    def connect(self):
+        self.odometry.clear()
+        self.ros.wait_for_subscriber(self.twist, self.landmarks, self.initialpose)
+        return self
+
+    def see(self, pose, ids):
+        ids = np.array(list(ids), dtype=np.int64)
+        points = se3.transform(se3.inverse(pose), self.points[ids])
+        points += self.random.normal(scale=NOISE_M, size=points.shape)
+        twist = TwistStamped(header=header_message(time.time_ns(), 'base_link'))
+        twist.twist = twist_message(np.zeros(6))
+        self.twist.publish(twist)
+        self.ros.spin_for(0.1)
+        message = point_cloud2_message(time.time_ns(), 'base_link', ids, points)
+        self.landmarks.publish(message)
+        return message.header.stamp
+
+    def see_until_published(self, pose, ids):
+        """Look once, and return the pose published and its covariance, angles first."""
+        stamp = self.see(pose, ids)
+        self.ros.spin_until(
+            lambda: self.odometry and self.odometry[-1].header.stamp == stamp, 'its pose'
+        )
+        return as_pose(self.odometry[-1].pose)
+
+    def surveyed_file(self, path, ids=range(50)):
+        rows = [f'- {{id: {i}, position: {self.points[i].tolist()}, sigma: 0.01}}\n' for i in ids]
+        path.write_text(SURVEYED + ''.join(rows))
+        return path
+
+
+@pytest.fixture
+def robot(ros):
+    return Robot(ros)
+
+
+def as_pose(message):
+    p, q = message.pose.position, message.pose.orientation
+    pose = pose_matrices(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+    order = [3, 4, 5, 0, 1, 2]
+    return pose, message.covariance.reshape(6, 6)[np.ix_(order, order)]
+
+
+def nees(pose, covariance, true):
+    turn = so3.log(pose[:3, :3] @ true[:3, :3].T)
+    error = np.concatenate([turn, pose[:3, 3] - true[:3, 3]])
+    return error @ np.linalg.solve(covariance, error)
+
+
+def call(ros, service):
+    return ros.call(Trigger, f'/observer_node/{service}', Trigger.Request())
+
+
+def name_file(ros, path):
+    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(path))
+    request = SetParameters.Request(parameters=[Parameter(name='map_path', value=value)])
+    (result,) = ros.call(SetParameters, '/observer_node/set_parameters', request).results
+    assert result.successful, result.reason
+
+
+def initial_pose(pose, frame_id='map', variances=(0.01,) * 6):
+    message = PoseWithCovarianceStamped(header=header_message(time.time_ns(), frame_id))
+    message.pose.pose = pose_message(pose)
+    message.pose.covariance = pose_covariance_field(np.diag(variances))
+    return message
+
+
+def test_saved_killed_loaded_and_localised(ros, robot, tmp_path):
+    path = tmp_path / 'map.yaml'
+    first = NodeProcess('observer_node', tmp_path / 'log', map_path=path, **PARAMETERS)
+    try:
+        robot.connect()
+        for _ in range(5):
+            robot.see_until_published(np.eye(4), range(50))
+        answer = call(ros, 'save_map')
+        assert answer.success
+        assert answer.message == f"saved 50 landmarks in frame 'map' to {path}"
+    finally:
+        first.stop(signal.SIGKILL)
+    assert_allclose(read_map(path).world_points, robot.points, atol=5 * NOISE_M)
+    elsewhere = se3.exp(np.array([0.1, -0.2, 2.0, 3.0, -2.0, 0.5]))
+    # For some time a client takes the killed node for alive; a new one never hears of it.
+    with client() as ros, running(
+        'observer_node', tmp_path / 'log', map_file=path, **PARAMETERS
+    ) as node:
+        node.wait_for_output('loaded 50 landmarks from .*map.yaml; the pose is unknown until')
+        robot = Robot(ros).connect()
+        robot.see(elsewhere, [7, 31])
+        ros.spin_for(0.5)
+        assert not robot.odometry  # two landmarks don't tell where it is
+        pose, covariance = robot.see_until_published(elsewhere, [7, 31, 44])
+        assert nees(pose, covariance, elsewhere) < chi2.ppf(0.9973, 6)
+        node.wait_for_output('Found the place in the map')
+
+
+def test_a_fixed_surveyed_map_is_saved_at_the_end_as_it_was(ros, robot, tmp_path):
+    surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(0, 50, 2))
+    saved = tmp_path / 'saved.yaml'
+    maps = {'map_file': surveyed, 'map_path': saved, 'autosave_map': True}
+    pose = se3.exp(np.array([0.0, 0.0, -1.0, 1.0, 2.0, 0.0]))
+    with running(
+        'observer_node', tmp_path / 'log', localization_mode='fixed', **maps, **PARAMETERS
+    ):
+        robot.connect()
+        for _ in range(3):
+            estimate, _ = robot.see_until_published(pose, range(50))
+    assert_allclose(estimate, pose, atol=0.1)
+    before, after = read_map(surveyed), read_map(saved)
+    order = np.argsort(after.ids)
+    assert after.ids[order].tolist() == before.ids.tolist()
+    assert_allclose(after.world_points[order], before.world_points, atol=1e-9)
+
+
+def test_a_map_loaded_while_running_moves_the_estimate_into_its_frame(ros, robot, tmp_path):
+    surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(10))
+    pose = se3.exp(np.array([0.0, 0.0, 0.7, 1.0, 2.0, 0.0]))
+    with running('observer_node', tmp_path / 'log', **PARAMETERS):
+        robot.connect()
+        before, _ = robot.see_until_published(pose, range(20))
+        assert_allclose(before, np.eye(4), atol=1e-9)
+        name_file(ros, surveyed)
+        answer = call(ros, 'load_map')
+        assert answer.success
+        assert answer.message.endswith('the robot has found its place in it')
+        after, covariance = robot.see_until_published(pose, range(20))
+        assert nees(after, covariance, pose) < chi2.ppf(0.9973, 6)
+
+
+def test_the_initial_pose_places_the_robot_in_the_map(ros, robot, tmp_path):
+    surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml')
+    pose = se3.exp(np.array([0.0, 0.0, 0.5, -1.0, 2.0, 0.0]))
+    with running('observer_node', tmp_path / 'log', map_file=surveyed, **PARAMETERS) as node:
+        robot.connect()
+        robot.initialpose.publish(initial_pose(pose, frame_id='odom'))
+        node.wait_for_output("the pose given is not used: it is in frame 'odom', not 'map'")
+        robot.initialpose.publish(initial_pose(pose, variances=[np.nan] * 6))
+        node.wait_for_output('the pose given is not used: its covariance is not finite')
+        robot.initialpose.publish(initial_pose(pose, variances=(0, 0, 0.07, 0.25, 0.25, 0)))
+        node.wait_for_output(r'the robot is set to \(')
+        estimate, covariance = robot.see_until_published(pose, [3])
+        assert nees(estimate, covariance, pose) < chi2.ppf(0.9973, 6)
+
+
+def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    broken = tmp_path / 'broken.yaml'
+    broken.write_text('landmarks: []')
+    elsewhere = tmp_path / 'hall.yaml'
+    elsewhere.write_text(SURVEYED.replace('frame: map', 'frame: hall') + '  []')
+    with running('observer_node', tmp_path / 'log'):
+        assert call(ros, 'save_map').message == "no file is named: set the parameter 'map_path'"
+        for path, reason in (
+            (tmp_path / 'no.yaml', "can't read map .*no.yaml: No such file"),
+            (broken, 'map .*broken.yaml: it has no line'),
+            (elsewhere, "is in frame 'hall', and 'map_frame' is 'map'"),
+        ):
+            name_file(ros, path)
+            answer = call(ros, 'load_map')
+            assert not answer.success
+            assert re.search(reason, answer.message)
+        name_file(ros, tmp_path / 'no' / 'map.yaml')
+        assert "can't write map" in call(ros, 'save_map').message
+        name_file(ros, robot.surveyed_file(tmp_path / 'good.yaml'))
+        assert call(ros, 'load_map').success
+        answer = call(ros, 'save_map')
+        assert not answer.success
+        assert 'not known yet: nothing is saved' in answer.message
+        ros.spin_until(
+            lambda: any('place in the loaded map' in m.status[0].message for m in diagnostics),
+            'a diagnostic that tells it',
+        )
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'reason'),
+    [
+        ({'map_file': '/no/such/map.yaml'}, "can't read map /no/such/map.yaml"),
+        ({'autosave_map': True}, "'autosave_map' needs a file in 'map_path'"),
+    ],
+)
+def test_with_wrong_parameters_the_node_says_why_and_does_not_start(tmp_path, parameters, reason):
+    node = NodeProcess('observer_node', tmp_path / 'log', **parameters)
+    assert node.wait() == 2
+    assert reason in node.output
+    assert 'Traceback' not in node.output
