@@ -25,7 +25,7 @@ from rclpy.qos import DurabilityPolicy
 from slam_observer_ros.nodes.observer_node import ObserverNode
 from slam_observer_ros.nodes.settings import AUTO, ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.nodes.simulator_node import SimulatorNode
-from slam_observer_ros.parameters import Dataclass, Parameter, table
+from slam_observer_ros.parameters import Parameter, table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario
 
@@ -79,6 +79,26 @@ SIMULATED = {
     'ground_truth/pose': 'the true pose in `truth_frame`',
     'ground_truth/landmarks': 'the true landmarks in `truth_frame`',
 }
+
+
+MAIN_PARAMETERS = (
+    'gains',
+    'two_d_mode',
+    'angular_velocity_noise',
+    'linear_velocity_noise',
+    'observation_model',
+    'velocity_type',
+    'landmarks_type',
+    'map_frame',
+    'odom_frame',
+    'base_frame',
+    'sensor_frame',
+    'publish_tf',
+    'reorder_window',
+    'map_file',
+    'localization_mode',
+)
+"""What a new robot most often needs."""
 
 
 @dataclass(frozen=True)
@@ -171,10 +191,11 @@ def tables(observer: Interface, simulator: Interface) -> dict[str, str]:
         'outputs': topic_table('topic', observer.published, OUTPUTS),
         'services': topic_table('service', observer.services, SERVICES),
         'simulator-outputs': topic_table('topic', simulator.published, SIMULATED),
-        'estimator-parameters': parameter_table(Settings),
-        'observer-node-parameters': parameter_table(ObserverNodeSettings),
-        'scenario-parameters': parameter_table(Scenario),
-        'simulator-node-parameters': parameter_table(SimulatorNodeSettings),
+        'main-parameters': parameter_table(main_parameters()),
+        'estimator-parameters': parameter_table(table(Settings)),
+        'observer-node-parameters': parameter_table(table(ObserverNodeSettings)),
+        'scenario-parameters': parameter_table(table(Scenario)),
+        'simulator-node-parameters': parameter_table(table(SimulatorNodeSettings)),
     }
 
 
@@ -208,11 +229,17 @@ def expect_same_names(found: Iterable[str], described: Iterable[str]) -> None:
         raise SystemExit(f'{name} {what}: {__file__}')
 
 
-def parameter_table(settings_class: type[Dataclass]) -> str:
-    """Return the table of a settings dataclass."""
+def main_parameters() -> list[Parameter]:
+    """Return the rows of MAIN_PARAMETERS, in their order."""
+    rows = {row.name: row for row in (*table(Settings), *table(ObserverNodeSettings))}
+    return [rows[name] for name in MAIN_PARAMETERS]
+
+
+def parameter_table(parameters: Iterable[Parameter]) -> str:
+    """Return the table of parameters."""
     rows = [
         (f'`{row.name}`', f'`{default_text(row)}`', row.unit, row.range_text(), description(row))
-        for row in table(settings_class)
+        for row in parameters
     ]
     return markdown(('parameter', 'default', 'unit', 'range', 'what it is'), rows)
 
