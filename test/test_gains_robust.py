@@ -117,13 +117,13 @@ def test_an_outlier_at_first_sight_does_not_survive(gains, two_d_mode):
 
 @designs
 def test_an_unconfirmed_landmark_gives_way_to_the_first_contradiction(gains):
-    """Seen twice at a wrong place and once at the right one, then out of view."""
+    """Seen twice at a wrong place and three times at the right one, then out of view."""
     settings = Settings(gains=gains, confirmations=3)
     world = drive(settings, 5.0, landmarks=5, seen=5)
 
     def throw(index, event):
         is_off = (event.ids == 2) & (index < 2)
-        kept = (event.ids != 2) | (index < 3)
+        kept = (event.ids != 2) | (index < 5)
         points = event.points + is_off[:, None] * body_shift(world, event, [8.0, -8.0, 0.0])
         return replace(event, ids=event.ids[kept], points=points[kept])
 

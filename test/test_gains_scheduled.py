@@ -7,15 +7,20 @@ import tracemalloc
 
 from gain_worlds import configuration_error_m, drive, estimate, START_NS, STEP_NS
 from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from strategies import generators
 
+from slam_observer_ros.axes import SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.gains.base import Innovation
-from slam_observer_ros.gains.scheduled import ScheduledGains
+from slam_observer_ros.gains.robust import block_diagonal
+from slam_observer_ros.gains.scheduled import NOISE_INFLATION, ScheduledGains
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulated_run import run_simulation
@@ -65,31 +70,46 @@ def test_unseen_landmarks_stay_to_the_bit(two_d_mode):
     assert checked > 1000
 
 
-@given(generators())
-def test_the_gains_are_positive_so_a_residual_is_never_enlarged(rng):
-    n = int(rng.integers(1, 6))
-    gains = ScheduledGains(Settings(gains='scheduled', huber_threshold=0.0))
-    observer = Observer(np.eye(4))
-    roots = rng.normal(scale=0.2, size=(n, 3, 3))
-    covariances = roots @ roots.swapaxes(1, 2) + 1e-4 * np.eye(3)
-    points = rng.normal(scale=5.0, size=(n, 3))
-    observer.add_landmarks(points)
-    gains.set_pose_covariance(1e-3 * np.eye(6))
-    gains.add_landmarks(observer.y_ref, covariances)
-    moved = points + 1e-3 * rng.normal(size=points.shape)
-    everything = np.arange(n)
-    e, r = observer.errors(everything, moved)
-    correction, weights = gains.correct(Innovation(everything, e, r, observer.a, covariances, 0.1))
+@given(generators(), st.integers(1, 6))
+def test_one_step_is_that_of_a_kalman_filter_without_correlations(rng, n):
+    """Pose and landmarks move, and their covariances shrink, as if they had been independent."""
+    settings = Settings(gains='scheduled', huber_threshold=0.0, rejection_distance=1e9)
+    gains, observer = ScheduledGains(settings), Observer(np.eye(4))
+    observer.A = se3.exp(rng.normal(size=6))
+    observer.add_reference_landmarks(rng.normal(scale=5.0, size=(n, 3)))
+    observer.a = rng.normal(size=(n, 3))
+    P, L, R = covariances(rng, 1, 6)[0], covariances(rng, n, 3), covariances(rng, n, 3)
+    gains.set_pose_covariance(P)
+    gains.add_known_landmarks(L)
+    everything, points = np.arange(n), rng.normal(scale=5.0, size=(n, 3))
+    e, r = observer.errors(everything, points)
+    before = observer.y_ref + observer.a
+
+    prior = block_diag(P, *L)
+    C = np.hstack([SPATIAL.output_matrix(e + observer.a).reshape(-1, 6), -np.eye(3 * n)])
+    S = C @ prior @ C.T + NOISE_INFLATION**2 * block_diag(*R)
+    K = prior @ C.T @ np.linalg.inv(S)
+    x, posterior = K @ r.ravel(), prior - K @ C @ prior
+
+    correction, weights = gains.correct(Innovation(everything, e, r, observer.a, R, 0.1))
     observer.correct(correction)
     np.testing.assert_array_equal(weights, 1.0)
-    _, left = observer.errors(everything, moved)
-    # In the metric of the observations' noise, which the gains minimise.
-    information = np.linalg.inv(covariances)
-    assert cost(left, information) <= cost(r, information) * (1.0 + 1e-6)
+    np.testing.assert_allclose(correction.D, se3.exp(-x[:6]), atol=1e-9)
+    np.testing.assert_allclose(
+        observer.y_ref + observer.a, before - x[6:].reshape(n, 3), atol=1e-9
+    )
+    blocks = block_diagonal(covariances_of(posterior[6:, 6:], n))
+    np.testing.assert_allclose(gains.joint_covariance(everything), blocks, atol=1e-9)
 
 
-def cost(r, information):
-    return float(np.einsum('ij,ijk,ik', r, information, r))
+def covariances(rng, count, size):
+    roots = rng.normal(size=(count, size, size))
+    return roots @ roots.swapaxes(1, 2) / size + 0.1 * np.eye(size)
+
+
+def covariances_of(joint, n):
+    """The diagonal blocks (n, 3, 3) of a joint covariance."""
+    return joint.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
 
 @pytest.mark.parametrize('gains', DESIGNS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 from gain_worlds import (
     configuration_error_m,
@@ -20,6 +21,9 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.gains.base import Motion, Seen
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.history import History
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Frames, Prior, Smoother, Solution
@@ -167,6 +171,36 @@ def test_marginal_is_that_of_the_dense_inverse(problem):
     )
 
 
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
+    """A stretch without observations reaches the history in pieces."""
+    rng, d, k = np.random.default_rng(0), len(axes.pose), 6
+    settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
+    V, dt_s = np.zeros((k, 6)), np.full(k, 0.2)
+    V[:, axes.pose] = rng.normal(size=(k, d))
+    path = [np.eye(4)]
+    for motion in se3.exp(V * dt_s[:, None]):
+        path.append(path[-1] @ motion)
+    path, covariances = np.array(path), random_covariances(rng, k, 6, 0.1)
+
+    def frames(*cuts):
+        calibration = Calibration(settings, axes)
+        count = d + calibration.count
+        start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
+        history = History(axes, start)
+        for a, b in pairwise((0, *cuts, k)):
+            part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], np.zeros(b - a), covariances[a:b])
+            history.move(part, calibration)
+        nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        history.see(nothing, path[-1], np.empty((0, 3)))
+        return history.frames()
+
+    whole, parts = frames(), frames(1, 3)
+    np.testing.assert_allclose(parts.motions, whole.motions, atol=1e-12)
+    np.testing.assert_allclose(parts.motion_covariances, whole.motion_covariances, atol=1e-12)
+    np.testing.assert_allclose(parts.sensitivities, whole.sensitivities, atol=1e-12)
+
+
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_smoothing_a_run_without_noise_returns_the_truth(two_d_mode):
     settings = Settings(two_d_mode=two_d_mode)
@@ -177,6 +211,21 @@ def test_smoothing_a_run_without_noise_returns_the_truth(two_d_mode):
     np.testing.assert_allclose(
         hindsight.world_points, world.world_points[hindsight.ids], atol=1e-6
     )
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_in_hindsight_a_gross_outlier_counts_for_nothing(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
+    world = drive(settings, 10.0)
+
+    def throw(index, event):
+        is_off = (np.arange(len(event.ids)) == 1) & (index == 20)
+        return replace(event, points=event.points + is_off[:, None] * [30.0, -20.0, 0.0])
+
+    clean = estimate(world, settings).smooth()
+    disturbed = estimate(world.with_observations(throw), settings).smooth()
+    np.testing.assert_allclose(disturbed.poses, clean.poses, atol=2e-3)
+    np.testing.assert_allclose(disturbed.world_points, clean.world_points, atol=2e-3)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -254,7 +303,9 @@ def test_the_window_bounds_the_history_even_if_nothing_ever_turns():
 
 @pytest.mark.parametrize('window', range(41, 48))
 def test_a_landmark_that_moves_as_the_window_closes_stays_where_it_went(window):
-    settings = Settings(reorder_window=0.0, hindsight_window=window)
+    settings = Settings(
+        hindsight_window=window, hindsight_interval=5, hindsight_turn=0.0, confirmations=1
+    )
     world = drive(settings, 15.0, landmarks=4)
 
     def move(index, event):
