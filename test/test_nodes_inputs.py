@@ -1,0 +1,202 @@
+"""Every kind of input over real DDS; missing packages and deaf subscriptions are told."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+import importlib.util
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Pose, PoseArray, TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from node_processes import client, NodeProcess, running
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from robots import own_topics, Robot, stamp_ns, TransformSender
+from sensor_msgs.msg import Imu, PointCloud2
+
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.nodes.conversions import (
+    header_message,
+    point_message,
+    pose_message,
+    twist_message,
+    vector_message,
+)
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.recording.point_clouds import decode_point_cloud2
+
+pytestmark = pytest.mark.ros
+
+SECOND = 1_000_000_000
+STEP_NS = SECOND // 20
+STEPS = 30
+V = np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0])
+WRONG_TURN = np.array([0.0, 0.0, -0.8, 1.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope='module')
+def ros(ros_domain_id):
+    with client() as opened:
+        yield opened
+
+
+def true_pose(stamp_ns, start_ns):
+    return se3.exp(V * (stamp_ns - start_ns) * 1e-9)
+
+
+def odometry(stamp, start_ns, velocity=V):
+    message = Odometry(header=header_message(stamp, 'odom'), child_frame_id='base_link')
+    message.pose.pose = pose_message(true_pose(stamp, start_ns))
+    message.twist.twist = twist_message(velocity)
+    return message
+
+
+def twist_with_covariance(stamp, _start_ns):
+    message = TwistWithCovarianceStamped(header=header_message(stamp, 'base_link'))
+    message.twist.twist = twist_message(V)
+    message.twist.covariance = (np.eye(6) * 1e-4).ravel()
+    return message
+
+
+def imu(stamp, _start_ns):
+    message = Imu(header=header_message(stamp, 'base_link'))
+    message.angular_velocity = vector_message(V[:3])
+    return message
+
+
+# For each way of knowing the velocity: parameters, and what is published where.
+VELOCITY_INPUTS = {
+    '/twist_with_covariance': ({}, {'twist': (TwistWithCovarianceStamped, twist_with_covariance)}),
+    '/odometry_twist': ({}, {'twist': (Odometry, odometry)}),
+    '/pose_differences': (
+        {'velocity_source': 'pose_differences', 'reorder_window': 0.1},
+        {'twist': (Odometry, lambda stamp, start: odometry(stamp, start, np.zeros(6)))},
+    ),
+    '/wheels_and_imu': (
+        {'use_imu': True},
+        {
+            'imu': (Imu, imu),
+            'twist': (Odometry, lambda stamp, start: odometry(stamp, start, WRONG_TURN)),
+        },
+    ),
+}
+
+
+def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):
+    with ExitStack() as stack:
+        received, publishers = {}, []
+        for namespace, (parameters, topics) in VELOCITY_INPUTS.items():
+            log = tmp_path / namespace.strip('/')
+            arguments = own_topics(namespace)
+            stack.enter_context(running('observer_node', log, *arguments, **parameters))
+            received[namespace] = ros.collect(Odometry, f'{namespace}/odometry')
+            publishers += [
+                (ros.node.create_publisher(message_class, f'{namespace}/{topic}', 100), make)
+                for topic, (message_class, make) in topics.items()
+            ]
+        ros.wait_for_subscriber(*(publisher for publisher, _ in publishers))
+        start_ns = time.time_ns()
+        for step in range(STEPS):
+            stamp = start_ns + step * STEP_NS
+            for publisher, make in publishers:
+                publisher.publish(make(stamp, start_ns))
+                ros.spin_for(0.005)
+        last_ns = start_ns + (STEPS - 5) * STEP_NS
+        ros.spin_until(
+            lambda: all(m and stamp_ns(m[-1]) >= last_ns for m in received.values()), 'the end'
+        )
+    for namespace, messages in received.items():
+        pose = messages[-1].pose.pose.position
+        truth = true_pose(stamp_ns(messages[-1]), start_ns)
+        assert_allclose([pose.x, pose.y, pose.z], truth[:3, 3], atol=1e-6, err_msg=namespace)
+        assert_allclose(messages[-1].twist.twist.angular.z, V[2], atol=1e-6, err_msg=namespace)
+
+
+def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
+    if TFMessage is None:
+        pytest.skip('tf2_msgs is not installed')
+    maps = ros.collect(PointCloud2, '/tags/map', LATCHED_QOS)
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    poses = ros.node.create_publisher(PoseArray, '/nameless/landmarks', 10)
+    sender = TransformSender(ros, '/tags')
+    tagged = {'landmarks_type': 'tf', 'tag_frame_prefix': 'dock', 'odom_frame': "''"}
+    with (
+        running('observer_node', tmp_path / 'tags', *own_topics('/tags'), **tagged),
+        running('observer_node', tmp_path / 'nameless', *own_topics('/nameless')),
+        Robot(ros, namespace='/tags', subscribers=False) as robot,
+    ):
+        sender.send(('base_link', 'camera', se3.pose(np.eye(3), np.array([0.0, 0.0, 1.0]))))
+        ros.wait_for_subscriber(sender.dynamic, robot.twist, poses)
+        start_ns = time.time_ns()
+        for step in range(10):
+            stamp = start_ns + step * STEP_NS
+            robot.send(VelocityEvent(stamp, np.zeros(6)))
+            sender.send(
+                ('camera', 'tag36h11:3', se3.pose(np.eye(3), np.array([2.0, 0.0, 0.0]))),
+                ('camera', 'dock11', se3.pose(np.eye(3), np.array([0.0, 3.0, 0.0]))),
+                ('odom', 'base_link', np.eye(4)),
+                stamp_ns=stamp,
+            )
+            point = Pose(position=point_message(np.ones(3)))
+            header = header_message(stamp, 'base_link')
+            poses.publish(PoseArray(header=header, poses=[point]))
+            ros.spin_for(0.03)
+        ros.spin_until(lambda: len(seen(maps)) == 2, 'two fiducials')
+        ros.spin_until(lambda: counts(diagnostics, '/nameless').get('used: unknown_id'), 'a count')
+    assert set(seen(maps)) == {3, 11}
+    assert_allclose(seen(maps)[3], [2.0, 0.0, 1.0], atol=1e-6)
+    assert_allclose(seen(maps)[11], [0.0, 3.0, 1.0], atol=1e-6)
+
+
+def seen(maps):
+    if not maps:
+        return {}
+    event = decode_point_cloud2(serialize_message(maps[-1])).event
+    return dict(zip(event.ids.tolist(), event.points, strict=True))
+
+
+def counts(diagnostics, namespace):
+    statuses = [m.status[0] for m in diagnostics if m.status[0].hardware_id == namespace]
+    return {value.key: value.value for value in statuses[-1].values} if statuses else {}
+
+
+def test_optional_packages_are_named_when_they_are_missing(tmp_path):
+    packages = {'Detection3DArray': 'vision_msgs', 'AprilTagDetectionArray': 'apriltag_msgs'}
+    nodes = {
+        package: NodeProcess('observer_node', tmp_path / package, landmarks_type=landmarks_type)
+        for landmarks_type, package in packages.items()
+        if importlib.util.find_spec(package) is None
+    }
+    for package, node in nodes.items():
+        assert node.wait() == 2
+        assert f'apt install ros-jazzy-{package.replace("_", "-")}' in node.output
+        assert 'Traceback' not in node.output
+
+
+def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_path):
+    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    maps = ros.collect(PointCloud2, '/picky/map', LATCHED_QOS)
+    with (
+        running(
+            'observer_node', tmp_path / 'log', *own_topics('/picky'), landmarks_qos='reliable'
+        ) as node,
+        Robot(ros, namespace='/picky', subscribers=False) as robot,
+    ):
+        ros.node.destroy_publisher(robot.landmarks)
+        robot.landmarks = ros.node.create_publisher(PointCloud2, '/picky/landmarks', best_effort)
+        node.wait_for_output(r"'test_client' can't be heard on '/picky/landmarks'.*[Rr]eliab")
+        ros.node.destroy_publisher(robot.landmarks)
+        robot.landmarks = ros.node.create_publisher(PointCloud2, '/picky/landmarks', 10)
+        ros.wait_for_subscriber(robot.twist, robot.landmarks)
+        ros.spin_until(lambda: send_landmark(robot) or set(seen(maps)) == {5}, 'the landmark')
+
+
+def send_landmark(robot):
+    robot.send(ObservationEvent(time.time_ns(), np.array([5]), np.ones((1, 3))))
+    robot.send_zeros()

@@ -1,0 +1,201 @@
+"""Clocks: simulated, beginning at zero, looped, of another machine; and messages out of order."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+import time
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
+from node_processes import client, running
+import numpy as np
+from numpy.testing import assert_array_equal
+import pytest
+from rclpy.serialization import serialize_message
+from robots import Robot, stamp_ns
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.nodes.conversions import time_message
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.recording.point_clouds import decode_point_cloud2
+from slam_observer_ros.simulation import Scenario, Simulation
+
+pytestmark = pytest.mark.ros
+
+SECOND = 1_000_000_000
+RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=1.5, initial_bias=0.0)
+
+
+@pytest.fixture(scope='module')
+def ros(ros_domain_id):
+    with client() as opened:
+        yield opened
+
+
+@pytest.fixture(scope='module')
+def clock(ros):
+    publisher = ros.node.create_publisher(Clock, '/clock', 100)
+    yield lambda now_ns: publisher.publish(Clock(clock=time_message(now_ns)))
+    ros.node.destroy_publisher(publisher)
+
+
+def play(ros, robots, clock):
+    """Play a recording as `ros2 bag play --clock` does."""
+    for delivery in Simulation(RUN, SECOND).deliveries():
+        clock(delivery.arrival_ns)
+        for robot in robots:
+            robot.send(delivery.event)
+        ros.spin_for(0.005)
+
+
+def landmark_count(maps):
+    return len(decode_point_cloud2(serialize_message(maps[-1])).event.ids) if maps else 0
+
+
+def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
+    choices = ('reset', 'hold')
+    poses = {c: ros.collect(PoseWithCovarianceStamped, f'/{c}/pose') for c in choices}
+    maps = {c: ros.collect(PointCloud2, f'/{c}/map', LATCHED_QOS) for c in choices}
+    with ExitStack() as stack:
+        nodes = {}
+        for choice in choices:
+            parameters = {'use_sim_time': True, 'on_time_jump': choice}
+            arguments = ('-r', f'__ns:=/{choice}')
+            node = running('observer_node', tmp_path / choice, *arguments, **parameters)
+            nodes[choice] = stack.enter_context(node)
+        robots = [stack.enter_context(Robot(ros, namespace=f'/{choice}')) for choice in choices]
+        assert not any(poses.values()), 'published before the clock began'
+        play(ros, robots, clock)
+        ros.spin_until(lambda: all(landmark_count(m) == 4 for m in maps.values()), 'the maps')
+        ros.spin_for(0.2)
+        end_x = {choice: poses[choice][-1].pose.pose.position.x for choice in choices}
+        for messages in poses.values():
+            messages.clear()
+        play(ros, robots, clock)
+        for node in nodes.values():
+            node.wait_for_output('The clock has jumped')
+        ros.spin_until(
+            lambda: all(m and stamp_ns(m[-1]) > 2 * SECOND for m in poses.values()),
+            'the second run',
+        )
+    for choice in choices:
+        first = min(poses[choice], key=stamp_ns)
+        assert stamp_ns(first) < int(1.3 * SECOND)
+        output = nodes[choice].output
+        assert output.count('The clock has jumped') == 1, 'told by the clock and by the stamps'
+        assert 'Dropped' not in output
+        assert end_x[choice] > 1.0
+        if choice == 'reset':
+            assert first.pose.pose.position.x < 0.3
+        else:
+            assert landmark_count(maps[choice]) == 4
+            assert 'pose and map are held' in output
+
+
+def test_unstamped_velocity_waits_for_the_clock_to_begin(ros, clock, tmp_path):
+    poses = ros.collect(PoseWithCovarianceStamped, '/early/pose')
+    arguments = ('-r', '__ns:=/early', '-r', '/clock:=/early/clock')
+    own_clock = ros.node.create_publisher(Clock, '/early/clock', 10)
+    with (
+        running('observer_node', tmp_path / 'log', *arguments, use_sim_time=True) as node,
+        Robot(ros, twist_class=Twist, namespace='/early') as robot,
+    ):
+        for _ in range(3):
+            robot.send(VelocityEvent(0, np.zeros(6)))
+            ros.spin_for(0.05)
+        node.wait_for_output(r'no_clock.*/clock has not begun')
+        assert not poses
+        for step in range(1, 6):
+            own_clock.publish(Clock(clock=time_message(step * SECOND // 10)))
+            ros.spin_for(0.05)
+            robot.send(VelocityEvent(0, np.zeros(6)))
+            ros.spin_for(0.05)
+        ros.spin_until(lambda: poses, 'a pose')
+    assert 0 < stamp_ns(poses[0]) < SECOND
+
+
+def test_stamps_from_another_clock_are_reported_and_corrected_if_asked(ros, tmp_path):
+    poses = {
+        name: ros.collect(PoseWithCovarianceStamped, f'/{name}/pose')
+        for name in ('reported', 'corrected')
+    }
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    offset_ns = 100 * SECOND
+    with (
+        running('observer_node', tmp_path / '1', '-r', '__ns:=/reported') as reported,
+        running('observer_node', tmp_path / '2', '-r', '__ns:=/corrected',
+                correct_clock_offset=True) as corrected,
+        Robot(ros, namespace='/reported') as left,
+        Robot(ros, namespace='/corrected') as right,
+    ):  # fmt: skip
+        for _ in range(40):
+            for robot in (left, right):
+                robot.send(VelocityEvent(time.time_ns() - offset_ns, np.zeros(6)))
+            ros.spin_for(0.03)
+        for node in (reported, corrected):
+            node.wait_for_output(r"stamps of twist are 100\.\d+ s behind this machine's clock")
+            assert node.output.count('stamps of twist') == 1, 'not throttled'
+        ros.spin_until(
+            lambda: any('stamps of twist' in m.status[0].message for m in diagnostics),
+            'the warning',
+        )
+        lag_ns = {name: time.time_ns() - stamp_ns(poses[name][-1]) for name in poses}
+    assert abs(lag_ns['reported'] - offset_ns) < 30 * SECOND
+    assert abs(lag_ns['corrected']) < 30 * SECOND
+
+
+def test_a_stamp_that_was_left_out_is_the_time_of_reception(ros, tmp_path):
+    poses = ros.collect(PoseWithCovarianceStamped, '/bare/pose')
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/bare'),
+        Robot(ros, namespace='/bare') as robot,
+    ):
+        for _ in range(5):
+            message = TwistStamped()
+            assert message.header.stamp == Time()
+            robot.twist.publish(message)
+            ros.spin_for(0.06)
+        ros.spin_until(lambda: poses, 'a pose')
+    assert abs(time.time_ns() - stamp_ns(poses[-1])) < 60 * SECOND
+
+
+def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
+    scenario = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=1.0, point_noise=0.05)
+    start_ns = time.time_ns()
+    events = [
+        delivery.event
+        for delivery in Simulation(scenario, start_ns).deliveries()
+        if isinstance(delivery.event, VelocityEvent | ObservationEvent)
+    ]
+    lateness = np.random.default_rng(1).integers(0, SECOND // 5, len(events))
+    arrivals_ns = np.array([event.stamp_ns for event in events]) + lateness
+    last = [VelocityEvent(start_ns + 2 * SECOND, np.zeros(6))]
+    shuffled = [events[index] for index in np.argsort(arrivals_ns, kind='stable')]
+    orders = {'/ordered': [*events, *last], '/shuffled': [*shuffled, *last]}
+    end_ns = max(event.stamp_ns for event in events)
+    with ExitStack() as stack:
+        maps, robots = {}, {}
+        for name in orders:
+            maps[name] = ros.collect(PointCloud2, f'{name}/map', LATCHED_QOS)
+            arguments = ('-r', f'__ns:={name}')
+            log = tmp_path / name.strip('/')
+            stack.enter_context(running('observer_node', log, *arguments, reorder_window=0.3))
+        for name in orders:
+            robots[name] = stack.enter_context(Robot(ros, namespace=name))
+        for pair in zip(*orders.values(), strict=True):
+            for robot, event in zip(robots.values(), pair, strict=True):
+                robot.send(event)
+            ros.spin_for(0.004)
+        ros.spin_until(
+            lambda: all(m and stamp_ns(m[-1]) == end_ns for m in maps.values()), 'the end'
+        )
+    outcome = {
+        name.strip('/'): decode_point_cloud2(serialize_message(messages[-1])).event
+        for name, messages in maps.items()
+    }
+    assert_array_equal(outcome['ordered'].ids, outcome['shuffled'].ids)
+    assert_array_equal(outcome['ordered'].points, outcome['shuffled'].points)
+    assert_array_equal(outcome['ordered'].covariances, outcome['shuffled'].covariances)
