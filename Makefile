@@ -46,7 +46,7 @@ colcon: $(READY)  ## build, install and test as a ROS workspace does
 docs: $(READY)  ## write the tables anew, build the site into site/, check its links
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[docs]'
 	$(PYTHON_IN_VENV) scripts/write_docs.py
-	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
 benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
