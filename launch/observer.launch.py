@@ -22,11 +22,18 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'landmarks', default_value='landmarks', description='topic of the observations'
             ),
+            DeclareLaunchArgument(
+                'imu', default_value='imu', description='topic of the angular velocity'
+            ),
+            DeclareLaunchArgument(
+                'namespace', default_value='', description='namespace of the robot'
+            ),
             DeclareLaunchArgument('use_sim_time', default_value='false'),
             Node(
                 package='slam_observer_ros',
                 executable='observer_node',
                 name='observer_node',
+                namespace=LaunchConfiguration('namespace'),
                 parameters=[
                     LaunchConfiguration('params_file'),
                     {'use_sim_time': LaunchConfiguration('use_sim_time')},
@@ -34,6 +41,7 @@ def generate_launch_description():
                 remappings=[
                     ('twist', LaunchConfiguration('twist')),
                     ('landmarks', LaunchConfiguration('landmarks')),
+                    ('imu', LaunchConfiguration('imu')),
                 ],
                 output='screen',
             ),
