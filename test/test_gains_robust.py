@@ -109,7 +109,7 @@ def test_an_outlier_at_first_sight_does_not_survive(gains, two_d_mode):
 
     estimator = estimate(world.with_observations(throw), settings)
     clean = estimate(world, settings)
-    assert estimator.counts['moved_landmark'] == 1
+    assert estimator.counts['rejected_landmark'] >= 1
     row = list(estimator.landmark_ids).index(first)
     assert np.linalg.norm(estimator.world_points[row] - world.world_points[first]) < 0.6
     assert position_error_m(estimator, world) < position_error_m(clean, world) + 0.2
