@@ -32,12 +32,12 @@ def stamps_ns() -> range:
 
 
 def events() -> list[Event]:
-    """The run's events, with numbers that float32 holds."""
+    """Drive straight on at 1/8 m a step, past the landmarks: numbers that float32 holds."""
     made: list[Event] = []
     for index, stamp_ns in enumerate(stamps_ns()):
-        made.append(VelocityEvent(stamp_ns, np.array([0.0, 0.0, 0.25, 1.0, 0.0, index / 4])))
+        made.append(VelocityEvent(stamp_ns, np.array([0.0, 0.0, 0.0, 6.25, 0.0, 0.0])))
         if index % 2 == 0:
-            points = LANDMARKS.world_points + index / 8
+            points = LANDMARKS.world_points - np.array([index / 8, 0.0, 0.0])
             made.append(ObservationEvent(stamp_ns, LANDMARKS.ids, points))
     return made
 
@@ -45,7 +45,7 @@ def events() -> list[Event]:
 def true_poses() -> list[PoseTruth]:
     """The run's true poses."""
     return [
-        PoseTruth(stamp_ns, se3.exp(np.array([0.0, 0.0, 0.01, 1.0, 0.0, 0.0]) * index))
+        PoseTruth(stamp_ns, se3.exp(np.array([0.0, 0.0, 0.0, 0.125, 0.0, 0.0]) * index))
         for index, stamp_ns in enumerate(stamps_ns())
     ]
 

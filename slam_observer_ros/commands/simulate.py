@@ -91,8 +91,12 @@ def run(args: argparse.Namespace) -> None:
     scenario = _scenario(args)
     # The paper's gains, whatever is the best on real sensors; and each simulated velocity holds
     # until the next one.
-    timeout_s = max(2.0 * args.step, Settings().velocity_timeout)
-    settings = read_settings(args, gains='constant', velocity_timeout=timeout_s)
+    settings = read_settings(
+        args,
+        gains='constant',
+        velocity_timeout=max(2.0 * args.step, Settings().velocity_timeout),
+        max_innovation_time=max(args.step, Settings().max_innovation_time),
+    )
     check_outputs([args.output], args.force)
     check_plots(args.plot, FIGURES, args.force)
     simulation = Simulation(scenario, START_NS)
