@@ -13,7 +13,7 @@ from scipy.stats import chi2, norm
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.fixed_map import FixedMapGains
-from slam_observer_ros.gains.gauge import fit_gauge, GaugeFit, JITTER_M2
+from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import block_diagonal
 from slam_observer_ros.geometry import se3, so3
@@ -103,11 +103,10 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     P = slam.gains.joint_covariance(np.arange(n))
     if slam.landmark_covariances is None or P is None or n == 0:
         return slam.landmark_covariances
-    points = observer.y_ref + observer.a
-    G = axes.output_matrix(points - points.mean(axis=0)).reshape(n * k, -1)
-    fit = fit_gauge(G, P + JITTER_M2 * np.eye(n * k), np.zeros(n * k))
+    G = axes.output_matrix(observer.y_ref - observer.y_ref.mean(axis=0)).reshape(n * k, -1)
+    information = gauge_information(G, P + JITTER_M2 * np.eye(n * k))
     G_each = G.reshape(n, k, -1)
-    common = G_each @ np.linalg.pinv(fit.information, hermitian=True) @ so3.transpose(G_each)
+    common = G_each @ np.linalg.pinv(information, hermitian=True) @ so3.transpose(G_each)
     own = np.zeros((n, 3, 3))
     i = np.arange(n)
     own[:, :k, :k] = P.reshape(n, k, n, k)[i, :, i] - common
@@ -116,6 +115,7 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
 
 def find_transform(
     source: FloatArray,
+    source_reference: FloatArray,
     source_covariance: FloatArray,
     target: FloatArray,
     target_covariances: FloatArray,
@@ -129,6 +129,8 @@ def find_transform(
     ----------
     source : FloatArray
         (m, 3) landmarks in the one frame, metres.
+    source_reference : FloatArray
+        (m, 3) where they were taken to be when their covariance was propagated.
     source_covariance : FloatArray
         (m k, m k) their covariance, m².
     target : FloatArray
@@ -145,18 +147,25 @@ def find_transform(
         was found. None unless at least k of them agree and tell how to turn.
 
     """
+    k = axes.point
+    if len(source) < k:
+        return None
+    arms = source_reference - source_reference.mean(axis=0)
+    J = axes.output_matrix(arms).reshape(len(arms) * k, -1)
     agree = np.ones(len(source), dtype=np.bool_)
-    allowed = 2.0 * norm.sf(CONTRADICTION_SIGMAS)
-    while agree.sum() >= axes.point:
-        used = np.repeat(agree, axes.point)
+    while agree.sum() >= k:
+        used = np.repeat(agree, k)
         own, there = source_covariance[np.ix_(used, used)], target_covariances[agree]
         T = _aligned(source[agree], own, target[agree], there)
-        fit, misfits = _misfits(T, source[agree], own, target[agree], there, axes)
-        if _turn_std_rad(fit, axes) > MAX_TURN_STD_RAD:
+        R = T[:3, :3]
+        S = own + block_diagonal((R.T @ there @ R)[:, :k, :k]) + JITTER_M2 * np.eye(len(own))
+        r = (source[agree] - se3.transform(se3.inverse(T), target[agree]))[:, :k]
+        if _turn_std_rad(gauge_information(J[used], S), axes) > MAX_TURN_STD_RAD:
             return None
-        if chi2.sf(fit.misfit, len(own) - len(axes.pose)) >= allowed:
+        misfit, doubts = _contradictions(J[used], S, r)
+        if misfit <= chi2.isf(2.0 * norm.sf(CONTRADICTION_SIGMAS), r.size - J.shape[1]):
             return T, agree
-        agree[np.flatnonzero(agree)[np.argmax(misfits)]] = False
+        agree[np.flatnonzero(agree)[np.argmax(doubts)]] = False
     return None
 
 
@@ -169,29 +178,26 @@ def _aligned(
     return rigid_alignment(source, target, 1.0 / variances)
 
 
-def _misfits(
-    T: FloatArray,
-    source: FloatArray,
-    own: FloatArray,
-    target: FloatArray,
-    there: FloatArray,
-    axes: Axes,
-) -> tuple[GaugeFit, FloatArray]:
-    """Return what changes T (4, 4) for the better, and how badly each landmark (m,) fits."""
-    k, R = axes.point, T[:3, :3]
-    S = own + block_diagonal((R.T @ there @ R)[:, :k, :k]) + JITTER_M2 * np.eye(len(own))
-    r = (source - se3.transform(se3.inverse(T), target))[:, :k]
-    arms = source - source.mean(axis=0)
-    fit = fit_gauge(axes.output_matrix(arms).reshape(r.size, -1), S, r.ravel())
-    return fit, np.sum(r**2 / np.diagonal(S).reshape(-1, k), axis=1)
+def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float, FloatArray]:
+    """Return how badly differences (m, k) fit together, squared, and each by itself (m,).
+
+    Each one is judged as in Baarda's data snooping: by what the others leave of it, Q r with
+    Q = S⁻¹ − S⁻¹ J (Jᵀ S⁻¹ J)⁻¹ Jᵀ S⁻¹, in units of its standard deviation.
+    """
+    weights = np.linalg.inv(S)
+    W = weights @ J
+    Q = weights - W @ np.linalg.solve(J.T @ W, W.T)
+    left = Q @ r.ravel()
+    variances = np.maximum(np.diagonal(Q), 1e-6 * np.diagonal(weights))
+    return float(r.ravel() @ left), np.sum((left**2 / variances).reshape(r.shape), axis=1)
 
 
-def _turn_std_rad(fit: GaugeFit, axes: Axes) -> float:
-    """Return the largest standard deviation of the fit's rotation about any axis."""
-    turns = len(axes.pose) - axes.point
-    W = fit.information
-    by_shift = np.linalg.solve(W[turns:, turns:], W[turns:, :turns])
-    smallest = float(np.linalg.eigvalsh(W[:turns, :turns] - W[:turns, turns:] @ by_shift)[0])
+def _turn_std_rad(information: FloatArray, axes: Axes) -> float:
+    """Return the largest standard deviation of a gauge's rotation about any axis."""
+    t = len(axes.pose) - axes.point
+    by_shift = np.linalg.solve(information[t:, t:], information[t:, :t])
+    of_turn = information[:t, :t] - information[:t, t:] @ by_shift
+    smallest = float(np.linalg.eigvalsh(of_turn)[0])
     return float(smallest**-0.5) if smallest > 0.0 else np.inf
 
 
@@ -200,12 +206,13 @@ def _find_frame(
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
     axes = _axes(slam)
-    points = (slam.observer.y_ref + slam.observer.a)[rows]
+    y_ref = slam.observer.y_ref[rows]
     covariance = slam.gains.joint_covariance(rows)
     if covariance is None:
         covariance = slam.settings.point_noise**2 * np.eye(axes.point * len(rows))
     covariances = known.covariances_or(slam.settings.map_noise)
-    return find_transform(points, covariance, known.world_points, covariances, axes)
+    points = y_ref + slam.observer.a[rows]
+    return find_transform(points, y_ref, covariance, known.world_points, covariances, axes)
 
 
 def _without_negative(covariances: FloatArray) -> FloatArray:
@@ -222,11 +229,9 @@ def _axes(slam: Slam) -> Axes:
 def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
     """Correct the estimate by what a map knows of the landmarks at ``rows``."""
     observer = slam.observer
-    points = observer.y_ref + observer.a
     targets, covariances = _in_reference_frame(slam, known)
-    observer.rebase(observer.A, points)
-    r = points[rows] - targets
-    observer.correct(slam.gains.anchor(points, rows, r, covariances))
+    r = (observer.y_ref + observer.a)[rows] - targets
+    observer.correct(slam.gains.anchor(observer, rows, r, covariances))
     slam.landmarks.counts[rows] += known.counts
 
 

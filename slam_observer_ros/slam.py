@@ -108,9 +108,8 @@ class Slam:
 
         """
         observer = self.observer
-        A = se3.inverse(observer.reference_pose) @ pose
-        observer.rebase(A, observer.y_ref + observer.a)
-        back = np.linalg.inv(self._turn_to_world(A))
+        observer.A = se3.inverse(observer.reference_pose) @ pose
+        back = np.linalg.inv(self._turn_to_world(observer.A))
         given = np.zeros((6, 6)) if covariance is None else covariance
         self.gains.set_pose_covariance(back @ given @ back.T)
         self.gains.restart(observer)
@@ -252,9 +251,11 @@ class Slam:
         far = (
             self.gains.distances(self._innovation(event, rows)) > self.settings.rejection_distance
         )
+        moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
+        if moved.any():
+            self._counts['moved_landmark'] += int(np.sum(moved))
+            logger.warning('Landmarks %s have moved.', event.ids[moved].tolist())
         if far.any():
-            self._counts['moved_landmark'] += int(np.sum(far))
-            logger.warning('Landmarks %s have moved; starting them anew.', event.ids[far].tolist())
             self._restart(_select(event, far), rows[far])
 
     def _restart(self, event: ObservationEvent, rows: IntArray) -> None:

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.settings import Settings
 
@@ -290,6 +291,43 @@ def test_what_is_saved_can_be_loaded_and_gives_the_same_frame():
     second.load_map(first.landmark_map)
     add(second, world.drive(30.0, 31.0))
     assert np.linalg.norm(world.error(second, 30.9)[3:]) < 0.15
+
+
+@pytest.mark.parametrize('is_planar', [False, True])
+def test_in_a_map_that_an_earlier_run_has_saved_the_pose_is_honest(is_planar):
+    dof = 3 if is_planar else 6
+    nees = []
+    for seed in range(25):
+        world = World(seed, is_planar)
+        settings = world.settings(
+            angular_velocity_noise=(0.02 * 0.1**0.5,) * 3,
+            linear_velocity_noise=(0.02 * 0.1**0.5,) * 3,
+            huber_threshold=0.0,
+        )
+        first = add(Estimator(settings, world.start), world.drive(0.0, 6.0, count=5))
+        saved = first.landmark_map
+        second = Estimator(world.settings(localization_mode='uncertain'))
+        second.load_map(saved)
+        add(second, [world.see(3.0, world.random.choice(saved.ids, 4, replace=False))])
+        if second.is_localised:
+            weights = 1.0 / np.trace(saved.covariances, axis1=1, axis2=2)
+            frame = rigid_alignment(world.points[saved.ids], saved.world_points, weights)
+            world.start = frame @ world.start  # the map's frame is what its landmarks say
+            nees.append(world.nees(second, 3.0))
+    assert len(nees) > 20
+    assert 0.6 < np.mean(nees) / dof < 1.6
+    assert np.mean(np.array(nees) <= chi2.ppf(0.9973, dof)) > 0.9
+
+
+def test_how_the_map_lies_to_the_start_is_no_error_of_the_map():
+    world = World(17)
+    estimator = Estimator(world.settings())
+    estimator.set_pose(world.start, np.diag([0.5, 0.5, 0.5, 1.0, 1.0, 1.0]) ** 2)
+    add(estimator, world.drive(0.0, 3.0, count=8))
+    in_start_frame = np.trace(estimator.landmark_covariances, axis1=1, axis2=2)
+    in_own_frame = np.trace(estimator.landmark_map.covariances, axis1=1, axis2=2)
+    assert np.sqrt(in_start_frame.min()) > 1.0
+    assert np.sqrt(np.median(in_own_frame)) < 0.1
 
 
 def test_a_fixed_map_is_saved_as_it_was_loaded():

@@ -147,9 +147,10 @@ def test_saved_killed_loaded_and_localised(ros, robot, tmp_path):
     assert_allclose(read_map(path).world_points, robot.points, atol=5 * NOISE_M)
     elsewhere = se3.exp(np.array([0.1, -0.2, 2.0, 3.0, -2.0, 0.5]))
     # For some time a client takes the killed node for alive; a new one never hears of it.
-    with client() as ros, running(
-        'observer_node', tmp_path / 'log', map_file=path, **PARAMETERS
-    ) as node:
+    with (
+        client() as ros,
+        running('observer_node', tmp_path / 'log', map_file=path, **PARAMETERS) as node,
+    ):
         node.wait_for_output('loaded 50 landmarks from .*map.yaml; the pose is unknown until')
         robot = Robot(ros).connect()
         robot.see(elsewhere, [7, 31])

@@ -118,16 +118,16 @@ class GainDesign(Protocol):
         """Return the covariance (m k, m k) of landmarks (m,) together; None if unknown."""
 
     def anchor(
-        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+        self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
         """Return the correction that brings the whole estimate to where known landmarks are.
 
         Parameters
         ----------
-        points : FloatArray
-            (n, 3) all landmarks, metres, reference frame.
+        observer : Observer
+            The estimate.
         indices : IntArray
-            (m,) which of them are known.
+            (m,) which of its landmarks are known.
         r : FloatArray
             (m, 3) estimated minus known positions, metres, reference frame.
         covariances : FloatArray

@@ -79,7 +79,7 @@ class ConstantGains:
         """Return None: constant gains know no noise."""
 
     def anchor(
-        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+        self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
         """Return the correction that puts the known landmarks where they are known to be."""
         return Correction(np.eye(4), indices, -r)

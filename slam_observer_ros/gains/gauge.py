@@ -13,8 +13,6 @@ Kalman filter from what γ leaves of r. No large number has to stand for 'unknow
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
@@ -24,36 +22,10 @@ JITTER_M2 = 1e-12
 """Added to variances, so that S can be inverted where both sides are exact."""
 
 
-@dataclass(frozen=True, slots=True)
-class GaugeFit:
-    """The best γ.
-
-    Attributes
-    ----------
-    gamma : FloatArray
-        (d,) rotation vector and translation, on the axes that J has.
-    information : FloatArray
-        (d, d) inverse covariance Λ⁻¹ of ``gamma``.
-    misfit : float
-        What is left of r, squared, in units of S; χ² distributed with q − d degrees of freedom.
-
-    """
-
-    gamma: FloatArray
-    information: FloatArray
-    misfit: float
-
-
-def fit_gauge(J: FloatArray, S: FloatArray, r: FloatArray) -> GaugeFit:
-    """Fit γ to differences ``r`` (q,) with Jacobian ``J`` (q, d) and covariance ``S`` (q, q).
-
-    Where the landmarks leave some of γ open, that part is zero.
-    """
-    W = _solve(S, np.column_stack([J, r]))
-    information: FloatArray = J.T @ W[:, :-1]
-    gamma = np.linalg.lstsq(information, J.T @ W[:, -1])[0]
-    left = r - J @ gamma
-    return GaugeFit(gamma, information, float(left @ _solve(S, left)))
+def gauge_information(J: FloatArray, S: FloatArray) -> FloatArray:
+    """Return Λ⁻¹ = Jᵀ S⁻¹ J (d, d), what landmarks tell of γ, for J (q, d) and S (q, q)."""
+    information: FloatArray = J.T @ _solve(S, J)
+    return information
 
 
 def anchor(
@@ -84,11 +56,12 @@ def anchor(
     """
     J, PH = G[rows], P[:, rows]
     S = PH[rows] + R + JITTER_M2 * np.eye(len(r))
-    fit = fit_gauge(J, S, r)
+    information = gauge_information(J, S)
+    gamma = np.linalg.solve(information, J.T @ _solve(S, r))
     K = _solve(S, PH.T).T
     B = G - K @ J
-    after = P - K @ PH.T + B @ np.linalg.solve(fit.information, B.T)
-    return G @ fit.gamma + K @ (r - J @ fit.gamma), 0.5 * (after + after.T)
+    after = P - K @ PH.T + B @ np.linalg.solve(information, B.T)
+    return G @ gamma + K @ (r - J @ gamma), 0.5 * (after + after.T)
 
 
 def _solve(S: FloatArray, right: FloatArray) -> FloatArray:

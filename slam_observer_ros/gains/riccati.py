@@ -160,14 +160,17 @@ class RiccatiGains:
         return self._P[np.ix_(columns, columns)]
 
     def anchor(
-        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+        self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
-        """Return the correction that puts the whole estimate where known landmarks are."""
+        """Return the correction that puts the whole estimate where known landmarks are.
+
+        G is taken at y_i°, as C_i is: so it spans what P holds of the gauge already.
+        """
         k = self._axes.point
         G = np.zeros((len(self._P), self._p))
         G[: self._p] = np.eye(self._p)
         everything = self._columns(np.arange(self._count))
-        G[everything] = self._axes.output_matrix(points).reshape(-1, self._p)
+        G[everything] = self._axes.output_matrix(observer.y_ref).reshape(-1, self._p)
         R = block_diagonal(covariances[:, :k, :k])
         x, self._P = anchor(self._P, G, self._columns(indices), R, r[:, :k].ravel())
         return self._as_correction(-x)

@@ -99,9 +99,10 @@ class ScheduledGains:
         return block_diagonal(self._L[indices])
 
     def anchor(
-        self, points: FloatArray, indices: IntArray, r: FloatArray, covariances: FloatArray
+        self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
         """Return the correction that puts pose and known landmarks where these are known to be."""
+        points = observer.y_ref + observer.a
         first, p, m, k = len(self._P), len(self._axes.pose), len(r), self._axes.point
         P = block_diag(self._P, block_diagonal(self._L[indices]))
         G = np.zeros((len(P), p))
@@ -114,8 +115,8 @@ class ScheduledGains:
         self._L[indices] = own * (self._settings.localization_mode != 'fixed')
         shifts = self._axes.output_matrix(points) @ x[:p]
         shifts[indices] = x[first:].reshape(m, k)
-        a = np.zeros_like(points)
-        return self._as_correction(np.arange(len(a)), -x[:first], -shifts.ravel(), a)
+        everything = np.arange(len(points))
+        return self._as_correction(everything, -x[:first], -shifts.ravel(), observer.a)
 
     def restart(self, observer: Observer) -> None:
         """Do nothing: these gains keep no history."""

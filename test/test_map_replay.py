@@ -1,0 +1,66 @@
+"""``slam-observer replay --map`` and ``--load-map``: one file, from one recording to the next."""
+
+from __future__ import annotations
+
+from command_line import CommandLine
+import numpy as np
+import pytest
+
+from slam_observer_ros.evaluation.trajectory import read_tum
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.recording.map_file import read_map
+from slam_observer_ros.recording.writer import RecordingWriter
+
+BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
+POINT_NOISE_M = 0.02
+SETTINGS = ('--set', 'observation_model=cartesian', '--set', f'point_noise={POINT_NOISE_M}')
+
+
+@pytest.fixture
+def slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+def record(path, start, seed):
+    """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks."""
+    landmarks = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
+    random = np.random.default_rng(seed)
+    with RecordingWriter(path) as writer:
+        for step in range(80):
+            noise = random.normal(scale=0.01, size=6)
+            writer.write_velocity(VelocityEvent(step * 10**8, BODY_VELOCITY + noise))
+            pose = start @ se3.exp(BODY_VELOCITY * 0.1 * step)
+            points = se3.transform(se3.inverse(pose), landmarks)
+            seen = np.flatnonzero(np.linalg.norm(points, axis=1) < 6.0)
+            points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
+            writer.write_observation(ObservationEvent(step * 10**8, seen, points))
+    return path
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path, mode):
+    first = record(tmp_path / 'first.mcap', np.eye(4), seed=1)
+    start = se3.exp(np.array([0.0, 0.1, 2.0, 1.0, -2.0, 0.5]))
+    second = record(tmp_path / 'second.mcap', start, seed=2)
+    saved, again, poses = (tmp_path / name for name in ('map.yaml', 'again.yaml', 'poses.tum'))
+    slam_observer.succeed('replay', first, '--map', saved, *SETTINGS)
+    slam_observer(
+        'replay', second, '--load-map', saved, '--map', again, '--tum', poses, *SETTINGS,
+        '--set', f'localization_mode={mode}',
+    )  # fmt: skip
+    estimate = read_tum(poses)
+    true = start @ se3.exp(BODY_VELOCITY * (estimate.stamps_ns * 1e-9)[:, None])
+    distance = np.linalg.norm(estimate.poses[:, :3, 3] - true[:, :3, 3], axis=1)
+    assert len(distance) > 70
+    assert np.median(distance) < 0.1
+    known, after = read_map(saved), read_map(again)
+    assert set(known.ids) <= set(after.ids)
+    assert (len(after.ids) > len(known.ids)) == (mode == 'off')
+
+
+def test_a_map_that_cannot_be_read_is_refused_before_anything_is_done(slam_observer, tmp_path):
+    recording = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    missing = tmp_path / 'no.yaml'
+    error = slam_observer.fail('replay', recording, '--load-map', missing)
+    assert f"can't read map {missing}: No such file or directory" in error
