@@ -56,7 +56,8 @@ OUTPUTS = {
     'odometry': "pose in the map, velocity in the robot's frame",
     'pose': 'pose in the map with its covariance',
     'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
-    'map': 'landmarks with ids; with covariances where the gains know them',
+    'map': 'landmarks seen `confirmations` times or more, with ids; with covariances where the '
+    'gains know them',
     'landmark_estimates': 'the same landmarks for tools that read PointCloud',
     'markers': 'landmarks, ids and residuals for RViz and Foxglove',
     'lyapunov': 'the Lyapunov value L (34) of the last observation',
