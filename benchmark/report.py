@@ -83,11 +83,12 @@ recordings. The simulated worlds are made with the noise that these files state.
 - **smoothed** and **GTSAM batch** know the future: `riccati` and then Gauss–Newton over
   everything; Levenberg–Marquardt from iSAM2's last estimate.
 
-Configuration error: after each observation, the RMS over all landmarks known so far of
-|P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. ATE and heading are those
-of the poses right after the observations, after one rigid alignment of their positions. CPU time
-is that of the estimator's own calls; integrating the velocities, which all but the observer do by
-the same code, costs what dead reckoning costs. `failed`: GTSAM gave up with a singular system.
+Configuration error: after each observation, the RMS over all landmarks seen three times or more
+so far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. ATE and heading
+are those of the poses right after the observations, after one rigid alignment of their positions.
+CPU time is that of the estimator's own calls; integrating the velocities, which all but the
+observer do by the same code, costs what dead reckoning costs. `failed`: GTSAM gave up with a
+singular system, or nothing was mapped.
 
 ![Configuration error and consistency](images/benchmark.png)
 

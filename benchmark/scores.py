@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 
-from estimators import Run
+from estimators import Run, Snapshot
 import numpy as np
 from worlds import World
 
@@ -14,7 +15,7 @@ from slam_observer_ros.evaluation.metrics import (
     trajectory_errors,
 )
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import LandmarkTruth
+from slam_observer_ros.events import LandmarkTruth, ObservationEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +50,14 @@ def score(run: Run, world: World, labels: dict[int, int] | None = None) -> Score
     """Compare a run with the truth; ``labels`` maps an estimator's own ids to the true ones."""
     final = run.snapshots[-1]
     landmarks = world.landmarks if labels is None else _relabelled(world.landmarks, labels)
+    compared = _compared(run, world) if labels is None else run.snapshots
     trajectory = Trajectory.from_samples(
         [snapshot.stamp_ns for snapshot in run.snapshots],
         [snapshot.pose for snapshot in run.snapshots],
     )
     errors = trajectory_errors(trajectory, world.truth)
     return Scores(
-        configuration_rmse_m(run, world, landmarks),
+        _configuration_rmse_m(compared, world.truth, landmarks),
         errors.ate_rmse_m,
         errors.heading_rmse_rad,
         landmark_errors(final.ids, final.world_points, landmarks).rmse_m,
@@ -63,22 +65,42 @@ def score(run: Run, world: World, labels: dict[int, int] | None = None) -> Score
     )
 
 
-def configuration_rmse_m(run: Run, world: World, landmarks: LandmarkTruth) -> float:
+def _compared(run: Run, world: World) -> list[Snapshot]:
+    """Return the snapshots without landmarks that were seen less than ``confirmations`` times.
+
+    The observer shows a landmark only then. To compare the same landmarks, the rule is applied to
+    all estimators.
+    """
+    counts: Counter[int] = Counter()
+    snapshots = []
+    observations = (event for event in world.events if isinstance(event, ObservationEvent))
+    for event, snapshot in zip(observations, run.snapshots, strict=True):
+        counts.update(event.ids.tolist())
+        often = [counts[i] >= world.settings.confirmations for i in snapshot.ids.tolist()]
+        kept = np.flatnonzero(often)
+        points = snapshot.world_points[kept]
+        snapshots.append(replace(snapshot, ids=snapshot.ids[kept], world_points=points))
+    return snapshots
+
+
+def _configuration_rmse_m(
+    snapshots: list[Snapshot], truth: Trajectory, landmarks: LandmarkTruth
+) -> float:
     """Return the RMS of the configuration error over the observations that the truth covers."""
-    stamps_ns = np.array([snapshot.stamp_ns for snapshot in run.snapshots])
-    true_poses, covered = interpolate(world.truth, stamps_ns)
+    stamps_ns = np.array([snapshot.stamp_ns for snapshot in snapshots])
+    true_poses, covered = interpolate(truth, stamps_ns)
     error = ConfigurationError()
     for i in np.flatnonzero(covered):
-        snapshot = run.snapshots[i]
+        estimate = snapshots[i]
         error.add(
-            snapshot.stamp_ns,
-            snapshot.pose,
-            snapshot.ids,
-            snapshot.world_points,
+            estimate.stamp_ns,
+            estimate.pose,
+            estimate.ids,
+            estimate.world_points,
             true_poses[i],
             landmarks,
         )
-    return error.rmse_m if error.rmse_m is not None else float('nan')
+    return float('nan') if error.rmse_m is None else error.rmse_m
 
 
 def _relabelled(landmarks: LandmarkTruth, labels: dict[int, int]) -> LandmarkTruth:
