@@ -172,10 +172,9 @@ def test_observations_wait_for_their_transform_and_are_dropped_without(ros, tmp_
     maps = ros.collect(PointCloud2, '/late/map', LATCHED_QOS)
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
     sender = TransformSender(ros, '/late')
+    parameters = {'transform_timeout': 2.0, 'confirmations': 1}
     with (
-        running(
-            'observer_node', tmp_path / 'log', *own_topics('/late'), transform_timeout=2.0
-        ) as node,
+        running('observer_node', tmp_path / 'log', *own_topics('/late'), **parameters) as node,
         Robot(ros, namespace='/late', sensor_frame_id='turret') as robot,
     ):
         ros.wait_for_subscriber(sender.dynamic)

@@ -346,8 +346,10 @@ def test_reset_forgets_pose_and_map(ros, observer):
         ros.spin_for(0.2)
         poses.clear()
         robot.send(VelocityEvent(time.time_ns(), np.zeros(6)))
-        robot.send(ObservationEvent(time.time_ns(), np.array([7]), np.array([[1.0, 0.0, 0.0]])))
-        ros.spin_for(0.1)
+        for _ in range(5):  # a landmark is published once it is confirmed
+            point = np.array([[1.0, 0.0, 0.0]])
+            robot.send(ObservationEvent(time.time_ns(), np.array([7]), point))
+            ros.spin_for(0.1)
         robot.send(VelocityEvent(time.time_ns(), np.zeros(6)))
         ros.spin_until(lambda: poses and len(estimates[-1].points) == 1, 'the only landmark')
     assert_allclose(poses[-1].pose.pose.position.x, 0.0, atol=1e-9)

@@ -123,8 +123,9 @@ def test_correction_of_the_odometry_holds_while_paused(ros, tmp_path):
 def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
     maps = ros.collect(PointCloud2, '/forgetful/map', LATCHED_QOS)
     forget = ros.node.create_publisher(Int64, '/forgetful/observer_node/forget_landmark', 10)
+    arguments = ('-r', '__ns:=/forgetful')
     with (
-        running('observer_node', tmp_path / 'log', '-r', '__ns:=/forgetful') as node,
+        running('observer_node', tmp_path / 'log', *arguments, confirmations=1) as node,
         Robot(ros, namespace='/forgetful') as robot,
     ):
         robot.run(RUN)
