@@ -155,8 +155,8 @@ class RiccatiGains:
         self._place_velocities(indices)
 
     def joint_covariance(self, indices: IntArray) -> FloatArray:
-        """Return the covariance (m k, m k) of landmarks together."""
-        columns = self._columns(indices)
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks together."""
+        columns = np.append(np.arange(self._p), self._columns(indices))
         return self._P[np.ix_(columns, columns)]
 
     def anchor(
@@ -226,7 +226,7 @@ class RiccatiGains:
             return
         self._history.see(seen, observer.A, observer.shifts[seen.indices])
         self._observations += 1
-        rested = self._observations >= max(interval, len(self._history.stamps_ns) // 10)
+        rested = self._observations >= interval
         turned_far = self._turn_squared > self._settings.hindsight_turn**2
         if in_doubt or self._window_is_full or (turned_far and rested):
             self._rebase(observer)
