@@ -13,7 +13,7 @@ from scipy.stats import chi2, norm
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.fixed_map import FixedMapGains
-from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
+from slam_observer_ros.gains.gauge import anchor, gauge_information, JITTER_M2
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import block_diagonal
 from slam_observer_ros.geometry import se3, so3
@@ -23,7 +23,7 @@ from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 MAX_TURN_STD_RAD = 0.2
-"""Standard deviation about any axis beyond which landmarks don't tell how a map lies.
+"""Standard deviation about any axis beyond which landmarks don't tell how the robot is turned.
 
 Three of them in a line leave the roll about it open; two that are close together, the heading.
 """
@@ -100,9 +100,10 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     """
     n, axes, observer = len(slam.landmarks), _axes(slam), slam.observer
     k, R = axes.point, observer.reference_pose[:3, :3]
-    P = slam.gains.joint_covariance(np.arange(n))
-    if slam.landmark_covariances is None or P is None or n == 0:
+    joint = slam.gains.joint_covariance(np.arange(n))
+    if slam.landmark_covariances is None or joint is None or n == 0:
         return slam.landmark_covariances
+    P = joint[len(axes.pose) :, len(axes.pose) :]
     G = axes.output_matrix(observer.y_ref - observer.y_ref.mean(axis=0)).reshape(n * k, -1)
     information = gauge_information(G, P + JITTER_M2 * np.eye(n * k))
     G_each = G.reshape(n, k, -1)
@@ -128,11 +129,11 @@ def find_transform(
     Parameters
     ----------
     source : FloatArray
-        (m, 3) landmarks in the one frame, metres.
+        (m, 3) landmarks in the robot's own frame, metres.
     source_reference : FloatArray
-        (m, 3) where they were taken to be when their covariance was propagated.
+        (m, 3) the same as y_i°, for which their covariance holds.
     source_covariance : FloatArray
-        (m k, m k) their covariance, m².
+        (p + m k, p + m k) covariance of the pose's error and theirs together, rad² and m².
     target : FloatArray
         (m, 3) the same landmarks in the other frame, metres.
     target_covariances : FloatArray
@@ -143,27 +144,25 @@ def find_transform(
     Returns
     -------
     tuple or None
-        Transform (4, 4) from the source's frame to the target's, and by which landmarks (m,) it
-        was found. None unless at least k of them agree and tell how to turn.
+        Transform (4, 4) from the robot's frame to the other one, and by which landmarks (m,) it
+        was found. None unless at least k of them agree and tell how the robot is turned.
 
     """
-    k = axes.point
-    if len(source) < k:
-        return None
-    arms = source_reference - source_reference.mean(axis=0)
-    J = axes.output_matrix(arms).reshape(len(arms) * k, -1)
+    p, k = len(axes.pose), axes.point
+    J = axes.output_matrix(source_reference).reshape(len(source) * k, p)
+    G = np.vstack([np.eye(p), J])
     agree = np.ones(len(source), dtype=np.bool_)
     while agree.sum() >= k:
-        used = np.repeat(agree, k)
-        own, there = source_covariance[np.ix_(used, used)], target_covariances[agree]
-        T = _aligned(source[agree], own, target[agree], there)
+        rows = np.flatnonzero(np.append(np.ones(p, dtype=np.bool_), np.repeat(agree, k)))
+        P = source_covariance[np.ix_(rows, rows)]
+        T = _aligned(source[agree], P[p:, p:], target[agree], target_covariances[agree])
         R = T[:3, :3]
-        S = own + block_diagonal((R.T @ there @ R)[:, :k, :k]) + JITTER_M2 * np.eye(len(own))
+        there = block_diagonal((R.T @ target_covariances[agree] @ R)[:, :k, :k])
         r = (source[agree] - se3.transform(se3.inverse(T), target[agree]))[:, :k]
-        if _turn_std_rad(gauge_information(J[used], S), axes) > MAX_TURN_STD_RAD:
+        if _turn_std_rad(P, G[rows], there, axes) > MAX_TURN_STD_RAD:
             return None
-        misfit, doubts = _contradictions(J[used], S, r)
-        if misfit <= chi2.isf(2.0 * norm.sf(CONTRADICTION_SIGMAS), r.size - J.shape[1]):
+        misfit, doubts = _contradictions(G[rows[p:]], P[p:, p:] + there, r)
+        if misfit <= chi2.isf(2.0 * norm.sf(CONTRADICTION_SIGMAS), r.size - p):
             return T, agree
         agree[np.flatnonzero(agree)[np.argmax(doubts)]] = False
     return None
@@ -178,27 +177,33 @@ def _aligned(
     return rigid_alignment(source, target, 1.0 / variances)
 
 
+def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: Axes) -> float:
+    """Return the standard deviation of the robot's attitude in a map, about the worst axis.
+
+    Parameters are those of :func:`slam_observer_ros.gains.gauge.anchor`, for the pose and the
+    landmarks that the map has.
+    """
+    turns, rows = len(axes.pose) - axes.point, np.arange(len(axes.pose), len(P))
+    try:
+        _, after = anchor(P, G, rows, there, np.zeros(len(rows)))
+    except np.linalg.LinAlgError:
+        return np.inf
+    # Where landmarks leave a turn open, rounding decides whether its variance is +∞ or −∞.
+    return float(np.sqrt(np.abs(np.linalg.eigvalsh(after[:turns, :turns])).max()))
+
+
 def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float, FloatArray]:
     """Return how badly differences (m, k) fit together, squared, and each by itself (m,).
 
     Each one is judged as in Baarda's data snooping: by what the others leave of it, Q r with
     Q = S⁻¹ − S⁻¹ J (Jᵀ S⁻¹ J)⁻¹ Jᵀ S⁻¹, in units of its standard deviation.
     """
-    weights = np.linalg.inv(S)
+    weights = np.linalg.inv(S + JITTER_M2 * np.eye(len(S)))
     W = weights @ J
     Q = weights - W @ np.linalg.solve(J.T @ W, W.T)
     left = Q @ r.ravel()
     variances = np.maximum(np.diagonal(Q), 1e-6 * np.diagonal(weights))
     return float(r.ravel() @ left), np.sum((left**2 / variances).reshape(r.shape), axis=1)
-
-
-def _turn_std_rad(information: FloatArray, axes: Axes) -> float:
-    """Return the largest standard deviation of a gauge's rotation about any axis."""
-    t = len(axes.pose) - axes.point
-    by_shift = np.linalg.solve(information[t:, t:], information[t:, :t])
-    of_turn = information[:t, :t] - information[:t, t:] @ by_shift
-    smallest = float(np.linalg.eigvalsh(of_turn)[0])
-    return float(smallest**-0.5) if smallest > 0.0 else np.inf
 
 
 def _find_frame(
@@ -209,7 +214,9 @@ def _find_frame(
     y_ref = slam.observer.y_ref[rows]
     covariance = slam.gains.joint_covariance(rows)
     if covariance is None:
-        covariance = slam.settings.point_noise**2 * np.eye(axes.point * len(rows))
+        variance = slam.settings.point_noise**2
+        pose = np.zeros(len(axes.pose))
+        covariance = np.diag(np.append(pose, np.full(axes.point * len(rows), variance)))
     covariances = known.covariances_or(slam.settings.map_noise)
     points = y_ref + slam.observer.a[rows]
     return find_transform(points, y_ref, covariance, known.world_points, covariances, axes)

@@ -115,7 +115,7 @@ class GainDesign(Protocol):
         """Take ``covariance`` (6, 6) for that of ε, independent of all else."""
 
     def joint_covariance(self, indices: IntArray) -> FloatArray | None:
-        """Return the covariance (m k, m k) of landmarks (m,) together; None if unknown."""
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks; None if unknown."""
 
     def anchor(
         self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray

@@ -95,8 +95,9 @@ class ScheduledGains:
         self._P[:p, :p] = covariance[np.ix_(pose, pose)]
 
     def joint_covariance(self, indices: IntArray) -> FloatArray:
-        """Return the covariance (m k, m k) of landmarks, without correlations."""
-        return block_diagonal(self._L[indices])
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks, without correlations."""
+        p = len(self._axes.pose)
+        return np.asarray(block_diag(self._P[:p, :p], block_diagonal(self._L[indices])))
 
     def anchor(
         self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray

@@ -158,7 +158,7 @@ def project(M: FloatArray) -> FloatArray:
 
 
 def exp(xi: FloatArray) -> FloatArray:
-    """Pose exp(V) = I + V + b V² + c V³ with V = (Ω, v)_∧ (b, c: see `so3`).
+    """Return the pose I + V + b V² + c V³ of V = (Ω, v)_∧, with b and c as in `so3`.
 
     Parameters
     ----------
