@@ -52,7 +52,7 @@ class Factors(Protocol):
         """Return where a landmark is that is seen at ``point`` (3,), world."""
 
     def matrix(self, pose: Any) -> FloatArray:
-        """Return the matrix (4, 4) of GTSAM's pose."""
+        """Return a GTSAM pose as a (4, 4) array."""
 
     def pose_of(self, values: Any, key: int) -> Any:
         """Return GTSAM's pose ``key``."""
@@ -98,7 +98,7 @@ class PlanarFactors:
         return np.asarray(pose.transformFrom(point[:2]))
 
     def matrix(self, pose: gtsam.Pose2) -> FloatArray:
-        """Return the matrix (4, 4) of a ``Pose2``."""
+        """Return a GTSAM pose as a (4, 4) array."""
         matrix = np.eye(4)
         matrix[:2, :2] = pose.rotation().matrix()
         matrix[:2, 3] = pose.translation()
@@ -149,7 +149,7 @@ class SpatialFactors:
         return np.asarray(pose.transformFrom(point))
 
     def matrix(self, pose: gtsam.Pose3) -> FloatArray:
-        """Return the matrix (4, 4) of a ``Pose3``."""
+        """Return a GTSAM pose as a (4, 4) array."""
         return np.asarray(pose.matrix())
 
     def pose_of(self, values: gtsam.Values, key: int) -> gtsam.Pose3:
