@@ -9,11 +9,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.stats import chi2
 
+from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.localisation import find_transform
 from slam_observer_ros.settings import Settings
 
 POINT_NOISE_M = 0.05
@@ -168,6 +170,19 @@ def test_landmarks_may_be_seen_one_after_another():
     assert estimator.is_localised
     assert estimator.counts['not_localised'] >= 2
     assert world.nees(estimator, 2.9) < chi2.ppf(0.9973, 6)
+
+
+@pytest.mark.parametrize('axes', [SPATIAL, PLANAR])
+def test_a_frame_that_lies_anyhow_to_robot_and_landmarks_alike_is_no_obstacle(axes):
+    p, k = len(axes.pose), axes.point
+    source = np.random.default_rng(0).uniform(-5, 5, (6, 3)) * ([1, 1, 1] if k == 3 else [1, 1, 0])
+    G = np.vstack([np.eye(p), axes.output_matrix(source).reshape(6 * k, p)])
+    tilted = G @ G.T + 1e-4 * np.eye(p + 6 * k)  # by 1 rad, in common
+    true = se3.exp(np.array([0.0, 0.0, 1.0, 2.0, 3.0, 0.0]))
+    known = se3.transform(true, source), np.tile(1e-4 * np.eye(3), (6, 1, 1))
+    transform, agree = find_transform(source, source, tilted, *known, axes)
+    assert_allclose(transform, true, atol=1e-9)
+    assert agree.all()
 
 
 def line_of_landmarks(count):
