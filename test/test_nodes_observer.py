@@ -204,6 +204,9 @@ def test_outputs_follow_the_parameters_and_carry_true_stamps(ros, tmp_path):
     by_namespace = {marker.ns: marker for marker in markers[-1].markers}
     assert len(by_namespace['landmarks'].points) == 4
     assert len(by_namespace['residuals'].points) == 8
+    sizes = [m.scale.x for m in markers[-1].markers if m.ns == 'uncertainties']
+    assert len(sizes) == 4
+    assert 0.0 < min(sizes) <= max(sizes) < 5.0
     assert {m.text for m in markers[-1].markers if m.type == Marker.TEXT_VIEW_FACING} == set(
         '0123'
     )

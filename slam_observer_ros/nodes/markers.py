@@ -1,4 +1,4 @@
-"""Landmarks, their ids and residuals as RViz markers."""
+"""Landmarks, their ids, uncertainties and residuals as RViz markers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.nodes.conversions import point_message
+from slam_observer_ros.nodes.conversions import point_message, quaternion_message, vector_message
 from slam_observer_ros.types import FloatArray
 
 POINT_SIZE_M = 0.2
@@ -17,14 +17,23 @@ LINE_WIDTH_M = 0.03
 
 GREEN = ColorRGBA(r=0.0, g=0.62, b=0.45, a=1.0)
 WHITE = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
+BLUE = ColorRGBA(r=0.0, g=0.45, b=0.7, a=0.3)
 RED = ColorRGBA(r=0.84, g=0.37, b=0.0, a=1.0)
 
 MAX_LABELS = 200
 """Landmarks that get a text; more could not be read, and each is a message of its own."""
 
+ELLIPSOID_SIGMAS = 3.0
+"""Half axes of the ellipsoids, in standard deviations."""
+
+MIN_SIZE_M = 1e-3
+"""RViz complains about markers without a size."""
+
 
 def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
-    """Return markers that replace all earlier ones: points, ids and the last residuals.
+    """Return markers that replace all earlier ones.
+
+    Points, ids, the last residuals and, where covariances are known, ellipsoids.
 
     Parameters
     ----------
@@ -42,15 +51,35 @@ def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
         )
     ]
     clear = Marker(header=header, action=Marker.DELETEALL)
-    return MarkerArray(
-        markers=[clear, _points(header, points), _residual_lines(header, estimator), *labels]
-    )
+    lines = _residual_lines(header, estimator)
+    ellipsoids = _ellipsoids(header, points, estimator.landmark_covariances)
+    return MarkerArray(markers=[clear, _points(header, points), lines, *ellipsoids, *labels])
 
 
 def _points(header: Header, points: FloatArray) -> Marker:
     marker = _marker(header, 'landmarks', Marker.SPHERE_LIST, GREEN, POINT_SIZE_M)
     marker.points = [point_message(point) for point in points]
     return marker
+
+
+def _ellipsoids(
+    header: Header, points: FloatArray, covariances: FloatArray | None
+) -> list[Marker]:
+    """Return an ellipsoid for each of the first landmarks; none where no covariance is known."""
+    if covariances is None:
+        return []
+    variances, axes = np.linalg.eigh(covariances[:MAX_LABELS])
+    axes *= np.linalg.det(axes)[:, None, None]  # a rotation, not a reflection
+    sizes_m = 2.0 * ELLIPSOID_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    markers = []
+    for number, (point, size, turn) in enumerate(zip(points, sizes_m, axes, strict=False)):
+        marker = _marker(header, 'uncertainties', Marker.SPHERE, BLUE, MIN_SIZE_M)
+        marker.id = number
+        marker.pose.position = point_message(point)
+        marker.pose.orientation = quaternion_message(turn)
+        marker.scale = vector_message(np.maximum(size, MIN_SIZE_M))
+        markers.append(marker)
+    return markers
 
 
 def _residual_lines(header: Header, estimator: Estimator) -> Marker:
