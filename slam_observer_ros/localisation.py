@@ -248,21 +248,22 @@ def _complete(slam: Slam, known: LandmarkMap) -> None:
     new = known.select(slam.landmarks.indices_of(known.ids) < 0)
     y_ref, covariances = _in_reference_frame(slam, new)
     observer.add_reference_landmarks(y_ref)
-    slam.gains.add_known_landmarks(covariances)
+    observer.rebase(observer.A, observer.y_ref + observer.a)
     # A surveyed landmark needs no observation to be believed.
     slam.landmarks.add_known(new.ids, np.maximum(new.counts, settings.confirmations))
-    observer.rebase(observer.A, observer.y_ref + observer.a)
+    slam.is_mapping = settings.localization_mode == 'off'
     if settings.localization_mode == 'fixed':
         _hold(slam, known)
-    slam.is_mapping = settings.localization_mode == 'off'
+    if not isinstance(slam.gains, FixedMapGains):
+        slam.gains.add_known_landmarks(covariances)
     slam.gains.restart(observer)
 
 
 def _hold(slam: Slam, known: LandmarkMap) -> None:
     """Put the landmarks exactly where the map has them, and leave them there."""
-    places = np.searchsorted(known.ids, slam.landmarks.ids, sorter=np.argsort(known.ids))
-    in_order = known.select(np.argsort(known.ids)[places])
-    y_ref, covariances = _in_reference_frame(slam, in_order)
+    order = np.argsort(known.ids)
+    rows = order[np.searchsorted(known.ids, slam.landmarks.ids, sorter=order)]
+    y_ref, covariances = _in_reference_frame(slam, known.select(rows))
     slam.observer.rebase(slam.observer.A, y_ref)
     if isinstance(slam.gains, RiccatiGains):
         slam.gains = FixedMapGains(slam.gains, covariances)

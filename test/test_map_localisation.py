@@ -358,6 +358,17 @@ def test_a_fixed_map_is_saved_as_it_was_loaded():
     assert_allclose(saved.covariances[order], known.covariances, atol=1e-12)
 
 
+def test_a_fixed_map_may_be_large():
+    world = World(18)
+    random = np.random.default_rng(0)
+    world.points = random.uniform([-200, -200, -1], [200, 200, 4], (20_000, 3))
+    estimator = Estimator(world.settings(localization_mode='fixed'))
+    estimator.load_map(world.map(range(20_000)))
+    add(estimator, world.drive(0.0, 2.0))
+    assert np.linalg.norm(world.error(estimator, 1.9)[3:]) < 0.1
+    assert len(estimator.landmark_ids) == 20_000
+
+
 def test_a_robot_that_was_carried_away_finds_itself_again(caplog):
     world = World(14)
     estimator = Estimator(world.settings(localization_mode='fixed'))

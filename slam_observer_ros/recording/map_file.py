@@ -42,7 +42,9 @@ _LARGEST = 1e12
 _ROUNDING = 1e-6
 """Part of a covariance's largest entry by which it may miss being one."""
 
-_Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # ten times faster, where libyaml is
+# Faster by far, where libyaml is.
+_Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
@@ -130,7 +132,10 @@ def _as_mappings(landmark_map: LandmarkMap) -> list[dict[str, Any]]:
 
 
 def _on_one_line(landmark: Mapping[str, Any]) -> str:
-    return yaml.safe_dump(dict(landmark), default_flow_style=True, sort_keys=False, width=10**6)
+    text: str = yaml.dump(
+        dict(landmark), Dumper=_Dumper, default_flow_style=True, sort_keys=False, width=10**6
+    )
+    return text
 
 
 def _parse(content: Any) -> LandmarkMap:
