@@ -175,13 +175,6 @@ class Settings:
     two_d_mode: bool = parameter(
         False, 'Whether motion and map are planar: z, roll and pitch stay exactly zero'
     )
-    gate_probability: float = parameter(
-        0.9999,
-        'Share of good observations that pass the outlier gate',
-        minimum=0.5,
-        maximum=1.0,
-        read_only=False,
-    )
     huber_threshold: float = parameter(
         1.345,
         'Standard deviations of noise beyond which an observation loses weight; 0 for never',

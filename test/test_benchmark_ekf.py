@@ -31,7 +31,6 @@ PRECISE = Settings(
     observation_model='cartesian',
     point_noise=0.01,
     huber_threshold=0.0,
-    gate_probability=1.0,
 )
 
 
