@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any, TypeAlias
 
 import estimators
@@ -306,7 +307,7 @@ def _draw_bars(axes: Axes, table: Table) -> None:
         heights = _values(table, table, column, 'configuration_rmse_m')
         axes.bar(places + (i - 0.5 * (len(shown) - 1)) * width, heights, width, label=column)
     axes.set_yscale('log')
-    axes.set_xticks(places, [world.replace(', ', '\n') for world in table], fontsize=8)
+    axes.set_xticks(places, [fill(world, 16) for world in table], fontsize=8)
     axes.set_ylabel('configuration error, m')
     axes.legend(ncols=len(shown), fontsize=8, frameon=False)
 
@@ -315,7 +316,7 @@ def _draw_consistency(axes: Axes, loop: str, columns: dict[str, Consistency]) ->
     for name, consistency in columns.items():
         axes.plot(consistency.times_s, consistency.pose, marker='.', label=name)
         axes.axhspan(*consistency.band, color='#DDDDDD', zorder=0)
-    axes.set_yscale('log')
+    axes.set_ylim(bottom=0.0)
     axes.set_xlabel('time, s')
     axes.set_ylabel("pose's ANEES")
     axes.set_title(f'{loop}; grey: 95 % of honest estimators', fontsize=9)
