@@ -239,6 +239,7 @@ def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
     targets, covariances = _in_reference_frame(slam, known)
     r = (observer.y_ref + observer.a)[rows] - targets
     observer.correct(slam.gains.anchor(observer, rows, r, covariances))
+    slam.gains.settle(observer)
     slam.landmarks.counts[rows] += known.counts
 
 

@@ -214,6 +214,7 @@ class Slam:
         innovation = self._innovation(event, rows)
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
+        self.gains.settle(self.observer)
         self._innovation_ns = event.stamp_ns
         rejected = weights == 0.0
         self.landmarks.see(rows[~rejected], event.stamp_ns)

@@ -150,6 +150,9 @@ class GainDesign(Protocol):
     def distances(self, innovation: Innovation) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
 
+    def settle(self, observer: Observer) -> None:
+        """Move the reference to the estimate after a correction, where the design needs that."""
+
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen; where the design looks back, move the observer's reference.
 

@@ -109,6 +109,9 @@ class ConstantGains:
         """Return zeros: constant gains know no noise to measure residuals by."""
         return np.zeros(len(innovation.r))
 
+    def settle(self, observer: Observer) -> None:
+        """Do nothing: the reference stays where the paper puts it."""
+
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Do nothing: constant gains have no memory."""
 

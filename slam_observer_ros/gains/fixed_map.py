@@ -46,6 +46,9 @@ class FixedMapGains(RiccatiGains):
         """Forget the landmarks at ``indices``."""
         self._landmark_covariances = np.delete(self._landmark_covariances, indices, axis=0)
 
+    def settle(self, observer: Observer) -> None:
+        """Do nothing: the landmarks of an exact map do not move."""
+
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Do nothing: in an exact map there is no drift to undo."""
 

@@ -214,6 +214,22 @@ class RiccatiGains:
         y_ref = innovation.e - innovation.r
         return self._axes.output_matrix(y_ref).reshape(-1, self._p)
 
+    def settle(self, observer: Observer) -> None:
+        """Take the landmarks' estimates for their reference, so that â_i = 0.
+
+        ã_i = â_i − R_Ã a_i turns with the noise of the pose unless a_i is small, which prediction
+        in the pose block alone leaves out. With y_i° + â_i for y_i°, ã_i becomes ã_i − [â_i]× ω.
+        """
+        if not observer.a.any():
+            return
+        columns = self._columns(np.arange(self._count))
+        L = self._axes.output_matrix(observer.a)
+        L[:, :, self._axes.pose >= 3] = 0.0
+        L = L.reshape(-1, self._p)
+        self._P[columns] += L @ self._P[: self._p]
+        self._P[:, columns] += self._P[:, : self._p] @ L.T
+        observer.rebase(observer.A, observer.y_ref + observer.a)
+
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise all of it anew.
 

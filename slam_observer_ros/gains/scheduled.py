@@ -154,6 +154,9 @@ class ScheduledGains:
         S = C @ self._P @ so3.transpose(C) + L + R
         return mahalanobis(innovation.r[:, : self._axes.point], S)
 
+    def settle(self, observer: Observer) -> None:
+        """Do nothing: these gains measure landmarks in the world, whatever the reference."""
+
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Do nothing: these gains keep no history."""
 
