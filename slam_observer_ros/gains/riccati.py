@@ -6,8 +6,9 @@ calibration. The residual is, by (33), r_i = Ã y_i° − ã_i − y_i° ≈ C_i
 
     C_i = [ −[y_i°]×  I  0 … −I … 0 ].
 
-This C does not depend on the estimate, so what no observation can tell, the choice of the world's
-frame, stays exactly in its null space and the covariance stays honest. Then
+What no observation can tell, the choice of the world's frame, is exactly in its null space, so
+the covariance stays honest. While â_i = 0, which :meth:`RiccatiGains.settle` sees to after each
+correction (the reference ξ° is arbitrary), the motion's noise touches Ã alone. Then
 
     prediction   P ← P + Ad_Â Q Ad_Âᵀ in the pose block alone: O(1), however large the map
     update       K = P Cᵀ (C P Cᵀ + R)⁻¹,   X̂ ← exp(−K r) · X̂
