@@ -17,7 +17,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy venv clean
+.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy benchmark-speed venv clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
@@ -51,6 +51,9 @@ docs: $(READY)  ## write the tables anew, build the site into site/, check its l
 benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
+
+benchmark-speed: $(READY)  ## cost of an observation against landmarks seen and known
+	$(PYTHON_IN_VENV) benchmark/speed.py
 
 venv: $(READY)  ## only set up .venv
 
