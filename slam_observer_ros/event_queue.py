@@ -61,10 +61,10 @@ class EventQueue:
 
     def pop_ready(self) -> Iterator[Event]:
         """Give out, in order, the events that have left the window."""
-        newest_ns = self.newest_ns or 0
-        while self._heap and self._heap[0][0][0] <= newest_ns - self._window_ns:
+        ready_ns = (self.newest_ns or 0) - self._window_ns
+        while self._heap and self._heap[0][0][0] <= ready_ns:
             yield self._pop()
-        oldest_ns = newest_ns - self._window_ns - self._late_limit_ns
+        oldest_ns = ready_ns - self._late_limit_ns
         while self._given_out and self._given_out[0][0] < oldest_ns:
             self._known.discard(self._given_out.popleft())
 
@@ -79,14 +79,17 @@ class EventQueue:
         return event
 
     def _insert(self, event: Event) -> None:
-        is_observation = isinstance(event, ObservationEvent)
-        ids = event.ids.tobytes() if isinstance(event, ObservationEvent) else b''
-        key = (event.stamp_ns, is_observation, ids)
+        stamp_ns = event.stamp_ns
+        if isinstance(event, ObservationEvent):
+            key = (stamp_ns, True, event.ids.tobytes())
+        else:
+            key = (stamp_ns, False, b'')
         if key in self._known:
             raise InvalidEventError('duplicate', 'an event with this stamp is already known')
         self._known.add(key)
         heapq.heappush(self._heap, (key, event))
-        self.newest_ns = max(event.stamp_ns, self.newest_ns or event.stamp_ns)
+        if self.newest_ns is None or stamp_ns > self.newest_ns:
+            self.newest_ns = stamp_ns
 
     def _check(self, stamp_ns: int) -> bool:
         """Return whether ``stamp_ns`` confirms a jump; raise if it is the first to claim one."""

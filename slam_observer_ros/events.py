@@ -102,7 +102,8 @@ class LandmarkTruth:
 def flatten(event: Event) -> Event:
     """Return the event without what leaves the plane z = 0 or turns out of it."""
     if isinstance(event, VelocityEvent):
-        return replace(event, body_velocity=event.body_velocity * _PLANAR_VELOCITY)
+        planar_velocity = event.body_velocity * _PLANAR_VELOCITY
+        return VelocityEvent(event.stamp_ns, planar_velocity, event.covariance)
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
     return replace(event, points=event.points * _PLANAR_POINT, velocities=velocities)
 

@@ -34,8 +34,7 @@ def check_event(event: Event) -> None:
 
 
 def _check_velocity(event: VelocityEvent) -> None:
-    _check_array('body velocity', event.body_velocity, (6,))
-    _check_size('body velocity', event.body_velocity)
+    _check_coordinates('body velocity', event.body_velocity, (6,))
     if event.covariance is not None:
         _check_array('velocity covariance', event.covariance, (6, 6))
         _check_definite('velocity covariance', event.covariance)
@@ -43,8 +42,7 @@ def _check_velocity(event: VelocityEvent) -> None:
 
 def _check_observation(event: ObservationEvent) -> None:
     m = len(event.points)
-    _check_array('landmark points', event.points, (m, 3))
-    _check_size('landmark points', event.points)
+    _check_coordinates('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'{len(event.ids)} ids for {m} landmark points')
     known = event.ids[event.ids != UNKNOWN_ID]
@@ -56,8 +54,16 @@ def _check_observation(event: ObservationEvent) -> None:
         _check_array('landmark covariances', event.covariances, (m, 3, 3))
         _check_definite('landmark covariances', event.covariances)
     if event.velocities is not None:
-        _check_array('landmark velocities', event.velocities, (m, 3))
-        _check_size('landmark velocities', event.velocities)
+        _check_coordinates('landmark velocities', event.velocities, (m, 3))
+
+
+def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+    # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
+    if array.shape == shape and np.vdot(array, array) <= LARGEST**2:
+        return
+    _check_array(name, array, shape)
+    if np.abs(array).max(initial=0.0) > LARGEST:
+        raise InvalidEventError('too_large', f'{name} have an entry beyond {LARGEST:g}')
 
 
 def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
@@ -65,11 +71,6 @@ def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
         raise InvalidEventError('wrong_shape', f'{name} have shape {array.shape}, not {shape}')
     if not np.isfinite(array).all():
         raise InvalidEventError('not_finite', f'{name} have a NaN or infinite entry')
-
-
-def _check_size(name: str, array: FloatArray) -> None:
-    if np.abs(array).max(initial=0.0) > LARGEST:
-        raise InvalidEventError('too_large', f'{name} have an entry beyond {LARGEST:g}')
 
 
 def _check_definite(name: str, covariances: FloatArray) -> None:

@@ -72,10 +72,9 @@ class VelocityHistory:
         events = self._events[max(first, 0) : last]
         if first < 0:
             events.insert(0, VelocityEvent(start_ns - self._timeout_ns, np.zeros(6)))
-        stamps = np.array([event.stamp_ns for event in events], dtype=np.int64)
-        begins = np.maximum(stamps, start_ns)
-        ends = np.append(stamps[1:], end_ns)[: len(stamps)]
-        stops = np.clip(stamps + self._timeout_ns, begins, ends)
+        stamps = np.array([*(event.stamp_ns for event in events), end_ns], dtype=np.int64)
+        begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
+        stops = np.minimum(np.maximum(stamps[:-1] + self._timeout_ns, begins), ends)
         return HeldVelocities(
             np.array([event.body_velocity for event in events]).reshape(-1, 6),
             [event.covariance for event in events],
