@@ -15,7 +15,6 @@ large D and d_i are is what the gain designs in :mod:`slam_observer_ros.gains` d
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import accumulate
 
 import numpy as np
 
@@ -166,7 +165,12 @@ class Observer:
 
         """
         motions = se3.exp(body_velocities * dt_s[:, None])
-        return np.array(list(accumulate(motions, np.matmul, initial=self.A)))
+        path = np.concatenate([self.A[None], motions])
+        reach = 1
+        while reach < len(path):  # log k products of stacks cost less than k of matrices
+            path[reach:] = path[:-reach] @ path[reach:]
+            reach *= 2
+        return path
 
     def propagate(self, path: FloatArray) -> None:
         """Advance Â to the end of a ``path`` (k + 1, 4, 4)."""

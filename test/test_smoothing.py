@@ -24,6 +24,7 @@ from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.gains.base import Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.history import History
+from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Frames, Prior, Smoother, Solution
@@ -190,7 +191,8 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
         history = History(axes, start)
         for a, b in pairwise((0, *cuts, k)):
             part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], np.zeros(b - a), covariances[a:b])
-            history.move(part, calibration)
+            P = initial_covariance(axes, calibration)
+            history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
         nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
         history.see(nothing, path[-1], np.empty((0, 3)))
         return history.frames()

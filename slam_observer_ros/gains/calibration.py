@@ -36,7 +36,8 @@ class Calibration:
         self._biased = axes.pose[bias[axes.pose] > 0.0]
         self._scale = np.ones(6)
         self._bias = np.zeros(6)
-        self.count = len(self._scaled) + len(self._biased)
+        self._calibrated = np.append(self._scaled, self._biased)
+        self.count = len(self._calibrated)
         errors = np.append(scale[self._scaled], bias[self._biased])
         self.initial_variances = errors**2
         self.drift_variances = errors**2 * settings.calibration_drift**2
@@ -55,9 +56,10 @@ class Calibration:
 
         From ε' = Ad_Â (V ∘ s̃ + b̃); ``Ad`` (k, p, 6) holds the estimated rows of Ad_Â.
         """
-        by_bias = np.einsum('kij,k->ij', Ad, motion.dt_s)
-        by_scale = np.einsum('kij,kj,k->ij', Ad, motion.measured_velocities, motion.dt_s)
-        return np.hstack([by_scale[:, self._scaled], by_bias[:, self._biased]])
+        rates = motion.measured_velocities[:, self._calibrated]
+        rates[:, len(self._scaled) :] = 1.0
+        F: FloatArray = np.einsum('kij,kj,k->ij', Ad[:, :, self._calibrated], rates, motion.dt_s)
+        return F
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""

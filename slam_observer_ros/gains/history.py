@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from slam_observer_ros.axes import Axes
-from slam_observer_ros.gains.base import Motion, Seen
-from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.smoothing import Frames, Prior
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -50,19 +49,32 @@ class History:
         self._shifts: list[FloatArray] = []
         self._information: list[FloatArray] = []
         self._calibration = prior.calibration
-        self._motion, self._covariance, self._sensitivity = self._at_rest()
+        self._start: FloatArray | None = None
+        self._end = prior.pose
+        self._noise, self._sensitivity = self._at_rest()
 
-    def move(self, motion: Motion, calibration: Calibration) -> None:
-        """Append a motion to the one that leads to the next frame."""
-        end = se3.inverse(motion.path[-1])
-        Ad = se3.adjoint(end @ motion.path[:-1])[:, self._axes.pose]
-        step = se3.inverse(motion.path[0]) @ motion.path[-1]
-        carry = se3.adjoint(se3.inverse(step))[np.ix_(self._axes.pose, self._axes.pose)]
-        noise = np.sum(Ad @ motion.covariances @ Ad.swapaxes(1, 2), axis=0)
-        self._motion = self._motion @ step
-        self._covariance = carry @ self._covariance @ carry.T + noise
-        self._sensitivity = carry @ self._sensitivity + calibration.sensitivity(Ad, motion)
-        self._calibration = calibration.values
+    def move(
+        self, path: FloatArray, noise: FloatArray, sensitivity: FloatArray, calibration: FloatArray
+    ) -> None:
+        """Append a motion to the one that leads to the next frame.
+
+        Parameters
+        ----------
+        path : FloatArray
+            (k + 1, 4, 4) poses along it.
+        noise, sensitivity : FloatArray
+            (d, d) and (d, c) covariance of its error ε, reference frame, and what the
+            calibration's error adds to ε.
+        calibration : FloatArray
+            (c,) calibration with which it was computed.
+
+        """
+        if self._start is None:
+            self._start = path[0]
+        self._end = path[-1]
+        self._noise = self._noise + noise
+        self._sensitivity = self._sensitivity + sensitivity
+        self._calibration = calibration
 
     def see(self, seen: Seen, pose: FloatArray, shifts: FloatArray) -> None:
         """Close a frame: the observation ``seen``, made at ``pose`` (4, 4).
@@ -70,18 +82,22 @@ class History:
         ``shifts`` (m, 3) is how far the landmarks had moved by themselves, metres.
         """
         k = self._axes.point
+        start = self._end if self._start is None else self._start
+        back = se3.inverse(self._end)
+        to_body = se3.adjoint(back)[np.ix_(self._axes.pose, self._axes.pose)]
         self.stamps_ns.append(seen.stamp_ns)
         self.poses.append(pose)
-        self._motions.append(self._motion)
-        self._covariances.append(self._covariance)
-        self._sensitivities.append(self._sensitivity)
+        self._motions.append(se3.inverse(start) @ self._end)
+        self._covariances.append(to_body @ self._noise @ to_body.T)
+        self._sensitivities.append(to_body @ self._sensitivity)
         self._calibrations.append(self._calibration)
         self._landmarks.append(seen.indices)
         self._points.append(seen.points)
         self._shifts.append(shifts)
         information = np.linalg.inv(seen.covariances[:, :k, :k])
         self._information.append(np.asarray(information, dtype=np.float64))
-        self._motion, self._covariance, self._sensitivity = self._at_rest()
+        self._start = None
+        self._noise, self._sensitivity = self._at_rest()
 
     def relocate_landmarks(self, indices: IntArray) -> None:
         """Forget all about the landmarks at ``indices`` but their latest observation."""
@@ -136,7 +152,7 @@ class History:
         first = len(self.prior.covariance) - k * len(self.prior.points)
         return (first + k * indices[:, None] + np.arange(k)).ravel()
 
-    def _at_rest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return no motion, its covariance and its sensitivity to the calibration."""
+    def _at_rest(self) -> tuple[FloatArray, FloatArray]:
+        """Return the covariance and the sensitivity of no motion."""
         d = len(self._axes.pose)
-        return np.eye(4), np.zeros((d, d)), np.zeros((d, len(self._calibration)))
+        return np.zeros((d, d)), np.zeros((d, len(self._calibration)))

@@ -16,7 +16,9 @@ def initial_covariance(axes: Axes, calibration: Calibration) -> FloatArray:
     return np.diag(np.append(np.zeros(len(axes.pose)), calibration.initial_variances))
 
 
-def predict(P: FloatArray, axes: Axes, calibration: Calibration, motion: Motion) -> None:
+def predict(
+    P: FloatArray, axes: Axes, calibration: Calibration, motion: Motion
+) -> tuple[FloatArray, FloatArray]:
     """Add a motion's noise Ad_Â Q Ad_Âᵀ to the pose block of P, in place.
 
     Parameters
@@ -28,16 +30,25 @@ def predict(P: FloatArray, axes: Axes, calibration: Calibration, motion: Motion)
     motion : Motion
         The motion since the last call.
 
+    Returns
+    -------
+    noise : FloatArray
+        (p, p) what was added to the pose block.
+    F : FloatArray
+        (p, c) how the pose error has grown with that of the calibration.
+
     """
     p = len(axes.pose)
     c = slice(p, p + calibration.count)
     Ad = se3.adjoint(motion.path[:-1])[:, axes.pose]
+    F = calibration.sensitivity(Ad, motion)
     if calibration.count:
-        F = calibration.sensitivity(Ad, motion)
         P[:p] += F @ P[c]
         P[:, :p] += P[:, c] @ F.T
         P[p:, :p] = P[:p, p:].T
         P[c, c] += np.diag(calibration.drift_variances * np.sum(motion.dt_s))
-    P[:p, :p] += np.sum(Ad @ motion.covariances @ so3.transpose(Ad), axis=0)
+    noise: FloatArray = np.sum(Ad @ motion.covariances @ so3.transpose(Ad), axis=0)
+    P[:p, :p] += noise
     # No observation takes a skew part away again, so rounding must not add to it.
     P[:p, :p] = 0.5 * (P[:p, :p] + P[:p, :p].T)
+    return noise, F

@@ -97,8 +97,9 @@ class RiccatiGains:
 
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
-        self._history.move(motion, self._calibration)
-        predict(self._P, self._axes, self._calibration, motion)
+        noise, F = predict(self._P, self._axes, self._calibration, motion)
+        if self._looks_back:
+            self._history.move(motion.path, noise, F, self._calibration.values)
         if self._is_moving:
             everything = np.arange(self._count)
             a, u = self._columns(everything), self._velocity_columns(everything)
@@ -238,12 +239,11 @@ class RiccatiGains:
         blind stretch a plain filter closes its loop badly. The smoother's marginal becomes the
         filter's covariance, and its solution the observer's new reference ξ°, with â_i = 0.
         """
-        interval = self._settings.hindsight_interval
-        if interval == 0 or self._is_moving:
+        if not self._looks_back:
             return
         self._history.see(seen, observer.A, observer.shifts[seen.indices])
         self._observations += 1
-        rested = self._observations >= interval
+        rested = self._observations >= self._settings.hindsight_interval
         turned_far = self._turn_squared > self._settings.hindsight_turn**2
         if in_doubt or self._window_is_full or (turned_far and rested):
             self._rebase(observer)
@@ -294,6 +294,10 @@ class RiccatiGains:
         J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(self._axes.pose, self._axes.pose)]
         self._P = J @ covariance @ J.T
         self._history.poses = list(solution.poses)
+
+    @property
+    def _looks_back(self) -> bool:
+        return self._settings.hindsight_interval > 0 and not self._is_moving
 
     @property
     def _window_is_full(self) -> bool:
