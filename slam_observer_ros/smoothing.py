@@ -16,9 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from slam_observer_ros.axes import Axes
+from slam_observer_ros.bordered_chain import Equations, Factors, landmark_columns, sum_at
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -105,18 +105,6 @@ class Solution:
     points: FloatArray
 
 
-@dataclass(slots=True)
-class _Equations:
-    """The normal equations, block by block; S + 1 poses of d axes and a border of b unknowns."""
-
-    diagonal: FloatArray  # (S + 1, d, d)
-    above: FloatArray  # (S, d, d) block of poses s and s + 1
-    border: FloatArray  # (S + 1, d, b)
-    corner: FloatArray  # (b, b)
-    gradient: FloatArray  # (S + 1, d)
-    border_gradient: FloatArray  # (b,)
-
-
 class Smoother:
     """Gauss–Newton iterations over a prior and frames.
 
@@ -145,7 +133,7 @@ class Smoother:
         """Iterate from ``start`` until no unknown moves by more than ``tolerance`` (m, rad)."""
         solution = start
         for _ in range(iterations):
-            change, border_change = _Factors(self._linearise(solution)).solve()
+            change, border_change = Factors(self._linearise(solution)).solve()
             solution = self._moved(solution, change, border_change)
             if max(np.abs(change).max(), np.abs(border_change).max(initial=0.0)) < tolerance:
                 break
@@ -153,7 +141,7 @@ class Smoother:
 
     def marginal(self, solution: Solution) -> FloatArray:
         """Return the covariance of (η, dc, dp), η being that of the last pose."""
-        return _Factors(self._linearise(solution)).marginal()
+        return Factors(self._linearise(solution)).marginal()
 
     def _moved(
         self, solution: Solution, change: FloatArray, border_change: FloatArray
@@ -167,23 +155,30 @@ class Smoother:
             solution.points + self._axes.full_points(border_change[c:]),
         )
 
-    def _linearise(self, solution: Solution) -> _Equations:
-        d, S = len(self._axes.pose), len(solution.poses)
-        b = len(solution.calibration) + self._axes.point * len(solution.points)
-        equations = _Equations(
-            np.zeros((S, d, d)),
+    def _linearise(self, solution: Solution) -> Equations:
+        c, k, frames = len(solution.calibration), self._axes.point, self._frames
+        S, d, b = len(solution.poses), len(self._axes.pose), c + k * len(solution.points)
+        H, pull = self._observations(solution)
+        poses = frames.frames + 1
+        columns = landmark_columns(frames.landmarks, c, k)
+        axes = np.arange(d)
+        equations = Equations(
+            sum_at((S, d, d), (poses[:, None, None], axes[:, None], axes), H[:, :d, :d]),
             np.zeros((S - 1, d, d)),
-            np.zeros((S, d, b)),
-            np.zeros((b, b)),
-            np.zeros((S, d)),
-            np.zeros(b),
+            np.zeros((S, d, c)),
+            poses,
+            frames.landmarks,
+            H[:, :d, d:],
+            np.zeros((d, b)),
+            sum_at((b, b), (columns[:, :, None], columns[:, None]), H[:, d:, d:]),
+            sum_at((S, d), (poses[:, None], axes), pull[:, :d]),
+            sum_at((b,), (columns,), pull[:, d:]),
         )
         self._add_prior(equations, solution)
         self._add_motions(equations, solution)
-        self._add_observations(equations, solution)
         return equations
 
-    def _add_prior(self, equations: _Equations, solution: Solution) -> None:
+    def _add_prior(self, equations: Equations, solution: Solution) -> None:
         prior, d, k = self._prior, len(self._axes.pose), self._axes.point
         eta, pose = se3.log(se3.inverse(prior.pose) @ solution.poses[0]), self._axes.pose
         shifts = (solution.points[: len(prior.points)] - prior.points)[:, :k]
@@ -195,64 +190,50 @@ class Smoother:
         pull = information @ error
         information[:, :d] = information[:, :d] @ J
         equations.diagonal[0] += information[:d, :d]
-        equations.border[0, :, :known] += information[:d, d:]
+        equations.first[:, :known] += information[:d, d:]
         equations.corner[:known, :known] += information[d:, d:]
         equations.gradient[0] += pull[:d]
         equations.border_gradient[:known] += pull[d:]
 
-    def _add_motions(self, equations: _Equations, solution: Solution) -> None:
+    def _add_motions(self, equations: Equations, solution: Solution) -> None:
         """Add e_s = log((M_s exp(F_s (c − c_s)))⁻¹ Â_{s−1}⁻¹ Â_s) of each motion M_s."""
-        frames, pose, c = self._frames, self._axes.pose, len(solution.calibration)
+        frames, pose = self._frames, self._axes.pose
+        d, c = len(pose), len(solution.calibration)
         eta = np.zeros((len(frames.motions), 6))
         off = solution.calibration - frames.calibrations
         eta[:, pose] = (frames.sensitivities @ off[:, :, None])[:, :, 0]
         step = se3.inverse(solution.poses[:-1]) @ solution.poses[1:]
         error = se3.log(se3.inverse(frames.motions @ se3.exp(eta)) @ step)
-        J_right = se3.left_jacobian_inverse(-error)
-        J_to = J_right[:, pose][:, :, pose]
-        J_from = -(J_right @ se3.adjoint(se3.inverse(step)))[:, pose][:, :, pose]
-        J_off = se3.left_jacobian_inverse(error) @ se3.left_jacobian(-eta)
-        F = -J_off[:, pose][:, :, pose] @ frames.sensitivities
-        W = self._motion_information
-        We = W @ error[:, pose, None]
-        equations.diagonal[1:] += so3.transpose(J_to) @ W @ J_to
-        equations.diagonal[:-1] += so3.transpose(J_from) @ W @ J_from
-        equations.above += so3.transpose(J_from) @ W @ J_to
-        equations.border[1:, :, :c] += so3.transpose(J_to) @ W @ F
-        equations.border[:-1, :, :c] += so3.transpose(J_from) @ W @ F
-        equations.corner[:c, :c] += np.sum(so3.transpose(F) @ W @ F, axis=0)
-        equations.gradient[1:] += (so3.transpose(J_to) @ We)[:, :, 0]
-        equations.gradient[:-1] += (so3.transpose(J_from) @ We)[:, :, 0]
-        equations.border_gradient[:c] += np.sum(so3.transpose(F) @ We, axis=0)[:, 0]
+        J_to = se3.left_jacobian_inverse(-error)
+        J_from = -J_to @ se3.adjoint(se3.inverse(step))
+        J_off = -se3.left_jacobian_inverse(error) @ se3.left_jacobian(-eta)
+        F = J_off[:, pose][:, :, pose] @ frames.sensitivities
+        J = np.concatenate([J_from[:, pose][:, :, pose], J_to[:, pose][:, :, pose], F], axis=2)
+        H, pull = _normal(J, self._motion_information, error[:, pose])
+        equations.diagonal[:-1] += H[:, :d, :d]
+        equations.diagonal[1:] += H[:, d : 2 * d, d : 2 * d]
+        equations.above[:] += H[:, :d, d : 2 * d]
+        equations.shared[:-1] += H[:, :d, 2 * d :]
+        equations.shared[1:] += H[:, d : 2 * d, 2 * d :]
+        equations.corner[:c, :c] += np.sum(H[:, 2 * d :, 2 * d :], axis=0)
+        equations.gradient[:-1] += pull[:, :d]
+        equations.gradient[1:] += pull[:, d : 2 * d]
+        equations.border_gradient[:c] += np.sum(pull[:, 2 * d :], axis=0)
 
-    def _add_observations(self, equations: _Equations, solution: Solution) -> None:
-        """Add R_Âᵀ (p_i − x_Â) − y of each observed point, with Huber's weight."""
+    def _observations(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
+        """Return the normal equations of R_Âᵀ (p_i − x_Â) − y, with Huber's weight.
+
+        They are (M, d + k, d + k) and (M, d + k), for the pose and the landmark of each point.
+        """
         frames, k = self._frames, self._axes.point
         poses = solution.poses[frames.frames + 1]
         R = poses[:, :3, :3]
         arms = solution.points[frames.landmarks] + frames.shifts - poses[:, :3, 3]
         predicted = (so3.transpose(R) @ arms[:, :, None])[:, :, 0]
         error = (predicted - frames.points)[:, :k]
-        J_pose = -self._axes.output_matrix(predicted)
         J_point = so3.transpose(R)[:, :k, :k]
-        W = frames.information * self._weights(error)[:, None, None]
-        We = W @ error[:, :, None]
-        rows = frames.frames + 1
-        columns = len(solution.calibration) + k * frames.landmarks[:, None] + np.arange(k)
-        axes = np.arange(len(self._axes.pose))
-        np.add.at(equations.diagonal, rows, so3.transpose(J_pose) @ W @ J_pose)
-        np.add.at(equations.gradient, rows, (so3.transpose(J_pose) @ We)[:, :, 0])
-        np.add.at(
-            equations.border,
-            (rows[:, None, None], axes[:, None], columns[:, None, :]),
-            so3.transpose(J_pose) @ W @ J_point,
-        )
-        np.add.at(
-            equations.corner,
-            (columns[:, :, None], columns[:, None, :]),
-            so3.transpose(J_point) @ W @ J_point,
-        )
-        np.add.at(equations.border_gradient, columns, (so3.transpose(J_point) @ We)[:, :, 0])
+        J = np.concatenate([-self._axes.output_matrix(predicted), J_point], axis=2)
+        return _normal(J, frames.information * self._weights(error)[:, None, None], error)
 
     def _weights(self, error: FloatArray) -> FloatArray:
         """Return Huber's weights (M,), which fall off faster where a filter would reject."""
@@ -264,56 +245,10 @@ class Smoother:
         return weights
 
 
-class _Factors:
-    """Factors of the normal equations: banded for the poses, dense for the border."""
-
-    def __init__(self, equations: _Equations) -> None:
-        S, d, b = equations.border.shape
-        self._d = d
-        self._chain = cholesky_banded(_banded(equations.diagonal, equations.above))
-        border = equations.border.reshape(S * d, b)
-        self._gradient = equations.gradient.ravel()
-        self._eliminated = self._solve_chain(border)
-        self._corner = cho_factor(equations.corner - border.T @ self._eliminated)
-        self._border = border
-        self._border_gradient = equations.border_gradient
-
-    def solve(self) -> tuple[FloatArray, FloatArray]:
-        """Return the changes (S, d) of the poses and (b,) of the border."""
-        chain = self._solve_chain(self._gradient)
-        border: FloatArray = -cho_solve(
-            self._corner, self._border_gradient - self._border.T @ chain
-        )
-        return (-chain - self._eliminated @ border).reshape(-1, self._d), border
-
-    def marginal(self) -> FloatArray:
-        """Return the covariance (d + b, d + b) of the last pose and the border."""
-        d, b = self._d, self._border.shape[1]
-        last = np.zeros((len(self._gradient), d))
-        last[-d:] = np.eye(d)
-        corner = cho_solve(self._corner, np.eye(b))
-        tail = self._eliminated[-d:]
-        covariance = np.empty((d + b, d + b))
-        covariance[:d, :d] = self._solve_chain(last)[-d:] + tail @ corner @ tail.T
-        covariance[:d, d:] = -tail @ corner
-        covariance[d:, :d] = covariance[:d, d:].T
-        covariance[d:, d:] = corner
-        return covariance
-
-    def _solve_chain(self, right: FloatArray) -> FloatArray:
-        return np.asarray(cho_solve_banded((self._chain, False), right), dtype=np.float64)
-
-
-def _banded(diagonal: FloatArray, above: FloatArray) -> FloatArray:
-    """Return the upper banded form (2 d, S d) of a block-tridiagonal matrix."""
-    S, d = diagonal.shape[:2]
-    band = np.zeros((2 * d, S, d))
-    for row in range(d):
-        for column in range(row, d):
-            band[2 * d - 1 + row - column, :, column] = diagonal[:, row, column]
-        for column in range(d):
-            band[d - 1 + row - column, 1:, column] = above[:, row, column]
-    return band.reshape(2 * d, S * d)
+def _normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Jᵀ W J (M, q, q) and Jᵀ W e (M, q) for J (M, k, q), W (M, k, k) and e (M, k)."""
+    JW = so3.transpose(J) @ W
+    return JW @ J, (JW @ error[:, :, None])[:, :, 0]
 
 
 def _inverse(covariances: FloatArray) -> FloatArray:

@@ -1,0 +1,281 @@
+"""Normal equations of a chain of poses that see landmarks, solved exactly.
+
+    [ T   B ] [ x ]     [ g ]
+    [ Bᵀ  D ] [ z ] = − [ h ]
+
+T is block-tridiagonal, as each pose is linked to the next one only. The border z is shared by all
+poses: c unknowns that each depends on, then k for each landmark.
+
+A pose sees few landmarks, but once those before it are eliminated it depends on all that they
+saw. So the poses between every :data:`STRIDE`-th one go first, all such stretches side by side: a
+stretch depends on its two ends, on c and on what was seen along it. The shorter chain that is
+left is eliminated by a banded Cholesky factor, with the whole border; so is the whole chain if
+the border is small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, cholesky_banded
+from scipy.linalg.blas import dtbsv
+
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.types import FloatArray, IntArray
+
+STRIDE = 8
+
+SMALL_BORDER = 100
+"""Size of a border which, carried along the whole chain, costs less than a detour."""
+
+
+@dataclass(frozen=True, slots=True)
+class Equations:
+    """The normal equations, block by block, of S poses and a border of b unknowns.
+
+    Attributes
+    ----------
+    diagonal : FloatArray
+        (S, d, d) blocks of T.
+    above : FloatArray
+        (S - 1, d, d) blocks of T that link poses s and s + 1.
+    shared : FloatArray
+        (S, d, c) blocks of B that link poses to the first c unknowns of the border.
+    poses, landmarks : IntArray
+        (M,) which pose saw which landmark.
+    seen : FloatArray
+        (M, d, k) blocks of B that link the two.
+    first : FloatArray
+        (d, b) what else links the first pose to the border.
+    corner : FloatArray
+        (b, b) D.
+    gradient : FloatArray
+        (S, d) g.
+    border_gradient : FloatArray
+        (b,) h.
+
+    """
+
+    diagonal: FloatArray
+    above: FloatArray
+    shared: FloatArray
+    poses: IntArray
+    landmarks: IntArray
+    seen: FloatArray
+    first: FloatArray
+    corner: FloatArray
+    gradient: FloatArray
+    border_gradient: FloatArray
+
+
+class Factors:
+    """Factors of the normal equations.
+
+    Parameters
+    ----------
+    equations : Equations
+        What is to be solved.
+
+    Raises
+    ------
+    LinAlgError
+        If the equations leave something open.
+
+    """
+
+    def __init__(self, equations: Equations) -> None:
+        self._stretches = _Stretches(equations)
+        diagonal, above, border, gradient = self._stretches.kept_chain(equations)
+        corner, self._border_gradient = self._stretches.border(equations)
+        self._d, b = border.shape[1:]
+        self._chain = np.asfortranarray(cholesky_banded(_banded(diagonal, above)))
+        self._gradient = self._forward(gradient.ravel())
+        columns = border.reshape(gradient.size, b).T
+        self._border = np.reshape([self._forward(column) for column in columns], columns.shape)
+        self._corner = cho_factor(corner - self._border @ self._border.T)
+
+    def solve(self) -> tuple[FloatArray, FloatArray]:
+        """Return the changes (S, d) of the poses and (b,) of the border."""
+        open_gradient = self._border_gradient - self._border @ self._gradient
+        border: FloatArray = -cho_solve(self._corner, open_gradient)
+        bandwidth = len(self._chain) - 1
+        kept = -dtbsv(bandwidth, self._chain, self._gradient + border @ self._border)
+        return self._stretches.fill_in(kept.reshape(-1, self._d), border), border
+
+    def marginal(self) -> FloatArray:
+        """Return the covariance (d + b, d + b) of the last pose and the border."""
+        d, b = self._d, len(self._border)
+        corner = cho_solve(self._corner, np.eye(b))
+        units = np.eye(d, len(self._gradient), len(self._gradient) - d)
+        root = np.array([self._forward(unit)[-d:] for unit in units])  # U⁻¹ of the last pose
+        tail = root @ self._border[:, -d:].T
+        covariance = np.empty((d + b, d + b))
+        covariance[:d, :d] = root @ root.T + tail @ corner @ tail.T
+        covariance[:d, d:] = -tail @ corner
+        covariance[d:, :d] = covariance[:d, d:].T
+        covariance[d:, d:] = corner
+        return covariance
+
+    def _forward(self, right: FloatArray) -> FloatArray:
+        """Return U⁻ᵀ b, T = Uᵀ U: half of what solving by T costs, and all that is needed."""
+        return np.asarray(dtbsv(len(self._chain) - 1, self._chain, right, trans=1))
+
+
+class _Stretches:
+    """The J stretches of poses between every :data:`STRIDE`-th one, eliminated.
+
+    A stretch depends on its start, its end and a part of the border: ``_columns`` (J, c + k m),
+    filled up with columns behind the border's last where it saw less than m landmarks.
+    """
+
+    def __init__(self, equations: Equations) -> None:
+        S, self._d = equations.gradient.shape
+        is_small = len(equations.corner) <= SMALL_BORDER
+        self._count = 0 if is_small else (S - 1) // STRIDE
+        self._inner = STRIDE * np.arange(self._count)[:, None] + np.arange(1, STRIDE)
+        self._kept = np.setdiff1d(np.arange(S), self._inner)
+        stretch, place = np.divmod(equations.poses, STRIDE)
+        self._is_inner = (stretch < self._count) & (place > 0)
+        T, X = self._matrices(equations), self._links(equations)
+        self._solved = np.linalg.solve(T, X)
+        self._lost = so3.transpose(X) @ self._solved
+
+    def _matrices(self, equations: Equations) -> FloatArray:
+        """Return the part of T (J, (STRIDE − 1) d, (STRIDE − 1) d) of each stretch."""
+        J, d, row = self._count, self._d, np.arange(STRIDE - 1)
+        T = np.zeros((J, STRIDE - 1, d, STRIDE - 1, d))
+        above = equations.above[self._inner[:, :-1]].swapaxes(0, 1)
+        T[:, row, :, row] = equations.diagonal[self._inner].swapaxes(0, 1)
+        T[:, row[:-1], :, row[1:]] = above
+        T[:, row[1:], :, row[:-1]] = so3.transpose(above)
+        return T.reshape(J, (STRIDE - 1) * d, (STRIDE - 1) * d)
+
+    def _links(self, equations: Equations) -> FloatArray:
+        """Return (J, (STRIDE − 1) d, …): links to start, end and columns; then the gradient."""
+        J, d, (k, c) = self._count, self._d, (equations.seen.shape[2], equations.shared.shape[2])
+        stretch, place = np.divmod(equations.poses[self._is_inner], STRIDE)
+        beyond = (len(equations.corner) - c) // k
+        local, slots = _group(stretch, equations.landmarks[self._is_inner], J, beyond)
+        own = landmark_columns(local, c, k).reshape(J, k * local.shape[1])
+        self._columns = np.hstack([np.tile(np.arange(c), (J, 1)), own])
+        seen = sum_at(
+            (J, STRIDE - 1, d, k * local.shape[1]),
+            (
+                stretch[:, None, None],
+                place[:, None, None] - 1,
+                np.arange(d)[:, None],
+                landmark_columns(slots, 0, k)[:, None],
+            ),
+            equations.seen[self._is_inner],
+        )
+        to_start, to_end = np.zeros((2, J, STRIDE - 1, d, d))
+        to_start[:, 0] = so3.transpose(equations.above[self._inner[:, 0] - 1])
+        to_end[:, -1] = equations.above[self._inner[:, -1]]
+        shared, gradient = equations.shared[self._inner], equations.gradient[self._inner]
+        X = np.concatenate([to_start, to_end, shared, seen, gradient[..., None]], axis=-1)
+        return X.reshape(J, (STRIDE - 1) * d, X.shape[-1])
+
+    def kept_chain(
+        self, equations: Equations
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the blocks (R, d, d), (R − 1, d, d) and (R, d, b) of the R poses that are left.
+
+        The last (R, d) is their gradient.
+        """
+        J, d, start, end = self._count, self._d, slice(self._d), slice(self._d, 2 * self._d)
+        diagonal, gradient = equations.diagonal[self._kept], equations.gradient[self._kept]
+        diagonal[:J] -= self._lost[:, start, start]
+        diagonal[1 : J + 1] -= self._lost[:, end, end]
+        gradient[:J] -= self._lost[:, start, -1]
+        gradient[1 : J + 1] -= self._lost[:, end, -1]
+        above = np.concatenate([-self._lost[:, start, end], equations.above[STRIDE * J :]])
+        border = self._kept_border(equations)
+        stretch, axis, columns = np.arange(J)[:, None, None], np.arange(d)[:, None], self._columns
+        border[stretch, axis, columns[:, None]] -= self._lost[:, start, 2 * d : -1]
+        border[stretch + 1, axis, columns[:, None]] -= self._lost[:, end, 2 * d : -1]
+        return diagonal, above, border[:, :, : len(equations.corner)], gradient
+
+    def _kept_border(self, equations: Equations) -> FloatArray:
+        """Return the links (R, d, b + k) of the poses that are left to the border and beyond."""
+        k, c, is_kept = equations.seen.shape[2], equations.shared.shape[2], ~self._is_inner
+        columns = landmark_columns(equations.landmarks[is_kept], c, k)
+        border = sum_at(
+            (len(self._kept), self._d, len(equations.corner) + k),
+            (
+                np.searchsorted(self._kept, equations.poses[is_kept])[:, None, None],
+                np.arange(self._d)[:, None],
+                columns[:, None],
+            ),
+            equations.seen[is_kept],
+        )
+        border[:, :, :c] += equations.shared[self._kept]
+        border[0, :, : len(equations.corner)] += equations.first
+        return border
+
+    def border(self, equations: Equations) -> tuple[FloatArray, FloatArray]:
+        """Return what is left of D (b, b) and of its gradient (b,)."""
+        b, columns = len(equations.corner), self._columns
+        size, own = b + equations.seen.shape[2], slice(2 * self._d, -1)
+        lost = self._lost[:, own, own]
+        corner = sum_at((size, size), (columns[:, :, None], columns[:, None]), lost)
+        gradient = sum_at((size,), (columns,), self._lost[:, own, -1])
+        return equations.corner - corner[:b, :b], equations.border_gradient - gradient[:b]
+
+    def fill_in(self, kept: FloatArray, border: FloatArray) -> FloatArray:
+        """Return the changes (S, d) of all poses from those (R, d) left and (b,) of the border."""
+        J, d = self._count, self._d
+        beyond = np.append(border, np.zeros(self._columns.max(initial=0)))
+        ends = np.hstack([kept[:J], kept[1 : J + 1], beyond[self._columns], np.ones((J, 1))])
+        changes = np.empty((len(self._kept) + self._inner.size, d))
+        changes[self._kept] = kept
+        changes[self._inner] = -(self._solved @ ends[:, :, None]).reshape(J, STRIDE - 1, d)
+        return changes
+
+
+def landmark_columns(landmarks: IntArray, c: int, k: int) -> IntArray:
+    """Return the unknowns (…, k) of the border that belong to landmarks (…)."""
+    return c + k * landmarks[..., None] + np.arange(k)
+
+
+def sum_at(shape: tuple[int, ...], places: tuple[IntArray, ...], values: FloatArray) -> FloatArray:
+    """Return an array of ``shape`` with ``values`` added up at ``places``, which broadcast."""
+    flat = places[0]
+    for length, place in zip(shape[1:], places[1:], strict=True):
+        flat = flat * length + place
+    sums = np.bincount(flat.ravel(), values.ravel(), math.prod(shape))
+    return sums.reshape(shape).astype(np.float64, copy=False)  # of nothing they are integers
+
+
+def _group(
+    stretch: IntArray, landmarks: IntArray, count: int, beyond: int
+) -> tuple[IntArray, IntArray]:
+    """Give the landmarks that each of ``count`` stretches saw numbers of its own.
+
+    Returns
+    -------
+    local : IntArray
+        (count, m) which they are, filled up with ``beyond``.
+    slots : IntArray
+        (M,) the number of each landmark in its stretch.
+
+    """
+    pairs, inverse = np.unique(stretch * (beyond + 1) + landmarks, return_inverse=True)
+    of_stretch, landmark = np.divmod(pairs, beyond + 1)
+    number = np.arange(len(pairs)) - np.searchsorted(of_stretch, of_stretch)
+    local = np.full((count, number.max(initial=-1) + 1), beyond)
+    local[of_stretch, number] = landmark
+    return local, number[inverse]
+
+
+def _banded(diagonal: FloatArray, above: FloatArray) -> FloatArray:
+    """Return the upper banded form (2 d, S d) of a block-tridiagonal matrix."""
+    S, d = diagonal.shape[:2]
+    band = np.zeros((2 * d, S, d))
+    for row in range(d):
+        for column in range(row, d):
+            band[2 * d - 1 + row - column, :, column] = diagonal[:, row, column]
+        for column in range(d):
+            band[d - 1 + row - column, 1:, column] = above[:, row, column]
+    return band.reshape(2 * d, S * d)
