@@ -15,6 +15,8 @@ RESOLUTION_M = 1e-6
 LEAST_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
+_IDENTITY = np.eye(3)
+
 
 class NoiseModel:
     """Covariances in physical units.
@@ -56,8 +58,8 @@ class NoiseModel:
         some direction is known exactly.
         """
         covariances = self._stated(event)
-        least = RESOLUTION_M**2 + LEAST_SHARE * np.trace(covariances, axis1=1, axis2=2)
-        invertible: FloatArray = covariances + least[:, None, None] * np.eye(3)
+        least = RESOLUTION_M**2 + LEAST_SHARE * np.einsum('ijj->i', covariances)
+        invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
         return invertible
 
     def _stated(self, event: ObservationEvent) -> FloatArray:
@@ -66,8 +68,8 @@ class NoiseModel:
             return event.covariances
         s = self._settings
         if s.observation_model == 'cartesian':
-            return np.broadcast_to(s.point_noise**2 * np.eye(3), (len(event.points), 3, 3))
-        range_m = np.linalg.norm(event.points, axis=1)
+            return np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(event.points), 3, 3))
+        range_m = np.sqrt(np.einsum('ij,ij->i', event.points, event.points))
         if s.observation_model == 'stereo':
             along = range_m**2 * s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
             across = range_m * s.pixel_noise / s.stereo_focal_length
@@ -84,9 +86,8 @@ def _along_and_across(
 
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """
-    safe = np.where(range_m > 0.0, range_m, 1.0)
     across = np.where(range_m > 0.0, across, along)
-    sight = points / safe[:, None]
+    sight: FloatArray = points / np.maximum(range_m, np.finfo(np.float64).tiny)[:, None]
     outer = sight[:, :, None] * sight[:, None, :]
     spread = (along**2 - across**2)[:, None, None] * outer
-    return spread + (across**2)[:, None, None] * np.eye(3)
+    return spread + (across**2)[:, None, None] * _IDENTITY

@@ -297,6 +297,8 @@ class Slam:
 
 def _select(event: ObservationEvent, mask: BoolArray) -> ObservationEvent:
     """Return the part of an observation that ``mask`` (m,) picks."""
+    if mask.all():
+        return event
     return replace(
         event,
         ids=event.ids[mask],

@@ -84,7 +84,7 @@ class History:
         k = self._axes.point
         start = self._end if self._start is None else self._start
         back = se3.inverse(self._end)
-        to_body = se3.adjoint(back)[np.ix_(self._axes.pose, self._axes.pose)]
+        to_body = se3.adjoint(back)[self._axes.pose][:, self._axes.pose]
         self.stamps_ns.append(seen.stamp_ns)
         self.poses.append(pose)
         self._motions.append(se3.inverse(start) @ self._end)

@@ -190,9 +190,9 @@ class RiccatiGains:
         r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
         weights = observation_weights(r, CPC, noise, self._settings)
         passed = weights > 0.0
-        used = np.repeat(passed, k)
+        used = np.flatnonzero(np.repeat(passed, k))
         R = block_diagonal(noise[passed] / weights[passed, None, None])
-        S, PC = CPC[np.ix_(used, used)] + R, PC[:, used]
+        S, PC = CPC[used][:, used] + R, PC[:, used]
         K = np.linalg.solve(S, PC.T).T
         half = K @ (0.5 * S @ K.T - PC.T)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
@@ -224,7 +224,7 @@ class RiccatiGains:
         """
         if not observer.a.any():
             return
-        columns = self._columns(np.arange(self._count))
+        columns = self._map_columns
         L = self._axes.output_matrix(observer.a)
         L[:, :, self._axes.pose >= 3] = 0.0
         L = L.reshape(-1, self._p)
@@ -307,6 +307,13 @@ class RiccatiGains:
     def _count(self) -> int:
         return (len(self._P) - self._first) // self._stride
 
+    @property
+    def _map_columns(self) -> IntArray | slice:
+        """Columns of P that belong to all landmarks; a slice, which is cheap, if it can be."""
+        if self._is_moving:
+            return self._columns(np.arange(self._count))
+        return slice(self._first, None)
+
     def _columns(self, indices: IntArray) -> IntArray:
         """Return the columns of P that belong to landmarks (m,), as (m · point,)."""
         first = self._first + self._stride * indices[:, None]
@@ -323,9 +330,8 @@ class RiccatiGains:
         self._calibration.shift(x[self._p : self._first])
         Delta = self._axes.full_pose(x[: self._p])
         self._turn_squared += float(Delta[:3] @ Delta[:3])
-        everything = np.arange(self._count)
-        X = slam_group.exp(Delta, self._axes.full_points(x[self._columns(everything)]))
+        X = slam_group.exp(Delta, self._axes.full_points(x[self._map_columns]))
         if not self._is_moving:
             return Correction(X.A, slice(None), X.a)
-        u = self._axes.full_points(x[self._velocity_columns(everything)])
+        u = self._axes.full_points(x[self._velocity_columns(np.arange(self._count))])
         return Correction(X.A, slice(None), X.a, u)

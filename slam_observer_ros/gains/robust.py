@@ -32,9 +32,9 @@ def observation_weights(
     passed = distances(r, predicted, noise) <= settings.rejection_distance
     weights = passed.astype(np.float64)
     if passed.any() and settings.huber_threshold > 0.0:
-        used = np.repeat(passed, k)
+        used = np.flatnonzero(np.repeat(passed, k))
         weights[passed] = _reweighted(
-            r[passed], predicted[np.ix_(used, used)], noise[passed], settings.huber_threshold
+            r[passed], predicted[used][:, used], noise[passed], settings.huber_threshold
         )
     return weights
 
@@ -46,11 +46,27 @@ def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatA
     return mahalanobis(r, predicted.reshape(m, k, m, k)[i, :, i] + noise)
 
 
-def huber_weights(left: FloatArray, noise: FloatArray, threshold: float) -> FloatArray:
-    """Return Huber's weights (m,) of residuals (m, k) with noise (m, k, k); ones for 0."""
+def huber_weights(
+    pull: FloatArray, noise: FloatArray, weights: FloatArray, threshold: float
+) -> FloatArray:
+    """Return Huber's weights (m,) of what is left of residuals after a correction.
+
+    Parameters
+    ----------
+    pull : FloatArray
+        (m, k) S⁻¹ r. What is left is R S⁻¹ r, at the distance √(pullᵀ R pull) from zero.
+    noise : FloatArray
+        (m, k, k) covariances of the observations, m².
+    weights : FloatArray
+        (m,) weights that were used, by which these covariances were divided to have R.
+    threshold : float
+        Distance from which on an observation weighs less; with 0 all weigh the same.
+
+    """
     if threshold == 0.0:
-        return np.ones(len(left))
-    return np.asarray(threshold / np.maximum(mahalanobis(left, noise), threshold))
+        return np.ones(len(pull))
+    left = np.sqrt(np.einsum('ij,ijk,ik->i', pull, noise, pull)) / weights
+    return np.asarray(threshold / np.maximum(left, threshold))
 
 
 def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -78,8 +94,8 @@ def _reweighted(
     weights = np.ones(len(r))
     for _ in range(REWEIGHTINGS):
         R = block_diagonal(noise / weights[:, None, None])
-        left = (R @ np.linalg.solve(predicted + R, r.ravel())).reshape(r.shape)
-        weights = huber_weights(left, noise, threshold)
+        pull = np.asarray(np.linalg.solve(predicted + R, r.ravel()), dtype=np.float64)
+        weights = huber_weights(pull.reshape(r.shape), noise, weights, threshold)
         if weights.min() == 1.0:
             break
     return weights

@@ -138,8 +138,7 @@ class ScheduledGains:
             gain_k = np.asarray(np.linalg.inv(L + R / weights[:, None, None]))
             P_new, x = self._pose_step(C, gain_k, r)
             pull = gain_k @ (r + C @ x)
-            left = (R @ pull)[:, :, 0] / weights[:, None]
-            weights = huber_weights(left, R, self._settings.huber_threshold)
+            weights = huber_weights(pull[:, :, 0], R, weights, self._settings.huber_threshold)
         spread = gain_k - gain_k @ C @ P_new @ so3.transpose(C) @ gain_k
         self._P, self._L[rows] = P_new, L - L @ spread @ L
         correction = self._as_correction(rows, x[:, 0], (L @ pull)[:, :, 0], a)
