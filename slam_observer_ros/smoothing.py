@@ -206,8 +206,10 @@ class Smoother:
         error = se3.log(se3.inverse(frames.motions @ se3.exp(eta)) @ step)
         J_to = se3.left_jacobian_inverse(-error)
         J_from = -J_to @ se3.adjoint(se3.inverse(step))
-        J_off = -se3.left_jacobian_inverse(error) @ se3.left_jacobian(-eta)
-        F = J_off[:, pose][:, :, pose] @ frames.sensitivities
+        F = frames.sensitivities
+        if c:
+            J_off = -se3.left_jacobian_inverse(error) @ se3.left_jacobian(-eta)
+            F = J_off[:, pose][:, :, pose] @ F
         J = np.concatenate([J_from[:, pose][:, :, pose], J_to[:, pose][:, :, pose], F], axis=2)
         H, pull = _normal(J, self._motion_information, error[:, pose])
         equations.diagonal[:-1] += H[:, :d, :d]
