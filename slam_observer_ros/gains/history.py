@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Seen
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.smoothing import Frames, Prior
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -40,8 +40,9 @@ class History:
         self.prior = prior
         self.stamps_ns: list[int] = []
         self.poses: list[FloatArray] = [prior.pose]
-        self._motions: list[FloatArray] = []
-        self._covariances: list[FloatArray] = []
+        self._starts: list[FloatArray] = []
+        self._ends: list[FloatArray] = []
+        self._noises: list[FloatArray] = []
         self._sensitivities: list[FloatArray] = []
         self._calibrations: list[FloatArray] = []
         self._landmarks: list[IntArray] = []
@@ -70,8 +71,8 @@ class History:
 
         """
         if self._start is None:
-            self._start = path[0]
-        self._end = path[-1]
+            self._start = path[0].copy()
+        self._end = path[-1].copy()  # not a view, which would keep all of the path
         self._noise = self._noise + noise
         self._sensitivity = self._sensitivity + sensitivity
         self._calibration = calibration
@@ -82,14 +83,12 @@ class History:
         ``shifts`` (m, 3) is how far the landmarks had moved by themselves, metres.
         """
         k = self._axes.point
-        start = self._end if self._start is None else self._start
-        back = se3.inverse(self._end)
-        to_body = se3.adjoint(back)[self._axes.pose][:, self._axes.pose]
         self.stamps_ns.append(seen.stamp_ns)
         self.poses.append(pose)
-        self._motions.append(se3.inverse(start) @ self._end)
-        self._covariances.append(to_body @ self._noise @ to_body.T)
-        self._sensitivities.append(to_body @ self._sensitivity)
+        self._starts.append(self._end if self._start is None else self._start)
+        self._ends.append(self._end)
+        self._noises.append(self._noise)
+        self._sensitivities.append(self._sensitivity)
         self._calibrations.append(self._calibration)
         self._landmarks.append(seen.indices)
         self._points.append(seen.points)
@@ -125,14 +124,17 @@ class History:
 
     def frames(self) -> Frames:
         """Return all frames as arrays."""
-        S, d, k = len(self.stamps_ns), len(self._axes.pose), self._axes.point
+        S, pose, k = len(self.stamps_ns), self._axes.pose, self._axes.point
+        d, c = len(pose), len(self._calibration)
+        back = se3.inverse(np.reshape(self._ends, (S, 4, 4)))
+        to_body = se3.adjoint(back)[:, pose][:, :, pose]
         counts = [len(landmarks) for landmarks in self._landmarks]
         none = np.empty(0, dtype=np.int64)
         return Frames(
-            np.reshape(self._motions, (S, 4, 4)),
-            np.reshape(self._covariances, (S, d, d)),
-            np.reshape(self._sensitivities, (S, d, len(self._calibration))),
-            np.reshape(self._calibrations, (S, len(self._calibration))),
+            se3.inverse(back @ np.reshape(self._starts, (S, 4, 4))),
+            to_body @ np.reshape(self._noises, (S, d, d)) @ so3.transpose(to_body),
+            to_body @ np.reshape(self._sensitivities, (S, d, c)),
+            np.reshape(self._calibrations, (S, c)),
             np.repeat(np.arange(S), counts),
             np.concatenate([none, *self._landmarks]),
             np.concatenate([np.empty((0, 3)), *self._points]),
