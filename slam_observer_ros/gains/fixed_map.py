@@ -38,6 +38,13 @@ class FixedMapGains(RiccatiGains):
         """(n, 3, 3) covariances of the landmarks, as the map has them."""
         return self._landmark_covariances
 
+    def joint_covariance(self, indices: IntArray) -> FloatArray:
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks, which have no error."""
+        size = self._p + self._axes.point * len(indices)
+        covariance = np.zeros((size, size))
+        covariance[: self._p, : self._p] = self._P[: self._p, : self._p]
+        return covariance
+
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose's covariance."""
         predict(self._P, self._axes, self._calibration, motion)
@@ -60,6 +67,12 @@ class FixedMapGains(RiccatiGains):
         C = self._pose_output(innovation)
         PC = self._P[:, : self._p] @ C.T
         return PC, C @ PC[: self._p]
+
+    def _foretold(self, innovation: Innovation) -> FloatArray:
+        """Return the covariance (m k, m k) of the residuals: the pose's error alone."""
+        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r).reshape(-1, self._p)
+        CPC: FloatArray = C @ self._P[: self._p, : self._p] @ C.T
+        return CPC
 
     def _as_correction(self, x: FloatArray) -> Correction:
         """Return the group element exp(x); it moves no landmark."""

@@ -188,7 +188,7 @@ class RiccatiGains:
         k, P = self._axes.point, self._P
         PC, CPC = self._project(innovation)
         r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
-        weights = observation_weights(r, CPC, noise, self._settings)
+        weights = observation_weights(r, self._foretold(innovation), noise, self._settings)
         passed = weights > 0.0
         used = np.flatnonzero(np.repeat(passed, k))
         R = block_diagonal(noise[passed] / weights[passed, None, None])
@@ -201,8 +201,8 @@ class RiccatiGains:
     def distances(self, innovation: Innovation) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
         k = self._axes.point
-        _, CPC = self._project(innovation)
-        return distances(innovation.r[:, :k], CPC, innovation.covariances[:, :k, :k])
+        S = self._foretold(innovation)
+        return distances(innovation.r[:, :k], S, innovation.covariances[:, :k, :k])
 
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
@@ -215,6 +215,19 @@ class RiccatiGains:
         """Return the columns (m k, p) of C that belong to ε."""
         y_ref = innovation.e - innovation.r
         return self._axes.output_matrix(y_ref).reshape(-1, self._p)
+
+    def _foretold(self, innovation: Innovation) -> FloatArray:
+        """Return the covariance (m k, m k) of the residuals, as it is to judge them by.
+
+        Turning y_i° to e_i, by however much, moves it at right angles to (e_i + y_i°)/2; with C
+        at y_i° a robot that has turned further than it knows would reject what it sees.
+        """
+        columns = self._columns(innovation.indices)
+        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r).reshape(-1, self._p)
+        cross = self._P[columns, : self._p] @ C.T
+        own = self._P[columns[:, None], columns]
+        CPC: FloatArray = C @ self._P[: self._p, : self._p] @ C.T - cross - cross.T + own
+        return CPC
 
     def settle(self, observer: Observer) -> None:
         """Take the landmarks' estimates for their reference, so that â_i = 0.
