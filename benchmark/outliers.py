@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from estimators import Run
 import numpy as np
 from worlds import World
 
 from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray, IntArray
 
 GROSS_SHARE = 0.05
@@ -37,22 +35,6 @@ def with_outliers(world: World, seed: int) -> World:
 def without_ids(world: World) -> World:
     """Take the ids away."""
     return replace(world, events=[_anonymous(event) for event in world.events])
-
-
-def true_labels(run: Run, world: World) -> dict[int, int]:
-    """Return which true landmark each of an estimator's own ids means.
-
-    It is the one that was observed nearest to where the new landmark was put when it appeared.
-    """
-    observations = [event for event in world.events if isinstance(event, ObservationEvent)]
-    labels: dict[int, int] = {}
-    for observation, snapshot in zip(observations, run.snapshots, strict=True):
-        seen = se3.transform(se3.inverse(snapshot.pose), snapshot.world_points)
-        for own_id, point in zip(snapshot.ids.tolist(), seen, strict=True):
-            if own_id not in labels:
-                distances = np.linalg.norm(observation.points - point, axis=1)
-                labels[own_id] = int(observation.ids[np.argmin(distances)])
-    return labels
 
 
 def _displaced(points: FloatArray, planar: bool, rng: np.random.Generator) -> FloatArray:

@@ -46,21 +46,22 @@ FAILED = Scores(*[float('nan')] * 5)
 """Of an estimator that gave up."""
 
 
-def score(run: Run, world: World, labels: dict[int, int] | None = None) -> Scores:
-    """Compare a run with the truth; ``labels`` maps an estimator's own ids to the true ones."""
+def score(run: Run, world: World, has_ids: bool = True) -> Scores:
+    """Compare a run with the truth; without ids there is no error of the map on its own."""
     final = run.snapshots[-1]
-    landmarks = world.landmarks if labels is None else _relabelled(world.landmarks, labels)
-    compared = _compared(run, world) if labels is None else run.snapshots
+    compared = _compared(run, world) if has_ids else run.snapshots
     trajectory = Trajectory.from_samples(
         [snapshot.stamp_ns for snapshot in run.snapshots],
         [snapshot.pose for snapshot in run.snapshots],
     )
     errors = trajectory_errors(trajectory, world.truth)
     return Scores(
-        _configuration_rmse_m(compared, world.truth, landmarks),
+        _configuration_rmse_m(compared, world.truth, world.landmarks),
         errors.ate_rmse_m,
         errors.heading_rmse_rad,
-        landmark_errors(final.ids, final.world_points, landmarks).rmse_m,
+        landmark_errors(final.ids, final.world_points, world.landmarks).rmse_m
+        if has_ids
+        else float('nan'),
         run.cpu_s,
     )
 
@@ -101,10 +102,3 @@ def _configuration_rmse_m(
             landmarks,
         )
     return float('nan') if error.rmse_m is None else error.rmse_m
-
-
-def _relabelled(landmarks: LandmarkTruth, labels: dict[int, int]) -> LandmarkTruth:
-    """Return the truth under an estimator's own ids; two of them may mean one landmark."""
-    row = {landmark_id: i for i, landmark_id in enumerate(landmarks.ids.tolist())}
-    points = landmarks.world_points[[row[true_id] for true_id in labels.values()]]
-    return LandmarkTruth(np.array(list(labels), dtype=np.int64), points)

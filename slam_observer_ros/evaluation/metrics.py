@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass, field
 import json
 
@@ -11,7 +12,7 @@ from scipy import special
 from slam_observer_ros.evaluation.alignment import align
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
-from slam_observer_ros.events import LandmarkTruth
+from slam_observer_ros.events import is_automatic, LandmarkTruth
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -190,6 +191,7 @@ class ConfigurationError:
 
     stamps_ns: list[int] = field(default_factory=list)
     values_m: list[float] = field(default_factory=list)
+    _votes: defaultdict[int, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
 
     def add(
         self,
@@ -209,7 +211,9 @@ class ConfigurationError:
         pose : FloatArray
             (4, 4) estimated pose.
         ids : IntArray
-            (n,) landmarks known so far; those without truth are passed over.
+            (n,) landmarks known so far; those without truth are passed over. One whose sensor
+            gave no id stands for the true landmark that it was nearest to most often so far, as
+            seen by the robot.
         world_points : FloatArray
             (n, 3) their estimated positions in the estimate's world, metres.
         true_pose : FloatArray
@@ -218,13 +222,23 @@ class ConfigurationError:
             True landmark positions at that time.
 
         """
-        _, rows, true_rows = np.intersect1d(ids, truth.ids, return_indices=True)
-        if len(rows) == 0:
+        if not len(truth.ids):
             return
-        seen = se3.transform(se3.inverse(pose), world_points[rows])
-        true_seen = se3.transform(se3.inverse(true_pose), truth.world_points[true_rows])
+        seen = se3.transform(se3.inverse(pose), world_points)
+        true_seen = se3.transform(se3.inverse(true_pose), truth.world_points)
+        for row in np.flatnonzero(is_automatic(ids)):
+            nearest = np.argmin(np.linalg.norm(true_seen - seen[row], axis=1))
+            self._votes[int(ids[row])][int(truth.ids[nearest])] += 1
+        true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
+        rows, true_rows = np.nonzero(true_ids[:, None] == truth.ids)
+        if not len(rows):
+            return
         self.stamps_ns.append(stamp_ns)
-        self.values_m.append(root_mean_square(seen - true_seen))
+        self.values_m.append(root_mean_square(seen[rows] - true_seen[true_rows]))
+
+    def _true_id(self, landmark_id: int) -> int:
+        votes = self._votes.get(landmark_id)
+        return landmark_id if votes is None else votes.most_common(1)[0][0]
 
     @property
     def rmse_m(self) -> float | None:
