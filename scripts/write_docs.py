@@ -41,7 +41,7 @@ PACKAGES_OF_EVERY_NODE = ('rcl_interfaces/', 'type_description_interfaces/')
 INPUTS = {
     'twist': 'the velocity of the robot in its own frame',
     'imu': 'the angular velocity, if `use_imu` is set; the linear one then comes from `twist`',
-    'landmarks': "the landmarks seen at one instant in the sensor's frame, each with its id",
+    'landmarks': "the landmarks seen at one instant in the sensor's frame, with ids or without",
     '/tf': 'where sensors are; `odom_frame` → `base_frame`; fiducials, if asked for',
     '/tf_static': 'where sensors are',
     'initialpose': "where the robot is in the map, as RViz's *2D Pose Estimate* gives it",

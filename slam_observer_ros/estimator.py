@@ -14,6 +14,7 @@ from slam_observer_ros.estimates import Hindsight, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.localisation import (
     enter_map,
@@ -55,8 +56,8 @@ class Estimator:
         Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``),
         observations made before the place in a loaded map was found (``'not_localised'``), how
         often it was lost again (``'lost'``), and what became of landmarks
-        (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``, and
-        ``'unknown_id'``, which are not used).
+        (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``,
+        ``'unsupported_landmark'``, and ``'unknown_id'``, which are not used).
     dropped : Counter
         Events refused, by reason.
 
@@ -69,10 +70,11 @@ class Estimator:
         on_update: Callable[[Update], None] | None = None,
     ) -> None:
         self.settings = settings
-        self.counts: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self._map: LandmarkMap | None = None
         self._on_update = on_update
+        self._hypotheses = Hypotheses(Slam(settings, np.eye(4)), settings)
         self.reset(initial_pose)
 
     def reset(self, pose: FloatArray | None = None) -> None:
@@ -102,7 +104,7 @@ class Estimator:
         self.flush()
         if self._stamp_ns is not None:
             self._advance(self._stamp_ns)
-        self._slam.restart_time()
+        self._hypotheses.decide().restart_time()
         self._forget_time()
 
     def load_map(
@@ -147,14 +149,14 @@ class Estimator:
         if self._stamp_ns is not None:
             self._advance(self._stamp_ns)
         if self.is_localised:
-            self._slam.set_pose(pose, covariance)
+            self._hypotheses.decide().set_pose(pose, covariance)
         else:
             self._start(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other gains from now on; parameters that are read-only keep their effect."""
         self.settings = settings
-        self._slam.change_settings(settings)
+        self._hypotheses.decide().change_settings(settings)
 
     def add(self, event: Event) -> bool:
         """Take an event; return whether it was accepted.
@@ -201,8 +203,13 @@ class Estimator:
         rows = self._slam.landmarks.indices_of(np.array([landmark_id]))
         if rows[0] < 0:
             return False
-        self._slam.remove(rows)
+        self._hypotheses.decide().remove(rows)
         return True
+
+    @property
+    def counts(self) -> Counter[str]:
+        """How many events were used, by kind, and what befell the landmarks in them."""
+        return self._counts + self._slam.counts
 
     @property
     def is_localised(self) -> bool:
@@ -306,6 +313,11 @@ class Estimator:
         """L (34) of the latest observation's residuals; zero before the first."""
         return 0.0 if self._last is None else self._last.lyapunov
 
+    @property
+    def _slam(self) -> Slam:
+        """The most likely state."""
+        return self._hypotheses.best
+
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
         if _is_power_of_ten(self.dropped[error.reason]):
@@ -328,7 +340,7 @@ class Estimator:
             return
         self._velocities.append(event)
         self._begin(event.stamp_ns)
-        self.counts['velocity'] += 1
+        self._counts['velocity'] += 1
         if self._velocities.count_since(self._state_ns or 0) >= MAX_PENDING_VELOCITIES:
             self._advance(event.stamp_ns)
 
@@ -337,8 +349,8 @@ class Estimator:
         if event.stamp_ns < (self._state_ns or 0):
             event = self._carry_forward(event)
         self._advance(event.stamp_ns)
-        ids, residuals = self._slam.observe(event)
-        self.counts['observation'] += 1
+        ids, residuals = self._hypotheses.observe(event)
+        self._counts['observation'] += 1
         self._localise(ids)
         level = lyapunov(self.settings.gain_k, residuals)
         observer = self._slam.observer
@@ -360,7 +372,9 @@ class Estimator:
 
     def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
         """Start with an empty map, or with the one that was loaded."""
-        self._slam = Slam(self.settings, np.eye(4) if pose is None else pose, self.counts)
+        self._counts += self._slam.counts
+        slam = Slam(self.settings, np.eye(4) if pose is None else pose)
+        self._hypotheses = Hypotheses(slam, self.settings)
         self._is_in_map = self._map is not None and pose is not None
         if self._map is not None and pose is not None:
             start_in_map(self._slam, self._map, covariance)
@@ -371,14 +385,14 @@ class Estimator:
             return
         if self._is_in_map and is_lost(self._slam, seen_ids):
             logger.warning('All landmarks are far from where they should be; localising anew.')
-            self.counts['lost'] += 1
+            self._counts['lost'] += 1
             self._start(None)
         if not self._is_in_map:
             self._enter_map()
-            self.counts['not_localised'] += not self._is_in_map
+            self._counts['not_localised'] += not self._is_in_map
 
     def _enter_map(self) -> None:
-        if self._map is not None and enter_map(self._slam, self._map):
+        if self._map is not None and enter_map(self._hypotheses.decide(), self._map):
             self._is_in_map = True
             logger.info('Found the place in the map of %d landmarks.', len(self._map.ids))
 
@@ -397,7 +411,7 @@ class Estimator:
         """Return what would be seen at the state's stamp: Φ⁻¹ (y + v τ), Φ the motion since."""
         state_ns = self._state_ns or 0
         back = self._motion(state_ns, event.stamp_ns)
-        self.counts['late_observation'] += 1
+        self._counts['late_observation'] += 1
         turn, points = back[:3, :3], event.points
         if event.velocities is not None:
             points = points + event.velocities * (state_ns - event.stamp_ns) * 1e-9
@@ -413,7 +427,7 @@ class Estimator:
         """Move the state on to ``stamp_ns`` along the velocities held since."""
         start_ns = stamp_ns if self._state_ns is None else self._state_ns
         if stamp_ns > start_ns:
-            self._slam.advance(self._velocities.held(start_ns, stamp_ns))
+            self._hypotheses.advance(self._velocities.held(start_ns, stamp_ns))
             self._velocities.forget_before(stamp_ns - _nanoseconds(self.settings.late_limit))
         self._state_ns = stamp_ns
 

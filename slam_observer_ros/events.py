@@ -7,10 +7,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
+
+FIRST_AUTOMATIC_ID = 10_000_000
+"""Landmarks whose sensor gives no ids are numbered from here on, up to 2²⁴, exact in float32."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +100,12 @@ class LandmarkTruth:
 
     ids: IntArray
     world_points: FloatArray
+
+
+def is_automatic(ids: IntArray) -> BoolArray:
+    """Return which ids (m,) were given to landmarks whose sensor gives none."""
+    automatic: BoolArray = (ids >= FIRST_AUTOMATIC_ID) & (ids < 2**24)
+    return automatic
 
 
 def flatten(event: Event) -> Event:

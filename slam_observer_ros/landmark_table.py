@@ -57,6 +57,11 @@ class LandmarkTable:
         self.add(ids, 0)
         self.counts[len(self.counts) - len(ids) :] = counts
 
+    def renumber(self, indices: IntArray, ids: IntArray) -> None:
+        """Give the rows ``indices`` (m,) other ids (m,)."""
+        self.ids[indices] = ids
+        self._order = np.argsort(self.ids)
+
     def see(self, indices: IntArray, stamp_ns: int) -> None:
         """Count one more accepted observation of the rows ``indices`` (m,)."""
         self.counts[indices] += 1

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.events import is_automatic
 from slam_observer_ros.gains.fixed_map import FixedMapGains
 from slam_observer_ros.gains.gauge import anchor, gauge_information, JITTER_M2
 from slam_observer_ros.gains.riccati import RiccatiGains
@@ -63,7 +64,7 @@ def enter_map(slam: Slam, known: LandmarkMap) -> bool:
 
     """
     rows = slam.landmarks.indices_of(known.ids)
-    shared = np.flatnonzero(rows >= 0)
+    shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
     found = _find_frame(slam, rows[shared], known.select(shared))
     if found is None:
         return False
@@ -74,6 +75,7 @@ def enter_map(slam: Slam, known: LandmarkMap) -> bool:
         slam.remove(rows[shared[~agree]])
     else:
         slam.remove(np.setdiff1d(np.arange(len(slam.landmarks)), rows[merged]))
+    _renumber(slam, known)
     _complete(slam, known)
     return True
 
@@ -241,6 +243,14 @@ def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
     observer.correct(slam.gains.anchor(observer, rows, r, covariances))
     slam.gains.settle(observer)
     slam.landmarks.counts[rows] += known.counts
+
+
+def _renumber(slam: Slam, known: LandmarkMap) -> None:
+    """Give landmarks new numbers where the map's have the same, though no sensor gave these."""
+    ids = slam.landmarks.ids
+    own = np.flatnonzero(is_automatic(ids) & np.isin(ids, known.ids))
+    taken = np.append(ids[is_automatic(ids)], known.ids[is_automatic(known.ids)])
+    slam.landmarks.renumber(own, np.max(taken, initial=0) + 1 + np.arange(len(own)))
 
 
 def _complete(slam: Slam, known: LandmarkMap) -> None:

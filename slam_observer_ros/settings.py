@@ -203,6 +203,17 @@ class Settings:
         'Most landmarks kept; a new one then replaces the one seen least often; 0 for any number',
         minimum=0,
     )
+    support_timeout: float = parameter(
+        10.0,
+        'Points without id: how long a landmark with too few confirmations is kept while unseen',
+        unit='s',
+        minimum=0.0,
+    )
+    max_hypotheses: int = parameter(
+        8,
+        'Points without id: most places of the robot that are followed until one is clear',
+        minimum=1,
+    )
     hindsight_interval: int = parameter(
         50,
         'Riccati gains: least observations between looking back over all of them; 0 for never',

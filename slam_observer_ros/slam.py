@@ -9,12 +9,15 @@ import logging
 
 import numpy as np
 
+from slam_observer_ros.association import find_readings, RESOLUTION
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.robust import mahalanobis
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
@@ -37,8 +40,6 @@ class Slam:
         All settings.
     initial_pose : FloatArray
         (4, 4) pose at the start, body to world; also the reference P°.
-    counts : Counter
-        Where rejected and moved landmarks are counted.
 
     Attributes
     ----------
@@ -50,18 +51,21 @@ class Slam:
         Ids and counts of the n known landmarks.
     is_mapping : bool
         Whether landmarks are added, and taken to have moved if they are rejected too often.
+    counts : Counter
+        How many landmarks were rejected, have moved, were forgotten and so on.
 
     """
 
-    def __init__(self, settings: Settings, initial_pose: FloatArray, counts: Counter[str]) -> None:
+    def __init__(self, settings: Settings, initial_pose: FloatArray) -> None:
         self.settings = settings
         self.observer = Observer(initial_pose)
         self.gains = make_gains(settings)
         self.landmarks = LandmarkTable()
         self.is_mapping = True
-        self._counts = counts
+        self.counts: Counter[str] = Counter()
         self._noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
+        self._index = LandmarkIndex()
 
     @property
     def confirmed(self) -> IntArray:
@@ -141,6 +145,52 @@ class Slam:
         noise = self._noise.motion(held)
         return Motion(path, held.body_velocities, held.dt_s, held.gap_s, noise)
 
+    def readings(
+        self, event: ObservationEvent, new_ids: IntArray
+    ) -> list[tuple[ObservationEvent, float]]:
+        """Return what an observation may mean where it has no ids, the most likely first.
+
+        Parameters
+        ----------
+        event : ObservationEvent
+            The observation, of m points.
+        new_ids : IntArray
+            (m,) ids of points that are taken for landmarks not seen before.
+
+        Returns
+        -------
+        list of tuple
+            The observation with all ids filled in, and what it costs: −2 ln of its likelihood. As
+            it came and 0 if the gains know no joint covariance to judge it by.
+
+        """
+        if not isinstance(self.gains, RiccatiGains):
+            return [(event, 0.0)]
+        self._forget_unsupported(event.stamp_ns)
+        R, ids = self.observer.A[:3, :3], self.landmarks.ids
+        found = find_readings(
+            self.observer,
+            self.gains,
+            self._index,
+            se3.transform(self.observer.A, event.points),
+            R @ self._noise.observation(event) @ R.T,
+            self.landmarks.indices_of(event.ids),
+            self.settings,
+        )
+        events = []
+        for reading in found:
+            named = np.where(reading.rows < 0, new_ids, np.append(ids, UNKNOWN_ID)[reading.rows])
+            named = np.where(event.ids == UNKNOWN_ID, named, event.ids)
+            events.append((replace(event, ids=named), reading.cost))
+        return events
+
+    def is_where(self, other: Slam, event: ObservationEvent) -> bool:
+        """Return whether the robot is where ``other`` has it, as far as the sensor can tell."""
+        here, there = self.observer.pose, other.observer.pose
+        shifts = se3.transform(here, event.points) - se3.transform(there, event.points)
+        noise = here[:3, :3] @ self._noise.observation(event) @ here[:3, :3].T
+        return bool(np.max(mahalanobis(shifts, noise), initial=0.0) <= RESOLUTION)
+
     def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the state's instant.
 
@@ -154,12 +204,12 @@ class Slam:
         """
         identified = event.ids != UNKNOWN_ID
         if not identified.all():
-            self._counts['unknown_id'] += int(np.sum(~identified))
+            self.counts['unknown_id'] += int(np.sum(~identified))
             event = _select(event, identified)
         rows = self.landmarks.indices_of(event.ids)
         known = rows >= 0
         if not self.is_mapping:
-            self._counts['unmapped_landmark'] += int(np.sum(~known))
+            self.counts['unmapped_landmark'] += int(np.sum(~known))
             event, rows, known = _select(event, known), rows[known], known[known]
         residuals = self._innovate(_select(event, known), rows[known])
         self._initialise(_select(event, ~known))
@@ -222,7 +272,7 @@ class Slam:
             spread_m = np.sqrt(np.trace(innovation.covariances[rejected], axis1=1, axis2=2))
             places = se3.transform(self.observer.pose, event.points[rejected])
             self.landmarks.reject(rows[rejected], places, SAME_PLACE * spread_m)
-            self._counts['rejected_landmark'] += int(np.sum(rejected))
+            self.counts['rejected_landmark'] += int(np.sum(rejected))
         return innovation.r
 
     def _innovation(self, event: ObservationEvent, rows: IntArray) -> Innovation:
@@ -254,7 +304,7 @@ class Slam:
         )
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():
-            self._counts['moved_landmark'] += int(np.sum(moved))
+            self.counts['moved_landmark'] += int(np.sum(moved))
             logger.warning('Landmarks %s have moved.', event.ids[moved].tolist())
         if far.any():
             self._restart(_select(event, far), rows[far])
@@ -265,6 +315,16 @@ class Slam:
         covariances = R @ self._noise.observation(event) @ R.T
         self.gains.relocate_landmarks(rows, self.observer.y_ref[rows], covariances)
         self.landmarks.restart(rows)
+
+    def _forget_unsupported(self, stamp_ns: int) -> None:
+        """Forget landmarks without an id that were seen too seldom, and not lately."""
+        table = self.landmarks
+        unseen_s = (stamp_ns - table.last_seen_ns) * 1e-9
+        unsupported = is_automatic(table.ids) & (table.counts < self.settings.confirmations)
+        forgotten = np.flatnonzero(unsupported & (unseen_s > self.settings.support_timeout))
+        if len(forgotten):
+            self.remove(forgotten)
+            self.counts['unsupported_landmark'] += len(forgotten)
 
     def _make_room(self, event: ObservationEvent) -> ObservationEvent:
         """Forget landmarks out of view, least often seen first; return the new ones that fit."""
@@ -277,8 +337,8 @@ class Slam:
         surplus = max(len(table) + fitting - limit, 0)
         order = np.lexsort((table.last_seen_ns[unseen], table.counts[unseen]))
         self.remove(np.sort(unseen[order[:surplus]]))
-        self._counts['forgotten_landmark'] += surplus
-        self._counts['unmapped_landmark'] += new - fitting
+        self.counts['forgotten_landmark'] += surplus
+        self.counts['unmapped_landmark'] += new - fitting
         return _select(event, np.arange(new) < fitting)
 
     def _initialise(self, event: ObservationEvent) -> None:

@@ -289,12 +289,3 @@ def test_told_of_a_jump_the_estimator_starts_again_at_once():
     assert len(estimator.landmark_ids) == 0
     assert estimator.stamp_ns is None
     assert estimator.add(velocity(-1e6))
-
-
-def test_points_without_id_are_counted_and_not_taken_for_one_landmark():
-    estimator = run([observation(0.0, [1, 2])])
-    event = observation(0.1, [1, 2, 3])
-    estimator.add(replace(event, ids=np.array([1, -1, -1])))
-    estimator.flush()
-    assert estimator.landmark_ids.tolist() == [1, 2]
-    assert estimator.counts['unknown_id'] == 2

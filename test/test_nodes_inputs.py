@@ -6,7 +6,6 @@ from contextlib import ExitStack
 import importlib.util
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Pose, PoseArray, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from node_processes import client, NodeProcess, running
@@ -18,7 +17,7 @@ from rclpy.serialization import serialize_message
 from robots import own_topics, Robot, stamp_ns, TransformSender
 from sensor_msgs.msg import Imu, PointCloud2
 
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.nodes.conversions import (
     header_message,
@@ -122,7 +121,7 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
     if TFMessage is None:
         pytest.skip('tf2_msgs is not installed')
     maps = ros.collect(PointCloud2, '/tags/map', LATCHED_QOS)
-    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    nameless_maps = ros.collect(PointCloud2, '/nameless/map', LATCHED_QOS)
     poses = ros.node.create_publisher(PoseArray, '/nameless/landmarks', 10)
     sender = TransformSender(ros, '/tags')
     tagged = {'landmarks_type': 'tf', 'tag_frame_prefix': 'dock', 'odom_frame': "''"}
@@ -148,10 +147,11 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
             poses.publish(PoseArray(header=header, poses=[point]))
             ros.spin_for(0.03)
         ros.spin_until(lambda: len(seen(maps)) == 2, 'two fiducials')
-        ros.spin_until(lambda: counts(diagnostics, '/nameless').get('used: unknown_id'), 'a count')
+        ros.spin_until(lambda: len(seen(nameless_maps)) == 1, 'a landmark without id')
     assert set(seen(maps)) == {3, 11}
     assert_allclose(seen(maps)[3], [2.0, 0.0, 1.0], atol=1e-6)
     assert_allclose(seen(maps)[11], [0.0, 3.0, 1.0], atol=1e-6)
+    assert_allclose(seen(nameless_maps)[FIRST_AUTOMATIC_ID], [1.0, 1.0, 1.0], atol=1e-6)
 
 
 def seen(maps):
@@ -159,11 +159,6 @@ def seen(maps):
         return {}
     event = decode_point_cloud2(serialize_message(maps[-1])).event
     return dict(zip(event.ids.tolist(), event.points, strict=True))
-
-
-def counts(diagnostics, namespace):
-    statuses = [m.status[0] for m in diagnostics if m.status[0].hardware_id == namespace]
-    return {value.key: value.value for value in statuses[-1].values} if statuses else {}
 
 
 def test_optional_packages_are_named_when_they_are_missing(tmp_path):

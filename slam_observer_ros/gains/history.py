@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +54,14 @@ class History:
         self._start: FloatArray | None = None
         self._end = prior.pose
         self._noise, self._sensitivity = self._at_rest()
+
+    def __deepcopy__(self, memo: dict[int, object]) -> History:
+        """Return a history that goes its own way from here: no array is ever changed in place."""
+        other = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, list):
+                setattr(other, name, value.copy())
+        return other
 
     def move(
         self, path: FloatArray, noise: FloatArray, sensitivity: FloatArray, calibration: FloatArray
@@ -115,7 +124,8 @@ class History:
         """Forget the landmarks at ``indices`` and all observations of them."""
         for s, landmarks in enumerate(self._landmarks):
             self._keep(s, ~np.isin(landmarks, indices))
-            self._landmarks[s] -= np.searchsorted(np.sort(indices), self._landmarks[s])
+            rows = self._landmarks[s]
+            self._landmarks[s] = rows - np.searchsorted(np.sort(indices), rows)
         known = indices[indices < len(self.prior.points)]
         columns = self._prior_columns(known)
         covariance = np.delete(np.delete(self.prior.covariance, columns, 0), columns, 1)

@@ -1,0 +1,152 @@
+"""Which landmarks the points of an observation are, where the sensor gave no ids.
+
+A *reading* takes each such point for a landmark, or for a new one. What matters about it is where
+it puts the robot: among readings that agree on that, within what the sensor can tell, the most
+likely one is taken. Readings that don't agree are all returned, for later observations to decide
+(:mod:`slam_observer_ros.hypotheses`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.gains.base import Innovation
+from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.robust import block_diagonal, mahalanobis
+from slam_observer_ros.joint_compatibility import columns_of, JointSearch, Pairs
+from slam_observer_ros.landmark_index import LandmarkIndex
+from slam_observer_ros.observer import Observer
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray, IntArray
+
+MARGIN = 40.0
+"""How much more than the cheapest a reading may cost: at odds of e²⁰ it is given up."""
+
+RESOLUTION = 3.0
+"""Two places are one if the sensor can't tell them apart by this many standard deviations."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What the points of an observation are taken for.
+
+    Attributes
+    ----------
+    rows : IntArray
+        (m,) row of the landmark that each point is, −1 for a new one.
+    cost : float
+        −2 ln of its likelihood, up to what all readings of the observation share.
+
+    """
+
+    rows: IntArray
+    cost: float
+
+
+def find_readings(
+    observer: Observer,
+    gains: RiccatiGains,
+    index: LandmarkIndex,
+    points: FloatArray,
+    noise: FloatArray,
+    known_rows: IntArray,
+    settings: Settings,
+) -> list[Reading]:
+    """Return all readings of an observation that put the robot at different places.
+
+    Parameters
+    ----------
+    observer, gains : Observer, RiccatiGains
+        State and its covariance.
+    index : LandmarkIndex
+        Index over the observer's landmarks.
+    points : FloatArray
+        (m, 3) Â y_i, metres, reference frame.
+    noise : FloatArray
+        (m, 3, 3) their covariances, m².
+    known_rows : IntArray
+        (m,) row of the landmark that the sensor says it is, −1 where it gives no id.
+    settings : Settings
+        ``rejection_distance`` is how far a point may be from its landmark, in σ.
+
+    Returns
+    -------
+    list of Reading
+        The most likely first.
+
+    """
+    axes = PLANAR if settings.two_d_mode else SPATIAL
+    gate, m, k = settings.rejection_distance, len(points), axes.point
+    at, rows = _pairs_within(gate, observer, gains, index, points, noise, known_rows)
+    pairs, PC = _joined(observer, gains, axes, at, rows, points, noise)
+    nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
+    search = JointSearch(pairs, nearly, gate, 0.0 if nearly.all() else MARGIN)
+    lonely_cost = (m - len(np.unique(at))) * gate**2
+    J, R = axes.output_matrix(points), noise[:, :k, :k]
+    readings: list[Reading] = []
+    moves: list[FloatArray] = []
+    for pairing in search.pairings():
+        columns = columns_of(pairing.chosen, k)
+        S, r = pairs.covariances[np.ix_(columns, columns)], pairs.residuals[pairing.chosen]
+        move = J @ (PC[:, columns] @ np.linalg.solve(S, r.ravel()))
+        if all(np.max(mahalanobis(move - other, R)) > RESOLUTION for other in moves):
+            found = np.full(m, -1)
+            found[at[pairing.chosen]] = rows[pairing.chosen]
+            readings.append(Reading(found, pairing.cost + lonely_cost))
+            moves.append(move)
+    return readings
+
+
+def _pairs_within(
+    gate: float,
+    observer: Observer,
+    gains: RiccatiGains,
+    index: LandmarkIndex,
+    points: FloatArray,
+    noise: FloatArray,
+    known_rows: IntArray,
+) -> tuple[IntArray, IntArray]:
+    """Return the pairs (q,), (q,) of a point and a landmark that pass the gate alone."""
+    landmarks = observer.y_ref + observer.a
+    C = SPATIAL.output_matrix(points)
+    seen = C @ gains.pose_covariance @ C.swapaxes(1, 2) + noise
+    spread_m = _spread_m(seen) + np.max(_spread_m(gains.landmark_covariances), initial=0.0)
+    at, rows = index.near(landmarks, points, gate * spread_m)
+    allowed = np.where(known_rows[at] >= 0, rows == known_rows[at], ~np.isin(rows, known_rows))
+    at, rows = at[allowed], rows[allowed]
+    a = observer.a[rows]
+    e = points[at] - a
+    pairs = Innovation(rows, e, e - observer.y_ref[rows], a, noise[at], 0.0)
+    near = gains.distances(pairs) <= gate
+    return at[near], rows[near]
+
+
+def _joined(
+    observer: Observer,
+    gains: RiccatiGains,
+    axes: Axes,
+    at: IntArray,
+    rows: IntArray,
+    points: FloatArray,
+    noise: FloatArray,
+) -> tuple[Pairs, FloatArray]:
+    """Return pairs with the joint covariance of their residuals, and that with the pose."""
+    p, k, q = len(axes.pose), axes.point, len(at)
+    landmarks = (observer.y_ref + observer.a)[rows]
+    different, columns = np.unique(rows, return_inverse=True)
+    P = gains.joint_covariance(different)
+    H = np.zeros((q, k, len(P)))
+    H[:, :, :p] = axes.output_matrix(0.5 * (points[at] + landmarks))
+    H[np.arange(q)[:, None], np.arange(k), p + k * columns[:, None] + np.arange(k)] = -1.0
+    C = H.reshape(q * k, len(P))
+    CP, R = C @ P, noise[at, :k, :k]
+    r = (points[at] - landmarks)[:, :k]
+    return Pairs(at, rows, r, CP @ C.T + block_diagonal(R), R), CP[:, :p].T
+
+
+def _spread_m(covariances: FloatArray) -> FloatArray:
+    """Return a bound on the standard deviation (m,) in any direction, of (m, 3, 3), metres."""
+    return np.asarray(np.sqrt(np.trace(covariances, axis1=1, axis2=2)))

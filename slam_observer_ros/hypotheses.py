@@ -1,0 +1,103 @@
+"""What may be: states that take points without an id for different landmarks.
+
+Where two readings of an observation put the robot at different places, both are followed, each
+with a state of its own, until later observations have made one much more likely than the other
+(D. B. Reid, *An algorithm for tracking multiple targets*, 1979). Nearly always there is one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from copy import deepcopy
+
+import numpy as np
+
+from slam_observer_ros.association import MARGIN
+from slam_observer_ros.events import (
+    FIRST_AUTOMATIC_ID,
+    is_automatic,
+    ObservationEvent,
+    UNKNOWN_ID,
+)
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam import Slam
+from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.velocity_history import HeldVelocities
+
+
+class Hypotheses:
+    """States that are all possible, the most likely first.
+
+    Parameters
+    ----------
+    slam : Slam
+        The state at the start.
+    settings : Settings
+        ``max_hypotheses``.
+
+    """
+
+    def __init__(self, slam: Slam, settings: Settings) -> None:
+        self._states = [slam]
+        self._costs = [0.0]
+        self._limit = settings.max_hypotheses
+        self._next_id = FIRST_AUTOMATIC_ID
+
+    def __len__(self) -> int:
+        """Return how many states are followed."""
+        return len(self._states)
+
+    @property
+    def best(self) -> Slam:
+        """The most likely state."""
+        return self._states[0]
+
+    def decide(self) -> Slam:
+        """Give up all states but the most likely one, and return that."""
+        self._states, self._costs = self._states[:1], [0.0]
+        return self.best
+
+    def advance(self, held: HeldVelocities) -> None:
+        """Move all states on along ``held``."""
+        for slam in self._states:
+            slam.advance(held)
+
+    def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
+        """Use an observation made at the states' instant; return what the best one makes of it.
+
+        Ids and residuals are those of :meth:`slam_observer_ros.slam.Slam.observe`.
+        """
+        if len(self._states) == 1 and not (event.ids == UNKNOWN_ID).any():
+            return self.best.observe(event)
+        readings = self._readings(event)
+        least = readings[0][0]
+        uses = Counter(number for _, number, _ in readings)
+        followed: list[tuple[float, Slam, tuple[IntArray, FloatArray]]] = []
+        for cost, number, reading in readings:
+            uses[number] -= 1
+            slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
+            seen = slam.observe(reading)
+            if not any(slam.is_where(other, event) for _, other, _ in followed):
+                followed.append((cost - least, slam, seen))
+            if len(followed) == self._limit:
+                break
+        self._costs = [cost for cost, _, _ in followed]
+        self._states = [slam for _, slam, _ in followed]
+        return followed[0][2]
+
+    def _readings(self, event: ObservationEvent) -> list[tuple[float, int, ObservationEvent]]:
+        """Return what each state may take an observation for: cost, number of the state, reading.
+
+        A point has the same id in all of them that take it for a new landmark.
+        """
+        for slam in self._states:
+            given = slam.landmarks.ids[is_automatic(slam.landmarks.ids)]  # of a loaded map, too
+            self._next_id = max(self._next_id, int(np.max(given, initial=0)) + 1)
+        new_ids = self._next_id + np.arange(len(event.ids))
+        readings = [
+            (cost + rise, number, reading)
+            for number, (slam, cost) in enumerate(zip(self._states, self._costs, strict=True))
+            for reading, rise in slam.readings(event, new_ids)
+        ]
+        readings.sort(key=lambda reading: reading[:2])
+        return [reading for reading in readings if reading[0] <= readings[0][0] + MARGIN]

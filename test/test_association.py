@@ -1,0 +1,261 @@
+"""Points without an id: which landmark each is, what is new, and where it can't be told yet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import itertools
+from pathlib import Path
+
+import gain_worlds
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.evaluation.metrics import ConfigurationError
+from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.events import (
+    FIRST_AUTOMATIC_ID,
+    is_automatic,
+    ObservationEvent,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.joint_compatibility import JointSearch, Pairs
+from slam_observer_ros.landmark_index import LandmarkIndex
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
+from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.settings import Settings
+
+CONFIG = Path(__file__).resolve().parent.parent / 'config' / 'wheeled_bearing_range.yaml'
+PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
+SPATIAL = Settings(reorder_window=0.0)
+SECOND_NS = 1_000_000_000
+
+
+def nameless(event):
+    return replace(event, ids=np.full_like(event.ids, UNKNOWN_ID))
+
+
+def without_ids(world):
+    return world.with_observations(lambda _, event: nameless(event))
+
+
+@pytest.mark.parametrize('settings', [PLANAR, SPATIAL], ids=['planar', 'spatial'])
+@pytest.mark.parametrize('seed', range(3))
+def test_without_ids_the_estimate_is_the_same_where_landmarks_are_well_apart(settings, seed):
+    world = gain_worlds.drive(settings, 40.0, seed, noise=0.5, landmarks=8)
+    named = gain_worlds.estimate(world, settings)
+    estimator = gain_worlds.estimate(without_ids(world), settings)
+    assert_allclose(estimator.pose, named.pose, atol=1e-6)
+    assert len(estimator.landmark_ids) == len(named.landmark_ids)
+    assert is_automatic(estimator.landmark_ids).all()
+    assert_allclose(estimator.world_points, named.world_points, atol=1e-6)
+
+
+def test_the_same_events_give_the_same_bits():
+    world = without_ids(gain_worlds.drive(PLANAR, 20.0, landmarks=40))
+    first, second = (gain_worlds.estimate(world, PLANAR) for _ in range(2))
+    assert_array_equal(first.pose, second.pose)
+    assert_array_equal(first.landmark_ids, second.landmark_ids)
+    assert_array_equal(first.world_points, second.world_points)
+
+
+def observe(estimator, time_s, points, ids=None):
+    """Add an observation of body points with ids, by default none."""
+    ids = np.full(len(points), UNKNOWN_ID) if ids is None else np.array(ids)
+    event = ObservationEvent(round(time_s * 1e9), ids, np.array(points, dtype=float))
+    assert estimator.add(event)
+
+
+def stand(estimator, time_s, body_velocity=(0, 0, 0, 0, 0, 0)):
+    assert estimator.add(VelocityEvent(round(time_s * 1e9), np.array(body_velocity, dtype=float)))
+
+
+def test_what_is_seen_once_or_twice_is_never_in_the_map_and_soon_forgotten():
+    estimator = Estimator(SPATIAL)
+    for step in range(150):
+        stand(estimator, 0.1 * step)
+        stray = [[0.0, 4.0, 1.0]] if step in (20, 21) else []
+        observe(estimator, 0.1 * step, [[3.0, 0.0, 0.0], *stray])
+        assert len(estimator.landmark_ids) == (1 if step >= 2 else 0)
+    assert estimator.counts['unsupported_landmark'] == 1
+
+
+def test_points_with_and_without_id_are_told_apart_in_one_observation():
+    estimator = Estimator(SPATIAL)
+    for step in range(10):
+        stand(estimator, 0.1 * step)
+        # The second lies beside the first, well within the sensor's noise.
+        points = [[3.0, 0.0, 0.0], [3.0, 0.02, 0.0], [0.0, 3.0, 0.0]]
+        observe(estimator, 0.1 * step, points, [7, UNKNOWN_ID, UNKNOWN_ID])
+    ids = estimator.landmark_ids
+    assert ids.tolist() == [7, FIRST_AUTOMATIC_ID + 1, FIRST_AUTOMATIC_ID + 2]
+    assert_allclose(estimator.world_points, points, atol=0.01)
+
+
+def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
+    """Two posts 3 m apart; after a blind turn of unknown size only one of them is in view.
+
+    The odometry says that it is the first, but it is the second. A third landmark tells.
+    """
+    settings = replace(PLANAR, angular_velocity_noise=(0.0, 0.0, 0.1), confirmations=1)
+    posts = np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 6.0, 0.0]])
+    estimator = Estimator(settings)
+    for step in range(20):
+        stand(estimator, 0.1 * step)
+        observe(estimator, 0.1 * step, posts)
+    known = estimator.landmark_ids
+    for step in range(20, 100):
+        stand(estimator, 0.1 * step)  # at rest, it says; the robot turns to the left by 0.6 rad
+    turned = se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0]))
+    seen = se3.transform(se3.inverse(turned), posts)
+    for step in range(100, 105):
+        observe(estimator, 0.1 * step, seen[1:2])
+    followed = len(estimator._hypotheses)
+    for step in range(105, 110):
+        observe(estimator, 0.1 * step, seen[1:])
+    assert followed > 1
+    assert_allclose(estimator.pose, turned, atol=0.1)
+    assert_array_equal(estimator.landmark_ids, known)
+    assert_allclose(estimator.world_points, posts, atol=0.1)
+
+
+def test_one_hypothesis_at_most_if_no_more_are_wanted():
+    world = without_ids(gain_worlds.drive(replace(PLANAR, max_hypotheses=1), 30.0, landmarks=60))
+    estimator = Estimator(replace(PLANAR, max_hypotheses=1))
+    for event in world.events:
+        estimator.add(event)
+        assert len(estimator._hypotheses) == 1
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled'])
+def test_gains_without_a_joint_covariance_leave_points_without_id_out(gains):
+    estimator = Estimator(replace(SPATIAL, gains=gains, confirmations=1))
+    stand(estimator, 0.0)
+    observe(estimator, 0.0, [[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]], [4, UNKNOWN_ID])
+    assert estimator.landmark_ids.tolist() == [4]
+    assert estimator.counts['unknown_id'] == 1
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+def test_a_robot_finds_its_way_in_a_map_by_reflectors_that_all_look_alike(mode):
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-9.0, -9.0, 0.0], [9.0, 9.0, 0.0], (25, 3))
+    reflectors = LandmarkMap(np.arange(25), points, None, np.full(25, 5))
+    settings = replace(PLANAR, localization_mode=mode, map_noise=0.02)
+    velocity = np.array([0.0, 0.0, 0.3, 0.8, 0.0, 0.0])
+    start = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, 2.0, 0.0]))
+    estimator = Estimator(settings)
+    estimator.load_map(reflectors, start, np.diag([0, 0, 0.03, 0.1, 0.1, 0]) ** 2)
+    true_start = start @ se3.exp(np.array([0.0, 0.0, 0.02, 0.07, -0.05, 0.0]))
+    for step in range(200):
+        pose = true_start @ se3.exp(velocity * 0.1 * step)
+        stand(estimator, 0.1 * step, velocity)
+        seen = se3.transform(se3.inverse(pose), points)
+        observe(estimator, 0.1 * step, seen[np.argsort(np.linalg.norm(seen, axis=1))[:4]])
+    assert_allclose(estimator.pose, pose, atol=0.03)
+    assert len(estimator.landmark_ids) == 25
+
+
+def test_numbers_given_to_landmarks_in_two_runs_say_nothing_of_which_is_which():
+    estimator = Estimator(replace(SPATIAL, confirmations=1))
+    tags = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
+    nameless_point = np.array([[3.0, 3.0, 0.0]])
+    for step in range(3):
+        stand(estimator, 0.1 * step)
+        observe(estimator, 0.1 * step, np.concatenate([tags, nameless_point]), [1, 2, 3, -1])
+    own = estimator.landmark_ids[-1]
+    ids = np.array([1, 2, 3, own])
+    elsewhere = np.concatenate([tags, [[-5.0, 1.0, 0.0]]])
+    estimator.load_map(LandmarkMap(ids, elsewhere, None, np.full(4, 9)))
+    assert estimator.is_localised
+    places = dict(zip(estimator.landmark_ids.tolist(), estimator.world_points, strict=True))
+    assert len(places) == 5
+    assert_allclose(places.pop(own), elsewhere[3], atol=1e-6)
+    assert_allclose(places[max(places)], nameless_point[0], atol=0.05)
+
+
+def test_without_ids_real_robots_are_hardly_worse_off(data_dir):
+    """Commands as odometry, blind for a minute at a time, posts of two or three barcodes."""
+    ratios = []
+    for robot in (2, 3):
+        run = load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot)
+        ratios.append(_configuration_rmse_m(run, nameless) / _configuration_rmse_m(run))
+    assert max(ratios) < 1.3
+
+
+def _configuration_rmse_m(run, change=None):
+    values = read_parameter_file(CONFIG)
+    names = {row.name for row in table(Settings)}
+    settings = from_parameters(Settings, {k: v for k, v in values.items() if k in names})
+    truth, error = (
+        Trajectory.from_samples(run.truth_stamps_ns, run.true_poses),
+        ConfigurationError(),
+    )
+
+    def compare(update):
+        (pose,), (covered,) = interpolate(truth, np.array([update.stamp_ns]))
+        if covered:
+            known, points = estimator.landmark_ids, estimator.world_points
+            error.add(update.stamp_ns, update.pose, known, points, pose, run.landmarks)
+
+    estimator = Estimator(settings, on_update=compare)
+    velocities = zip(run.velocity_stamps_ns.tolist(), run.body_velocities, strict=True)
+    events = [VelocityEvent(stamp_ns, V) for stamp_ns, V in velocities]
+    for event in sorted([*events, *run.observations], key=lambda event: event.stamp_ns):
+        is_observation = isinstance(event, ObservationEvent)
+        estimator.add(change(event) if change and is_observation else event)
+    estimator.flush()
+    return error.rmse_m
+
+
+@given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 4), st.sampled_from([2, 3]))
+def test_the_search_finds_the_cheapest_of_all_pairings(seed, points, landmarks, k):
+    rng = np.random.default_rng(seed)
+    at, rows = np.nonzero(rng.random((points, landmarks)) < 0.8)
+    q, gate = len(at), 3.0
+    root = rng.normal(size=(q * k, q * k))
+    noise = np.tile(0.3 * np.eye(k), (q, 1, 1))
+    S = 0.2 * root @ root.T + np.kron(np.eye(q), 0.3 * np.eye(k))
+    r = rng.normal(scale=1.5, size=(q, k))
+
+    def cost(chosen):
+        columns = (k * np.array(chosen, dtype=int)[:, None] + np.arange(k)).ravel()
+        own, left = S[np.ix_(columns, columns)], r[list(chosen)].ravel()
+        log_ratio = np.linalg.slogdet(own)[1] - len(chosen) * k * np.log(0.3)
+        unpaired = len(np.unique(at)) - len(chosen)
+        return left @ np.linalg.solve(own, left) + log_ratio + unpaired * gate**2
+
+    possible = [
+        chosen
+        for count in range(q + 1)
+        for chosen in itertools.combinations(range(q), count)
+        if len({at[i] for i in chosen}) == len({rows[i] for i in chosen}) == count
+    ]
+    pairs = Pairs(at, rows, r, S, noise)
+    found = JointSearch(pairs, np.zeros(q, dtype=bool), gate, 10.0).pairings()
+    least = min(cost(chosen) for chosen in possible)
+    assert found[0].cost == pytest.approx(least)
+    assert found[0].cost == pytest.approx(cost(found[0].chosen))
+    assert len(found) == sum(cost(chosen) <= least + 10.0 for chosen in possible)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 300), st.floats(0.01, 20.0))
+def test_the_index_misses_no_landmark_while_they_move_and_change_in_number(seed, first, radius_m):
+    rng = np.random.default_rng(seed)
+    index, landmarks = LandmarkIndex(), rng.uniform(-10.0, 10.0, (first, 3))
+    for _ in range(4):
+        points = rng.uniform(-10.0, 10.0, (3, 3))
+        radii_m = radius_m * rng.uniform(0.5, 1.0, 3)
+        found = np.zeros((3, len(landmarks)), dtype=bool)
+        found[index.near(landmarks, points, radii_m)] = True
+        distances_m = np.linalg.norm(points[:, None] - landmarks, axis=2)
+        assert found[distances_m <= radii_m[:, None]].all()
+        landmarks = landmarks + rng.normal(scale=0.05, size=landmarks.shape)
+        landmarks = np.concatenate([landmarks, rng.uniform(-10.0, 10.0, (rng.integers(9), 3))])
+        landmarks = np.delete(landmarks, rng.integers(len(landmarks)), axis=0)
