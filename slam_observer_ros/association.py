@@ -28,6 +28,9 @@ MARGIN = 40.0
 RESOLUTION = 3.0
 """Two places are one if the sensor can't tell them apart by this many standard deviations."""
 
+MAX_CANDIDATES = 10
+"""Landmarks that a point may be taken for; the nearest, if there are more."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:
@@ -120,7 +123,10 @@ def _pairs_within(
     a = observer.a[rows]
     e = points[at] - a
     pairs = Innovation(rows, e, e - observer.y_ref[rows], a, noise[at], 0.0)
-    near = gains.distances(pairs) <= gate
+    distances = gains.distances(pairs)
+    order = np.lexsort((distances, at))
+    rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
+    near = order[(rank < MAX_CANDIDATES) & (distances[order] <= gate)]
     return at[near], rows[near]
 
 

@@ -220,7 +220,7 @@ class Settings:
         minimum=0,
     )
     hindsight_turn: float = parameter(
-        0.3,
+        0.1,
         'Riccati gains: root sum square of attitude corrections after which to look back',
         unit='rad',
         minimum=0.0,

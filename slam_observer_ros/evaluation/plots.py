@@ -25,7 +25,7 @@ from slam_observer_ros.evaluation.metrics import (
     TrajectoryErrors,
 )
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import LandmarkTruth
+from slam_observer_ros.events import is_automatic, LandmarkTruth
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -260,8 +260,9 @@ def plot_map(
             axes.plot(points[:, 0], points[:, up], **style)
         axes.set(xlim=(low[0], high[0]), ylim=(low[up], high[up]), aspect='equal')
         axes.set_ylabel(f'{"xyz"[up]} [m]')
-    if len(ids) <= _MOST_LABELS:
-        _label_landmarks(panels[0], ids, world_points, landmark_truth)
+    named = ~is_automatic(ids)
+    if np.sum(named) <= _MOST_LABELS:
+        _label_landmarks(panels[0], ids[named], world_points[named], landmark_truth)
     aligned = '' if truth is None else ' after rigid alignment'
     panels[0].set_title(f'Trajectory and map{aligned}')
     panels[-1].set_xlabel('x [m]')

@@ -11,6 +11,8 @@ import numpy as np
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.robust import mahalanobis
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -44,6 +46,13 @@ class FixedMapGains(RiccatiGains):
         covariance = np.zeros((size, size))
         covariance[: self._p, : self._p] = self._P[: self._p, : self._p]
         return covariance
+
+    def distances(self, innovation: Innovation) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        k, P = self._axes.point, self._P[: self._p, : self._p]
+        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r)
+        CPC = C @ P @ so3.transpose(C)
+        return mahalanobis(innovation.r[:, :k], CPC + innovation.covariances[:, :k, :k])
 
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose's covariance."""

@@ -31,8 +31,8 @@ from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.prediction import initial_covariance, predict
-from slam_observer_ros.gains.robust import block_diagonal, distances, observation_weights
-from slam_observer_ros.geometry import se3, slam_group
+from slam_observer_ros.gains.robust import block_diagonal, mahalanobis, observation_weights
+from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Prior, Smoother, Solution
@@ -201,8 +201,13 @@ class RiccatiGains:
     def distances(self, innovation: Innovation) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
         k = self._axes.point
-        S = self._foretold(innovation)
-        return distances(innovation.r[:, :k], S, innovation.covariances[:, :k, :k])
+        columns = self._columns(innovation.indices).reshape(-1, k)
+        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r)
+        cross = self._P[columns, : self._p] @ so3.transpose(C)
+        own = self._P[columns[:, :, None], columns[:, None, :]]
+        CPC = C @ self._P[: self._p, : self._p] @ so3.transpose(C)
+        CPC += own - cross - so3.transpose(cross)
+        return mahalanobis(innovation.r[:, :k], CPC + innovation.covariances[:, :k, :k])
 
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
