@@ -89,6 +89,10 @@ class Observer:
         """(n, 3) estimated landmarks p̂_i = p_i° + R_P° â_i = P° (y_i° + â_i), metres, world."""
         return se3.transform(self.reference_pose, self.y_ref + self.a)
 
+    def body_points(self, indices: IntArray) -> FloatArray:
+        """Return where landmarks should be seen, Â⁻¹ (y_i° + â_i) (m, 3), metres, body frame."""
+        return se3.transform(se3.inverse(self.A), self.y_ref[indices] + self.a[indices])
+
     def add_landmarks(self, points: FloatArray) -> None:
         """Append landmarks seen for the first time, so that their residual is zero.
 

@@ -219,7 +219,7 @@ class Slam:
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows, event.velocities)
         in_doubt = self._in_doubt(rows) if self.is_mapping else np.zeros(len(rows), np.bool_)
-        seen = Seen(event.stamp_ns, rows, event.points, self._noise.observation(event))
+        seen = Seen(event.stamp_ns, rows, event.points, self._covariances(event, rows))
         self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
         self._relocate(_select(event, in_doubt), rows[in_doubt])
         return ids, residuals
@@ -279,10 +279,22 @@ class Slam:
         e, r = self.observer.errors(rows, event.points)
         R = self.observer.A[:3, :3]
         since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
-        covariances = R @ self._noise.observation(event) @ R.T
+        covariances = R @ self._covariances(event, rows) @ R.T
         return Innovation(
             rows, e, r, self.observer.a[rows], covariances, (event.stamp_ns - since_ns) * 1e-9
         )
+
+    def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+        """Return the covariances (m, 3, 3) of observed landmarks, body frame, m².
+
+        The noise model is told where a landmark should be, not where it was measured: a landmark
+        measured too near would be believed more than one measured too far, and all would be
+        drawn towards the robot. Only if it is in doubt, the measured point is the better guess.
+        """
+        points = np.where(
+            self._in_doubt(rows)[:, None], event.points, self.observer.body_points(rows)
+        )
+        return self._noise.observation(replace(event, points=points))
 
     def _in_doubt(self, rows: IntArray) -> BoolArray:
         """Return which of the landmarks seen (m,) have been rejected too often to be trusted."""

@@ -141,6 +141,30 @@ def test_covariances_of_messages_are_used_as_they_are():
     np.testing.assert_allclose(NoiseModel(Settings()).observation(event), stated, rtol=1e-3)
 
 
+def spread_after(range_m, **settings):
+    """Standard deviations of a robot that has seen landmarks 4 m ahead, then at ``range_m``."""
+    estimator = Estimator(Settings(gains='riccati', reorder_window=0.0, **settings))
+    sights = np.array([[1.0, 0.0, 0.0], [0.8, 0.6, 0.0], [0.8, 0.0, 0.6]])
+    for step, seen_at_m in enumerate([4.0, 4.0, 4.0, range_m]):
+        stamp_ns = 10**9 + step * 10**8
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        estimator.add(ObservationEvent(stamp_ns, np.arange(3), seen_at_m * sights))
+    return np.sqrt(np.diag(estimator.pose_covariance))
+
+
+@pytest.mark.parametrize(
+    'settings',
+    [
+        {'range_noise': 0.1, 'range_scale_noise': 0.2, 'bearing_noise': 0.02},
+        {'observation_model': 'stereo', 'stereo_focal_length': 400.0, 'stereo_baseline': 0.1},
+    ],
+)
+def test_known_landmarks_weigh_the_same_whether_seen_too_near_or_too_far(settings):
+    settings = {**settings, 'linear_velocity_noise': (0.5,) * 3, 'huber_threshold': 0.0}
+    near, far = spread_after(3.7, **settings), spread_after(4.3, **settings)
+    np.testing.assert_allclose(near, far, rtol=5e-3)
+
+
 def awkward_observations():
     """Points and covariances that are within the rules but leave some direction exact."""
     turned = so3.exp(np.array([0.3, 0.2, 0.5]))
