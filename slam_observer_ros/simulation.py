@@ -24,6 +24,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.parameters import parameter
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 BODY_VELOCITY = (0.0, 0.0, 0.2, 1.0, 0.0, 0.0)
 """Section VI's (Ω, v), rad/s and m/s, body frame."""
@@ -39,8 +40,6 @@ PAPER_DIRECTIONS = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1
 
 LANDMARK_LOOP_RADIUS_M = 1.0
 """Radius of the horizontal circle on which a moving landmark runs."""
-
-NANOSECONDS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,9 +226,9 @@ class Simulation:
         return heapq.merge(motion, sightings, key=lambda entry: entry[0])
 
     def _stamps(self, rate_hz: float) -> Iterator[int]:
-        end_ns = self.scenario.end_s * NANOSECONDS
+        end_ns = self.scenario.end_s * NANOSECONDS_PER_SECOND
         step = 0
-        while (elapsed_ns := round(step * NANOSECONDS / rate_hz)) <= end_ns:
+        while (elapsed_ns := round(step * NANOSECONDS_PER_SECOND / rate_hz)) <= end_ns:
             yield self.start_ns + elapsed_ns
             step += 1
 
@@ -270,7 +269,7 @@ class Simulation:
     def _draw_delay_ns(self, rng: np.random.Generator) -> int:
         if rng.random() >= self.scenario.late_fraction:
             return 0
-        return round(rng.uniform(0.0, self.scenario.max_lateness) * NANOSECONDS)
+        return round(rng.uniform(0.0, self.scenario.max_lateness) * NANOSECONDS_PER_SECOND)
 
     def _loop_angle(self, stamp_ns: int) -> FloatArray:
         rate = self.scenario.landmark_speed / LANDMARK_LOOP_RADIUS_M
@@ -278,7 +277,9 @@ class Simulation:
         return angle
 
     def _elapsed_s(self, stamp_ns: int | IntArray) -> FloatArray:
-        return np.asarray((np.asarray(stamp_ns) - self.start_ns) / NANOSECONDS, dtype=np.float64)
+        return np.asarray(
+            (np.asarray(stamp_ns) - self.start_ns) / NANOSECONDS_PER_SECOND, dtype=np.float64
+        )
 
 
 def _stamp_ns(delivery: Delivery) -> int:

@@ -13,8 +13,7 @@ import numpy as np
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-
-NANOSECONDS_PER_SECOND = 1_000_000_000
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 MAX_GAP_NS = NANOSECONDS_PER_SECOND // 2
 """Truth is not interpolated between samples further apart than this."""

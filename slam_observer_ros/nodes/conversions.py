@@ -13,13 +13,12 @@ from std_msgs.msg import Header
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
 from slam_observer_ros.types import FloatArray, IntArray
-
-NANOSECONDS = 1_000_000_000
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 
 def time_message(stamp_ns: int) -> Time:
     """Return a stamp in nanoseconds as a message."""
-    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 

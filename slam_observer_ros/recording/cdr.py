@@ -9,12 +9,12 @@ import numpy as np
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 """One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""
 
 ENCAPSULATION_BYTES = 4
-NANOSECONDS_PER_SECOND = 1_000_000_000
 MAXIMUM_PADDING_BYTES = 3
 
 _UINT32 = {'<': struct.Struct('<I'), '>': struct.Struct('>I')}

@@ -29,9 +29,10 @@ from rosbags.typesys import get_typestore, Stores
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.recording.cdr import Buffer, NANOSECONDS_PER_SECOND
+from slam_observer_ros.recording.cdr import Buffer
 from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout, PointCloud2Layout
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 VELOCITY_TOPIC = '/twist'
 LANDMARKS_TOPIC = '/landmarks'
