@@ -1,4 +1,4 @@
-"""Events of a recording through the estimator, and how accurate the outcome is.
+"""Events of a recording through the estimator.
 
 What is measured is the *online* estimate: the pose as it was known at each moment, from the events
 received until then, never corrected in hindsight. The trajectory is sampled at the stamps of
@@ -10,29 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-import logging
 import time
 
 import numpy as np
 
-from slam_observer_ros.estimates import Hindsight, Update
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.evaluation.errors import EvaluationError
-from slam_observer_ros.evaluation.metrics import (
-    anchored_average_nees,
-    ConfigurationError,
-    landmark_errors,
-    trajectory_errors,
-    TrajectoryErrors,
-)
+from slam_observer_ros.evaluation.metrics import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import Event, VelocityEvent
 from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.recording.reader import Truth
+from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
-
-logger = logging.getLogger(__name__)
 
 SAMPLE_PERIOD_NS = 50_000_000
 """Least time between two poses of a sampled trajectory: 20 Hz at most."""
@@ -216,88 +206,3 @@ class _Run:
                 true_poses[0],
                 self._landmark_truth,
             )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Accuracy:
-    """Errors of a replay; None where the truth that it takes is not in the recording.
-
-    Attributes
-    ----------
-    pose_errors : TrajectoryErrors or None
-        Of the online trajectory, after one rigid alignment.
-    dead_reckoning_errors : TrajectoryErrors or None
-        The same of the velocities alone.
-    landmark_rmse_m : float or None
-        Of the final map, after a rigid alignment of its own, metres.
-    configuration_rmse_m : float or None
-        See :class:`ConfigurationError`, metres.
-    anees : float or None
-        Of the pose, per degree of freedom; None where the gains know no covariance, too.
-
-    """
-
-    pose_errors: TrajectoryErrors | None
-    dead_reckoning_errors: TrajectoryErrors | None
-    landmark_rmse_m: float | None
-    configuration_rmse_m: float | None
-    anees: float | None
-
-
-def measure(result: Replay, truth: Truth) -> Accuracy:
-    """Compare a replay with the truth."""
-    pose_truth = Trajectory(truth.stamps_ns, truth.poses)
-    return Accuracy(
-        _pose_errors(result.trajectory, pose_truth),
-        _pose_errors(result.dead_reckoning, pose_truth),
-        _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
-        result.configuration.rmse_m,
-        None
-        if result.pose_covariances is None
-        else anchored_average_nees(result.trajectory, result.pose_covariances, pose_truth),
-    )
-
-
-def measure_hindsight(
-    hindsight: Hindsight, truth: Truth
-) -> tuple[TrajectoryErrors | None, float | None]:
-    """Compare what was smoothed with the truth.
-
-    Returns
-    -------
-    pose_errors : TrajectoryErrors or None
-        Of the poses at the observations, after one rigid alignment.
-    landmark_rmse_m : float or None
-        Of the map, after a rigid alignment of its own, metres.
-
-    """
-    return (
-        _pose_errors(trajectory_of(hindsight), Trajectory(truth.stamps_ns, truth.poses)),
-        _landmark_rmse_m(hindsight.ids, hindsight.world_points, truth),
-    )
-
-
-def trajectory_of(hindsight: Hindsight) -> Trajectory:
-    """Return the poses of a hindsight as a trajectory."""
-    return Trajectory.from_samples(hindsight.stamps_ns.tolist(), list(hindsight.poses))
-
-
-def _pose_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
-    if not len(truth):
-        return None
-    try:
-        return trajectory_errors(estimate, truth)
-    except EvaluationError as error:
-        logger.warning('The trajectory is not compared with the truth: %s', error)
-        return None
-
-
-def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
-    if truth.landmarks is None:
-        return None
-    try:
-        errors = landmark_errors(ids, world_points, truth.landmarks)
-    except EvaluationError as error:
-        logger.warning('The map is not compared with the truth: %s', error)
-        return None
-    return errors.rmse_m

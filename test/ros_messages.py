@@ -60,16 +60,37 @@ def odometry(
     position: Sequence[float] = (1.0, 2.0, 3.0),
     quaternion: Sequence[float] = (0.0, 0.0, 0.6, 0.8),
     frames: tuple[str, str] = ('odom', 'base_link'),
+    stamp_ns: int = STAMP_NS,
 ) -> object:
     """nav_msgs/Odometry with one covariance, in ROS order, for both pose and twist."""
     return make(
         'nav_msgs/msg/Odometry',
-        header(frames[0]),
+        header(frames[0], stamp_ns),
         frames[1],
         make(
             'geometry_msgs/msg/PoseWithCovariance', pose(position, quaternion), covariance.ravel()
         ),
         make('geometry_msgs/msg/TwistWithCovariance', twist(body_velocity), covariance.ravel()),
+    )
+
+
+def imu(
+    angular_velocity: Sequence[float],
+    covariance: np.ndarray,
+    frame_id: str = 'imu',
+    stamp_ns: int = STAMP_NS,
+) -> object:
+    """sensor_msgs/Imu with nothing but an angular velocity."""
+    unknown = np.zeros(9)
+    return make(
+        'sensor_msgs/msg/Imu',
+        header(frame_id, stamp_ns),
+        make('geometry_msgs/msg/Quaternion', 0.0, 0.0, 0.0, 1.0),
+        unknown,
+        vector(angular_velocity),
+        covariance.ravel(),
+        vector([4.0, 5.0, 6.0]),
+        unknown,
     )
 
 
@@ -120,12 +141,15 @@ def point_cloud2(
 
 
 def transform_stamped(
-    frames: tuple[str, str], translation: Sequence[float], quaternion: Sequence[float]
+    frames: tuple[str, str],
+    translation: Sequence[float],
+    quaternion: Sequence[float],
+    stamp_ns: int = STAMP_NS,
 ) -> object:
     """geometry_msgs/TransformStamped."""
     return make(
         'geometry_msgs/msg/TransformStamped',
-        header(frames[0]),
+        header(frames[0], stamp_ns),
         frames[1],
         make(
             'geometry_msgs/msg/Transform',

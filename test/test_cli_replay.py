@@ -191,7 +191,7 @@ class TestSettings:
 
     def test_the_nodes_own_file(self, slam_observer, simulated, tmp_path):
         config = self.config(
-            tmp_path, 'gains: constant, publish_rate: 20.0, base_frame: rover, use_sim_time: true'
+            tmp_path, 'gains: constant, publish_rate: 20.0, odom_frame: wheels, use_sim_time: true'
         )
         output = slam_observer.succeed('replay', simulated, '--config', config).output
         assert 'constant gains' in output

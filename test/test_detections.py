@@ -21,6 +21,7 @@ from slam_observer_ros.recording.detections import (
     decode_pose_array,
     observed_tags,
 )
+from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.messages import PoseMessage
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.topics import TopicNames
@@ -186,9 +187,7 @@ def recording_path(tmp_path_factory):
 
 
 def transform(parent, child, position, quaternion, stamp_ns):
-    message = ros.transform_stamped((parent, child), position, quaternion)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-    return message
+    return ros.transform_stamped((parent, child), position, quaternion, stamp_ns)
 
 
 def transforms(messages):
@@ -219,7 +218,8 @@ def cloud(event):
 def replayed(path, **names):
     with open_recording(path) as recording:
         selected = recording.find_topics(TopicNames(**names))
-        return replay(recording.events(selected, 'base_link', 'dock'), Settings()).estimator
+        inputs = InputSettings(tag_frame_prefix='dock')
+        return replay(recording.events(selected, inputs), Settings()).estimator
 
 
 @pytest.mark.parametrize('topic', ['/tf', '/tags/tf'])

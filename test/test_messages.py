@@ -93,19 +93,7 @@ class TestVelocities:
         assert messages.decode_odometry_twist(raw).event.covariance is None
 
     def imu(self, covariance: np.ndarray) -> bytes:
-        unknown = np.zeros(9)
-        return ros.serialise(
-            ros.make(
-                'sensor_msgs/msg/Imu',
-                ros.header('imu'),
-                ros.make('geometry_msgs/msg/Quaternion', 0.0, 0.0, 0.0, 1.0),
-                unknown,
-                ros.vector([1.0, 2.0, 3.0]),
-                covariance.ravel(),
-                ros.vector([4.0, 5.0, 6.0]),
-                unknown,
-            )
-        )
+        return ros.serialise(ros.imu([1.0, 2.0, 3.0], covariance))
 
     def test_imu_gives_angular_velocity(self):
         covariance = np.arange(1.0, 10.0).reshape(3, 3)

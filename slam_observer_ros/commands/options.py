@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 import json
 import os
@@ -48,13 +48,17 @@ def add_settings_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def read_settings(args: argparse.Namespace, **defaults: Value) -> Settings:
+def read_settings(
+    args: argparse.Namespace, other_names: Collection[str] = (), **defaults: Value
+) -> Settings:
     """Build settings from defaults, ``--config``, ``--set`` and ``--gains``; later ones win.
 
     Parameters
     ----------
     args : Namespace
         With the options of :func:`add_settings_options`.
+    other_names : collection of str
+        Names that ``--set`` takes for other settings of the command.
     **defaults : Value
         What the command sets if the user doesn't.
 
@@ -65,18 +69,28 @@ def read_settings(args: argparse.Namespace, **defaults: Value) -> Settings:
 
     """
     values: dict[str, object] = dict(defaults)
-    if args.config is not None:
-        values |= _read_config(args.config)
-    values |= dict(_parse_assignment(text) for text in args.set)
+    values |= {
+        name: value for name, value in read_config(args).items() if not _is_only_for_node(name)
+    }
+    for name, value in read_assignments(args).items():
+        if name in other_names:
+            continue
+        if _is_only_for_node(name):
+            raise UsageError(f"--set {name}: that is the node's parameter, of no use here")
+        values[name] = value
     if args.gains is not None:
         values['gains'] = args.gains
     return from_parameters(Settings, values)
 
 
-def _read_config(name: str) -> dict[str, object]:
-    """Read the estimator's part of a parameter file of the node."""
-    values = read_parameter_file(_find_config(name))
-    return {key: value for key, value in values.items() if not _is_only_for_node(key)}
+def read_config(args: argparse.Namespace) -> dict[str, object]:
+    """Read the parameter file that ``--config`` names, the node's own parameters included."""
+    return {} if args.config is None else read_parameter_file(_find_config(args.config))
+
+
+def read_assignments(args: argparse.Namespace) -> dict[str, object]:
+    """Return what ``--set`` sets, by name."""
+    return dict(_parse_assignment(text) for text in args.set)
 
 
 def _is_only_for_node(name: str) -> bool:
@@ -113,8 +127,6 @@ def _parse_assignment(text: str) -> tuple[str, object]:
     name, equals, value = text.partition('=')
     if not (name and equals):
         raise UsageError(f"--set takes NAME=VALUE, not '{text}'")
-    if name not in _ESTIMATOR_NAMES and _is_only_for_node(name):
-        raise UsageError(f"--set {name}: that is the node's parameter, of no use here")
     return name, _parse_value(value)
 
 

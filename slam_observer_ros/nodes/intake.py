@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 import time
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 from rclpy.node import Node
 
@@ -14,31 +14,17 @@ from slam_observer_ros.clock_offset import ClockOffset
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.nodes.frames import BaseFrame
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.recording.detections import TagDetections
+from slam_observer_ros.recording.event_builder import EventBuilder, Measured, NO_TRANSFORM
+from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
-from slam_observer_ros.velocity_sources import AngularReplacement, PoseDifferences
 
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports of one kind of drop."""
 
-MAX_WAITING = 1000
-"""Most messages that wait for a transform; the oldest go first."""
-
-Measured: TypeAlias = VelocityEvent | ObservationEvent | ImuMessage | PoseMessage | TagDetections
-MeasuredT = TypeVar('MeasuredT', VelocityEvent, ObservationEvent, ImuMessage, PoseMessage,
-                    TagDetections)  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class _Waiting:
-    """A message whose transform is not known yet."""
-
-    deadline_s: float
-    resolve: Callable[[], None]
-    give_up: Callable[[TransformError], None]
+MeasuredT = TypeVar('MeasuredT', VelocityEvent, ObservationEvent, ImuMessage, PoseMessage)
 
 
 class Intake:
@@ -77,15 +63,15 @@ class Intake:
         estimator: Estimator,
         base_frame: BaseFrame,
     ) -> None:
-        timeout_ns = round(estimator.settings.velocity_timeout * 1e9)
         self._node = node
         self._settings = settings
         self._estimator = estimator
-        self._base_frame = base_frame
-        self._poses = PoseDifferences(timeout_ns)
-        self._joined = AngularReplacement(timeout_ns)
-        self._waiting: deque[_Waiting] = deque(maxlen=MAX_WAITING)
-        self._frames_taken_as_base: set[str] = set()
+        self._builder = EventBuilder(
+            base_frame,
+            settings.transform_timeout,
+            estimator.settings.velocity_timeout,
+            self._drop_untransformed,
+        )
         self._quiet_until_s: dict[str, float] = {}
         self._processing_s = 0.0
         self._processed = 0
@@ -101,29 +87,25 @@ class Intake:
         """Take a velocity."""
         event = self._timed(message.event, 'twist', receive_ns)
         if event is not None:
-            self._place_velocity(replace(message, event=event))
+            self._build(replace(message, event=event))
 
     def add_pose(self, message: PoseMessage, receive_ns: int) -> None:
         """Take an odometry's pose; the velocity comes from its differences."""
         timed = self._timed(message, 'twist', receive_ns)
-        event = None if timed is None else self._poses.add(timed.stamp_ns, timed.pose)
-        if event is not None:
-            self._place_velocity(VelocityMessage(message.child_frame_id, event))
+        if timed is not None:
+            self._build(timed)
 
     def add_imu(self, message: ImuMessage, receive_ns: int) -> None:
         """Take an angular velocity."""
         timed = self._timed(message, 'imu', receive_ns)
         if timed is not None:
-            self._try(lambda: self._use_imu(timed), self._drop_untransformed)
+            self._build(timed)
 
     def add_observation(self, message: ObservationMessage, receive_ns: int) -> None:
         """Take landmarks."""
         event = self._timed(message.event, 'landmarks', receive_ns)
         if event is not None:
-            timed = replace(message, event=event)
-            self._try(
-                lambda: self._use(self._base_frame.observation(timed)), self._drop_untransformed
-            )
+            self._build(replace(message, event=event))
 
     def add_observations(self, messages: Sequence[ObservationMessage], receive_ns: int) -> None:
         """Take landmarks of several cameras."""
@@ -133,17 +115,16 @@ class Intake:
     def add_tags(self, message: TagDetections, receive_ns: int) -> None:
         """Take fiducials whose positions are on /tf, at the stamps of their message there."""
         if self._is_usable('landmarks', message.stamp_ns, receive_ns):
-            self._try(lambda: self._use(self._base_frame.tags(message)), self._drop_untransformed)
+            self._build(message)
 
     def retry(self) -> None:
         """Try again what waits for a transform; call it often."""
-        waiting, self._waiting = self._waiting, deque(maxlen=MAX_WAITING)
-        for message in waiting:
-            self._attempt(message)
+        for event in self._builder.retry(time.monotonic_ns()):
+            self._use(event)
 
     def forget(self) -> None:
         """Drop what waits, and what is known of clocks, as after a jump of the clock."""
-        self._waiting.clear()
+        self._builder.forget()
         for clock in self.clocks.values():
             clock.clear()
 
@@ -153,29 +134,8 @@ class Intake:
         self._processing_s, self._processed = 0.0, 0
         return mean_s * 1e3
 
-    def _place_velocity(self, message: VelocityMessage) -> None:
-        def use() -> None:
-            self._use(self._joined.add_velocity(self._base_frame.velocity(message)))
-
-        def use_untransformed(error: TransformError) -> None:
-            self._frames_taken_as_base.add(message.frame_id)
-            self._node.get_logger().warning(
-                f"velocities in frame '{message.frame_id}' are taken to be those of "
-                f"'{self._settings.base_frame}': {error}"
-            )
-            self._use(self._joined.add_velocity(message.event))
-
-        if message.frame_id in self._frames_taken_as_base:
-            self._use(self._joined.add_velocity(message.event))
-        else:
-            self._try(use, use_untransformed)
-
-    def _use_imu(self, message: ImuMessage) -> None:
-        turned = self._base_frame.angular_velocity(message)
-        event = self._joined.add_angular(
-            turned.stamp_ns, turned.angular_velocity, turned.covariance
-        )
-        if event is not None:
+    def _build(self, measured: Measured) -> None:
+        for event in self._builder.add(measured, time.monotonic_ns()):
             self._use(event)
 
     def _use(self, event: Event) -> None:
@@ -184,21 +144,8 @@ class Intake:
         self._processing_s += time.perf_counter() - start_s
         self._processed += 1
 
-    def _try(self, resolve: Callable[[], None], give_up: Callable[[TransformError], None]) -> None:
-        deadline_s = time.monotonic() + self._settings.transform_timeout
-        self._attempt(_Waiting(deadline_s, resolve, give_up))
-
-    def _attempt(self, message: _Waiting) -> None:
-        try:
-            message.resolve()
-        except TransformError as error:
-            if time.monotonic() < message.deadline_s:
-                self._waiting.append(message)
-            else:
-                message.give_up(error)
-
     def _drop_untransformed(self, error: TransformError) -> None:
-        self._drop('no_transform', f"no transform to '{self._settings.base_frame}': {error}")
+        self._drop(NO_TRANSFORM, f"no transform to '{self._settings.base_frame}': {error}")
 
     def _timed(self, measured: MeasuredT, source: str, receive_ns: int) -> MeasuredT | None:
         """Return the measurement in this machine's time; None if it can't be used."""

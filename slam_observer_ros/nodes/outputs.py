@@ -26,11 +26,11 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
     unknown_covariance_field,
 )
-from slam_observer_ros.nodes.frames import TransformSource
 from slam_observer_ros.nodes.markers import landmark_markers
 from slam_observer_ros.nodes.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.recording.frames import TransformSource
 from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud, FLOAT32_ID_LIMIT
 
 PATH_SPACING_NS = 100_000_000

@@ -5,29 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam_observer_ros.parameters import parameter
+from slam_observer_ros.recording.input_settings import InputSettings
 
 AUTO = 'auto'
 """Message type parameter: take the type that is found on the topic."""
 
-Pose6 = tuple[float, float, float, float, float, float]
-
 
 @dataclass(frozen=True)
-class ObserverNodeSettings:
-    """What ``observer_node`` adds to the estimator's settings."""
+class ObserverNodeSettings(InputSettings):
+    """What ``observer_node`` adds to the settings of the estimator and its inputs."""
 
     velocity_type: str = parameter(
         AUTO,
         'Message type on twist; auto takes the type found on the topic',
         choices=(AUTO, 'Twist', 'TwistStamped', 'TwistWithCovarianceStamped', 'Odometry'),
-    )
-    velocity_source: str = parameter(
-        'twist',
-        'What of Odometry is used: its twist, or the differences of its poses',
-        choices=('twist', 'pose_differences'),
-    )
-    use_imu: bool = parameter(
-        False, 'Whether the angular velocity comes from the Imu on imu, the linear one from twist'
     )
     landmarks_type: str = parameter(
         AUTO,
@@ -43,9 +34,6 @@ class ObserverNodeSettings:
             'tf',
         ),
     )
-    tag_frame_prefix: str = parameter(
-        'tag_', "Name of a fiducial's frame before its id; family:id, as of apriltag_ros, fits too"
-    )
     twist_qos: str = parameter(
         'best_effort',
         'Reliability asked of twist and imu; best_effort hears any publisher',
@@ -58,25 +46,6 @@ class ObserverNodeSettings:
     )
     queue_depth: int = parameter(
         100, 'Messages of each input kept while the node is busy', minimum=1, maximum=10_000
-    )
-    map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks')
-    odom_frame: str = parameter(
-        'odom',
-        'Odometry frame: if /tf has odom_frame to base_frame, map_frame to odom_frame is '
-        'published; empty for never',
-    )
-    base_frame: str = parameter('base_link', 'Frame of the robot, whose pose is estimated')
-    sensor_frame: str = parameter(
-        '', "Frame of the landmarks; empty takes each message's own, base_frame needs no transform"
-    )
-    sensor_pose: Pose6 = parameter(
-        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        "Pose of the landmarks' sensor in base_frame, x y z and roll pitch yaw, in place of /tf; "
-        'all zeros: from /tf',
-        unit='m, rad',
-    )
-    transform_timeout: float = parameter(
-        0.5, 'How long a message waits for a transform', unit='s', minimum=0.0, maximum=60.0
     )
     transform_tolerance: float = parameter(
         0.1,

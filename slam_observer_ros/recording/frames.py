@@ -1,15 +1,23 @@
-"""Frames of recorded or received messages: where sensors sit on the robot."""
+"""Frames of recorded or received messages: measurements brought into the base frame."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Protocol, TypeVar
+
+import numpy as np
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.events import Event, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation, move_velocity
-from slam_observer_ros.recording.messages import PoseMessage, VelocityMessage
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
+from slam_observer_ros.recording.detections import TagDetections
+from slam_observer_ros.recording.input_settings import InputSettings
+from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.transform_buffer import TransformBuffer
+from slam_observer_ros.types import FloatArray
+
+MeasuredT = TypeVar('MeasuredT', ObservationEvent, VelocityEvent, ImuMessage)
 
 
 def insert_transforms(
@@ -26,17 +34,128 @@ def insert_transforms(
         )
 
 
-def event_in_frame(
-    base_frame: str, message: VelocityMessage | ObservationMessage, transforms: TransformBuffer
-) -> Event:
-    """Return the event as the base has it; as it is where nothing connects their frames."""
-    event = message.event
-    if not base_frame or message.frame_id in ('', base_frame):
-        return event
-    try:
-        pose = transforms.lookup(base_frame, message.frame_id, event.stamp_ns)
-    except TransformError:
-        return event
-    if isinstance(event, VelocityEvent):
-        return move_velocity(event, pose)
-    return move_observation(event, pose)
+class TransformSource(Protocol):
+    """Where transforms come from."""
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
+        """Return the pose (4, 4) of frame ``source`` in frame ``target``.
+
+        Raises
+        ------
+        TransformError
+            If it is not known at that time.
+
+        """
+
+    def clear(self) -> None:
+        """Forget what has a time, after a jump of the clock."""
+
+
+class BaseFrame:
+    """Brings measurements into the base frame.
+
+    A message without frame is taken to be in the base frame already.
+
+    Parameters
+    ----------
+    settings : InputSettings
+        Frames, and the pose of the sensor if it isn't on /tf.
+    transforms : TransformSource
+        Where the sensors are.
+
+    Attributes
+    ----------
+    name : str
+        Name of the base frame.
+
+    """
+
+    def __init__(self, settings: InputSettings, transforms: TransformSource) -> None:
+        self._transforms = transforms
+        self.name = settings.base_frame
+        self._world_frames = (settings.map_frame, settings.odom_frame)
+        self._sensor_frame = settings.sensor_frame
+        self._tag_frame_prefix = settings.tag_frame_prefix
+        self._sensor_pose: FloatArray | None = None
+        if any(settings.sensor_pose):
+            self._sensor_pose = pose_from_rpy(settings.sensor_pose)
+
+    def observation(self, message: ObservationMessage) -> ObservationEvent:
+        """Return landmarks in the base frame.
+
+        Raises
+        ------
+        TransformError
+            If the sensor's pose is not known (yet).
+
+        """
+        if self._sensor_pose is not None:
+            return move_observation(message.event, self._sensor_pose)
+        frame_id = self._sensor_frame or message.frame_id
+        return self._moved(move_observation, message.event, frame_id)
+
+    def tags(self, detections: TagDetections) -> ObservationEvent:
+        """Return where /tf has the fiducials of a detection message, in the base frame.
+
+        Raises
+        ------
+        TransformError
+            If one of them is not known (yet).
+
+        """
+        camera_frame = self._sensor_frame or detections.frame_id
+        points = [
+            self._tag_position(camera_frame, family, number, detections.stamp_ns)
+            for family, number in zip(detections.families, detections.ids, strict=True)
+        ]
+        ids = np.array(detections.ids, dtype=np.int64)
+        event = ObservationEvent(detections.stamp_ns, ids, np.array(points).reshape(-1, 3))
+        return self.observation(ObservationMessage(camera_frame, event))
+
+    def velocity(self, message: VelocityMessage) -> VelocityEvent:
+        """Return the velocity of the base.
+
+        Raises
+        ------
+        TransformError
+            If the pose of the message's frame is not known (yet), or it is no part of the robot.
+
+        """
+        if message.frame_id in self._world_frames:
+            raise TransformError(f"'{message.frame_id}' does not move with the robot")
+        return self._moved(move_velocity, message.event, message.frame_id)
+
+    def angular_velocity(self, message: ImuMessage) -> ImuMessage:
+        """Return an angular velocity in the base frame's axes.
+
+        Raises
+        ------
+        TransformError
+            If the sensor's pose is not known (yet).
+
+        """
+        return self._moved(_turn_imu, message, message.frame_id)
+
+    def _moved(
+        self,
+        move: Callable[[MeasuredT, FloatArray], MeasuredT],
+        measured: MeasuredT,
+        frame_id: str,
+    ) -> MeasuredT:
+        if frame_id.lstrip('/') in ('', self.name):
+            return measured
+        return move(measured, self._transforms.lookup(self.name, frame_id, measured.stamp_ns))
+
+    def _tag_position(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
+        """Return where a tag is in the camera's frame (3,), under either of its names."""
+        try:
+            return self._transforms.lookup(camera, f'{family}:{number}', stamp_ns)[:3, 3]
+        except TransformError:
+            frame = f'{self._tag_frame_prefix}{number}'
+            return self._transforms.lookup(camera, frame, stamp_ns)[:3, 3]
+
+
+def _turn_imu(message: ImuMessage, pose: FloatArray) -> ImuMessage:
+    R = pose[:3, :3]
+    covariance = None if message.covariance is None else R @ message.covariance @ R.T
+    return ImuMessage(message.stamp_ns, message.frame_id, R @ message.angular_velocity, covariance)

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+import dataclasses
 import logging
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
-import numpy as np
-
 from slam_observer_ros.errors import MessageError, RecordingError, TransformError
-from slam_observer_ros.events import Event, LandmarkTruth, UNKNOWN_ID
-from slam_observer_ros.recording.detections import observed_tags
-from slam_observer_ros.recording.frames import event_in_frame, insert_transforms
-from slam_observer_ros.recording.messages import (
-    decode_transforms,
-    LANDMARK_DECODERS,
-    POSE_DECODERS,
-    pose_matrices,
-    PoseMessage,
-    VELOCITY_DECODERS,
-    VelocityMessage,
+from slam_observer_ros.events import Event
+from slam_observer_ros.recording.decoding import (
+    Decode,
+    decode_landmarks,
+    decode_pose,
+    decode_transform_message,
+    input_decoders,
 )
-from slam_observer_ros.recording.point_clouds import has_ids, ObservationMessage
+from slam_observer_ros.recording.event_builder import EventBuilder, NO_TRANSFORM
+from slam_observer_ros.recording.frames import BaseFrame, insert_transforms
+from slam_observer_ros.recording.input_settings import InputSettings
+from slam_observer_ros.recording.point_clouds import has_ids
 from slam_observer_ros.recording.sources import open_source, RawMessage, Topic
 from slam_observer_ros.recording.topics import (
     select_topics,
@@ -34,35 +31,13 @@ from slam_observer_ros.recording.topics import (
     TopicNames,
     TRANSFORMS_TYPE,
 )
+from slam_observer_ros.recording.truth import Truth
+from slam_observer_ros.settings import Settings
 from slam_observer_ros.transform_buffer import TransformBuffer
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
-TAG_FRAME_PREFIX = 'tag_'
-"""What a fiducial's frame is called before its id; ``family:id`` is known, too."""
-
-_NANOSECOND = 1e-9
 _logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')
-
-
-@dataclass(frozen=True, slots=True)
-class Truth:
-    """What the estimate is compared with, in the axes of the recording's world frame.
-
-    Attributes
-    ----------
-    stamps_ns : IntArray
-        (k,) strictly increasing stamps of the true poses, nanoseconds.
-    poses : FloatArray
-        (k, 4, 4) true poses, body to world; k is 0 if the recording has none.
-    landmarks : LandmarkTruth or None
-        True landmark positions; None if the recording has none.
-
-    """
-
-    stamps_ns: IntArray
-    poses: FloatArray
-    landmarks: LandmarkTruth | None
 
 
 class Recording:
@@ -78,6 +53,8 @@ class Recording:
         Why only a part of the recording can be read; None if it is whole.
     malformed : Counter
         Messages that could not be decoded so far, by topic; the first of each is logged.
+    dropped : Counter
+        Measurements that did not become events so far, by reason; the first is logged.
 
     """
 
@@ -86,6 +63,7 @@ class Recording:
         self._source, self.warning = open_source(path)
         self.topics = self._source.topics
         self.malformed: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
         if self.message_count == 0:
             self.close()
             raise RecordingError(f'{path}: the recording is empty')
@@ -113,15 +91,19 @@ class Recording:
     @property
     def duration_s(self) -> float:
         """Seconds from the first message to the last, by receive time."""
-        return (self._source.end_ns - self._source.start_ns) * _NANOSECOND
+        return (self._source.end_ns - self._source.start_ns) / NANOSECONDS_PER_SECOND
 
-    def find_topics(self, names: TopicNames | None = None) -> SelectedTopics:
-        """Pick the velocity, landmark and truth topics.
+    def find_topics(
+        self, names: TopicNames = TopicNames(), inputs: InputSettings = InputSettings()
+    ) -> SelectedTopics:
+        """Pick the topics of velocities, landmarks and truth, and that of an Imu if it is used.
 
         Parameters
         ----------
-        names : TopicNames or None
+        names : TopicNames
             What the user chose; the rest is found by message type and name.
+        inputs : InputSettings
+            What of the messages is to be used.
 
         Raises
         ------
@@ -129,32 +111,33 @@ class Recording:
             If no topic fits, or two do; it lists them, and names the option that decides.
 
         """
-        return select_topics(self.topics, names or TopicNames(), self._identifies)
+        return select_topics(self.topics, names, inputs, self._identifies)
 
     def event_count(self, selected: SelectedTopics) -> int:
-        """Count the messages that :meth:`events` reads, for a progress bar."""
-        return selected.velocity.count + selected.landmarks.count
+        """Count the messages that :meth:`events` makes events of, for a progress bar."""
+        return sum(topic.count for topic in selected.inputs)
 
     def events(
         self,
         selected: SelectedTopics,
-        base_frame: str = '',
-        tag_frame_prefix: str = TAG_FRAME_PREFIX,
+        inputs: InputSettings = InputSettings(),
+        velocity_timeout_s: float = Settings.velocity_timeout,
     ) -> Iterator[Event]:
-        """Yield velocities and observations in the order in which they were received.
+        """Yield velocities and observations in the base frame, as the live node makes them.
 
-        Stamps are those of the messages' headers; an unstamped Twist has its receive time.
-        Malformed messages are left out and counted in :attr:`malformed`. What is measured in
-        other frames than the base's is brought into it where /tf_static connects the two.
+        They come in the order in which they were received; what waits for a transform on /tf
+        comes when that has been received, or is dropped after the timeout. Stamps are those of
+        the messages' headers; an unstamped Twist has its receive time. Malformed messages are
+        left out and counted in :attr:`malformed`, what was dropped in :attr:`dropped`.
 
         Parameters
         ----------
         selected : SelectedTopics
             From :meth:`find_topics`.
-        base_frame : str
-            Frame of the robot; empty to leave all as it was measured.
-        tag_frame_prefix : str
-            Where landmarks come from /tf: name of a fiducial's frame before its id.
+        inputs : InputSettings
+            What of the messages is used, and in which frames it is.
+        velocity_timeout_s : float
+            How long a velocity holds, seconds.
 
         Raises
         ------
@@ -162,29 +145,33 @@ class Recording:
             If the file turns out to be damaged.
 
         """
-        transforms = self._static_transforms() if base_frame else TransformBuffer()
-        for raw in self._source.messages((selected.velocity, selected.landmarks)):
-            messages = self._decoded(raw, lambda raw: _decode_events(raw, tag_frame_prefix))
-            for message in messages or ():
-                yield event_in_frame(base_frame, message, transforms)
+        transforms = TransformBuffer()
+        for raw in self._source.messages(self._transform_topics('/tf_static')):
+            self._insert(transforms, raw, is_static=True)
+        builder = EventBuilder(
+            BaseFrame(inputs, transforms), inputs.transform_timeout, velocity_timeout_s, self._drop
+        )
+        decoders = input_decoders(selected, inputs)
+        moving = self._transform_topics('/tf')
+        for raw in self._source.messages((*decoders, *moving)):
+            if raw.topic in moving:
+                self._insert(transforms, raw, is_static=False)
+            yield from builder.retry(raw.receive_stamp_ns)
+            if raw.topic in decoders:
+                for measured in self._decoded(raw, decoders[raw.topic]) or ():
+                    yield from builder.add(measured, raw.receive_stamp_ns)
+        yield from builder.finish()
 
     def frames(
-        self, selected: SelectedTopics, tag_frame_prefix: str = TAG_FRAME_PREFIX
+        self, selected: SelectedTopics, inputs: InputSettings = InputSettings()
     ) -> tuple[str, str]:
         """Give the frames of the first velocity and of the first observation.
 
         A frame is empty if the message names none, as a Twist.
         """
-        velocity_frame = self._frame(selected.velocity, tag_frame_prefix)
-        return velocity_frame, self._frame(selected.landmarks, tag_frame_prefix)
-
-    def connects(self, frame: str, other_frame: str) -> bool:
-        """Tell whether /tf_static says where one frame is in the other."""
-        try:
-            self._static_transforms().lookup(frame, other_frame, 0)
-        except TransformError:
-            return False
-        return True
+        decoders = input_decoders(selected, dataclasses.replace(inputs, velocity_source='twist'))
+        velocity_frame = self._frame(selected.velocity, decoders[selected.velocity])
+        return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
 
     def truth(self, selected: SelectedTopics) -> Truth:
         """Read the true poses and landmarks.
@@ -200,8 +187,10 @@ class Recording:
             If the file turns out to be damaged.
 
         """
-        stamps_ns, poses = self._true_poses(selected.pose_truth)
-        return Truth(stamps_ns, poses, self._true_landmarks(selected.landmark_truth))
+        return Truth.from_messages(
+            self._all_decoded(selected.pose_truth, decode_pose),
+            self._all_decoded(selected.landmark_truth, decode_landmarks),
+        )
 
     def _decoded(
         self, raw: RawMessage, decode: Callable[[RawMessage], _Decoded]
@@ -214,61 +203,43 @@ class Recording:
             self.malformed[raw.topic.name] += 1
             return None
 
-    def _first(self, topic: Topic, decode: Callable[[RawMessage], _Decoded]) -> _Decoded | None:
-        """Decode the first message of a topic that isn't malformed."""
-        for raw in self._source.messages((topic,)):
-            with suppress(MessageError):
-                return decode(raw)
-        return None
+    def _all_decoded(
+        self, topic: Topic | None, decode: Callable[[RawMessage], _Decoded]
+    ) -> Iterator[_Decoded]:
+        for raw in self._source.messages((topic,) if topic else ()):
+            message = self._decoded(raw, decode)
+            if message is not None:
+                yield message
 
     def _identifies(self, topic: Topic) -> bool:
-        return self._first(topic, lambda raw: has_ids(raw.data, topic.message_type)) or False
-
-    def _frame(self, topic: Topic, tag_frame_prefix: str) -> str:
         for raw in self._source.messages((topic,)):
             with suppress(MessageError):
-                for message in _decode_events(raw, tag_frame_prefix):
-                    return message.frame_id
+                return has_ids(raw.data, topic.message_type)
+        return False
+
+    def _frame(self, topic: Topic, decode: Decode) -> str:
+        for raw in self._source.messages((topic,)):
+            with suppress(MessageError):
+                for measured in decode(raw):
+                    return measured.frame_id
         return ''
 
-    def _static_transforms(self) -> TransformBuffer:
-        buffer = TransformBuffer()
-        topics = [
+    def _transform_topics(self, name: str) -> list[Topic]:
+        """List the topics of transforms of that name, with or without a namespace."""
+        return [
             topic
             for topic in self.topics
-            if topic.message_type == TRANSFORMS_TYPE and topic.name.endswith('/tf_static')
+            if topic.message_type == TRANSFORMS_TYPE and topic.name.endswith(name)
         ]
-        for raw in self._source.messages(topics):
-            messages = self._decoded(raw, lambda raw: decode_transforms(raw.data))
-            insert_transforms(buffer, messages or (), is_static=True)
-        return buffer
 
-    def _true_poses(self, topic: Topic | None) -> tuple[IntArray, FloatArray]:
-        messages: list[PoseMessage] = []
-        for raw in self._source.messages((topic,) if topic else ()):
-            message = self._decoded(raw, _decode_pose)
-            if message is not None:
-                messages.append(message)
-        stamps_ns, order = np.unique(
-            np.array([message.stamp_ns for message in messages], dtype=np.int64),
-            return_index=True,
-        )
-        positions = np.array([message.position for message in messages]).reshape(-1, 3)
-        quaternions = np.array([message.quaternion for message in messages]).reshape(-1, 4)
-        return stamps_ns, pose_matrices(positions[order], quaternions[order])
+    def _insert(self, transforms: TransformBuffer, raw: RawMessage, *, is_static: bool) -> None:
+        messages = self._decoded(raw, decode_transform_message)
+        insert_transforms(transforms, messages or (), is_static=is_static)
 
-    def _true_landmarks(self, topic: Topic | None) -> LandmarkTruth | None:
-        """Gather the last known position of each landmark."""
-        positions: dict[int, FloatArray] = {}
-        for raw in self._source.messages((topic,) if topic else ()):
-            message = self._decoded(raw, _decode_observation)
-            if message is not None:
-                positions |= zip(message.event.ids.tolist(), message.event.points, strict=True)
-        positions.pop(UNKNOWN_ID, None)
-        if not positions:
-            return None
-        ids = np.array(sorted(positions), dtype=np.int64)
-        return LandmarkTruth(ids, np.array([positions[landmark_id] for landmark_id in ids]))
+    def _drop(self, error: TransformError) -> None:
+        if not self.dropped[NO_TRANSFORM]:
+            _logger.warning('Dropped a message (%s): %s', NO_TRANSFORM, error)
+        self.dropped[NO_TRANSFORM] += 1
 
 
 def open_recording(path: Path | str) -> Recording:
@@ -288,22 +259,3 @@ def open_recording(path: Path | str) -> Recording:
 
     """
     return Recording(Path(path))
-
-
-def _decode_events(
-    raw: RawMessage, tag_frame_prefix: str
-) -> Sequence[VelocityMessage | ObservationMessage]:
-    if raw.topic.message_type == TRANSFORMS_TYPE:
-        return observed_tags(decode_transforms(raw.data), tag_frame_prefix)
-    decoder = VELOCITY_DECODERS.get(raw.topic.message_type)
-    if decoder is None:
-        return [_decode_observation(raw)]
-    return [decoder(raw.data, raw.receive_stamp_ns)]
-
-
-def _decode_observation(raw: RawMessage) -> ObservationMessage:
-    return LANDMARK_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)
-
-
-def _decode_pose(raw: RawMessage) -> PoseMessage:
-    return POSE_DECODERS[raw.topic.message_type](raw.data)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.recording.input_settings import InputSettings, POSE_DIFFERENCES
 from slam_observer_ros.recording.messages import (
     LANDMARK_DECODERS,
     POSE_DECODERS,
@@ -23,6 +24,9 @@ ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
 TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
 """Type of /tf, which holds landmarks if they are fiducials; taken only if chosen by name."""
 
+ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
+IMU_TYPE = 'sensor_msgs/msg/Imu'
+
 
 @dataclass(frozen=True, slots=True)
 class TopicNames:
@@ -30,7 +34,7 @@ class TopicNames:
 
     Attributes
     ----------
-    velocity, landmarks, pose_truth, landmark_truth : str or None
+    velocity, landmarks, pose_truth, landmark_truth, imu : str or None
         Topic names, with or without leading slash.
 
     """
@@ -39,6 +43,7 @@ class TopicNames:
     landmarks: str | None = None
     pose_truth: str | None = None
     landmark_truth: str | None = None
+    imu: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +56,8 @@ class SelectedTopics:
         What the estimator takes in.
     pose_truth, landmark_truth : Topic or None
         What its estimate is compared with, where the recording has it.
+    imu : Topic or None
+        Where the angular velocity comes from; None if it comes with the velocity.
 
     """
 
@@ -58,6 +65,13 @@ class SelectedTopics:
     landmarks: Topic
     pose_truth: Topic | None
     landmark_truth: Topic | None
+    imu: Topic | None = None
+
+    @property
+    def inputs(self) -> tuple[Topic, ...]:
+        """What the estimator takes in."""
+        imu = () if self.imu is None else (self.imu,)
+        return (self.velocity, self.landmarks, *imu)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +86,10 @@ class _Role:
 
 
 def select_topics(
-    topics: Sequence[Topic], names: TopicNames, identifies: Callable[[Topic], bool]
+    topics: Sequence[Topic],
+    names: TopicNames,
+    inputs: InputSettings,
+    identifies: Callable[[Topic], bool],
 ) -> SelectedTopics:
     """Pick one topic for each purpose.
 
@@ -82,6 +99,8 @@ def select_topics(
         All topics of a recording.
     names : TopicNames
         What the user chose; any topic of a fitting type is allowed.
+    inputs : InputSettings
+        What of the velocities is used, and whether an Imu is.
     identifies : callable
         Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
         them, such as a lidar's, are taken only if they are chosen by name.
@@ -106,11 +125,16 @@ def select_topics(
         ]
         return _best(fitting, role)
 
+    def require(role: _Role, name: str | None) -> Topic:
+        return _required(pick(role, name), role, used)
+
+    is_of_poses = inputs.velocity_source == POSE_DIFFERENCES
     return SelectedTopics(
-        _required(pick(_VELOCITY, names.velocity), _VELOCITY, used),
-        _required(pick(_LANDMARKS, names.landmarks), _LANDMARKS, used),
+        require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity),
+        require(_LANDMARKS, names.landmarks),
         pick(_POSE_TRUTH, names.pose_truth),
         pick(_LANDMARK_TRUTH, names.landmark_truth),
+        require(_IMU, names.imu) if inputs.use_imu else None,
     )
 
 
@@ -133,6 +157,8 @@ def _pose_rank(name: str) -> int:
 
 
 _VELOCITY = _Role('velocity', '--velocity-topic', VELOCITY_DECODERS, False, _velocity_rank)
+_ODOMETRY = _Role('odometry', '--velocity-topic', (ODOMETRY_TYPE,), False, _velocity_rank)
+_IMU = _Role('Imu', '--imu', (IMU_TYPE,), False, lambda _name: 0)
 _LANDMARKS = _Role('landmark', '--landmarks-topic', LANDMARK_DECODERS, False, _landmark_rank)
 _POSE_TRUTH = _Role('true pose', '--pose-truth-topic', POSE_DECODERS, True, _pose_rank)
 _LANDMARK_TRUTH = _Role(

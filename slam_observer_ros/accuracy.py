@@ -1,0 +1,107 @@
+"""How accurate the outcome of a replay is, where the truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import logging
+
+from slam_observer_ros.estimates import Hindsight
+from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.evaluation.metrics import (
+    anchored_average_nees,
+    landmark_errors,
+    trajectory_errors,
+    TrajectoryErrors,
+)
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.recording.truth import Truth
+from slam_observer_ros.replay import Replay
+from slam_observer_ros.types import FloatArray, IntArray
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accuracy:
+    """Errors of a replay; None where the truth that it takes is not in the recording.
+
+    Attributes
+    ----------
+    pose_errors : TrajectoryErrors or None
+        Of the online trajectory, after one rigid alignment.
+    dead_reckoning_errors : TrajectoryErrors or None
+        The same of the velocities alone.
+    landmark_rmse_m : float or None
+        Of the final map, after a rigid alignment of its own, metres.
+    configuration_rmse_m : float or None
+        See :class:`ConfigurationError`, metres.
+    anees : float or None
+        Of the pose, per degree of freedom; None where the gains know no covariance, too.
+
+    """
+
+    pose_errors: TrajectoryErrors | None
+    dead_reckoning_errors: TrajectoryErrors | None
+    landmark_rmse_m: float | None
+    configuration_rmse_m: float | None
+    anees: float | None
+
+
+def measure(result: Replay, truth: Truth) -> Accuracy:
+    """Compare a replay with the truth."""
+    pose_truth = Trajectory(truth.stamps_ns, truth.poses)
+    anees = None
+    if result.pose_covariances is not None:
+        anees = anchored_average_nees(result.trajectory, result.pose_covariances, pose_truth)
+    return Accuracy(
+        _pose_errors(result.trajectory, pose_truth),
+        _pose_errors(result.dead_reckoning, pose_truth),
+        _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
+        result.configuration.rmse_m,
+        anees,
+    )
+
+
+def measure_hindsight(
+    hindsight: Hindsight, truth: Truth
+) -> tuple[TrajectoryErrors | None, float | None]:
+    """Compare what was smoothed with the truth.
+
+    Returns
+    -------
+    pose_errors : TrajectoryErrors or None
+        Of the poses at the observations, after one rigid alignment.
+    landmark_rmse_m : float or None
+        Of the map, after a rigid alignment of its own, metres.
+
+    """
+    return (
+        _pose_errors(trajectory_of(hindsight), Trajectory(truth.stamps_ns, truth.poses)),
+        _landmark_rmse_m(hindsight.ids, hindsight.world_points, truth),
+    )
+
+
+def trajectory_of(hindsight: Hindsight) -> Trajectory:
+    """Return the poses of a hindsight as a trajectory."""
+    return Trajectory.from_samples(hindsight.stamps_ns.tolist(), list(hindsight.poses))
+
+
+def _pose_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
+    if not len(truth):
+        return None
+    try:
+        return trajectory_errors(estimate, truth)
+    except EvaluationError as error:
+        logger.warning('The trajectory is not compared with the truth: %s', error)
+        return None
+
+
+def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
+    if truth.landmarks is None:
+        return None
+    try:
+        errors = landmark_errors(ids, world_points, truth.landmarks)
+    except EvaluationError as error:
+        logger.warning('The map is not compared with the truth: %s', error)
+        return None
+    return errors.rmse_m

@@ -1,0 +1,97 @@
+"""Options of ``slam-observer replay`` that choose its topics and what is used of them."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from slam_observer_ros.commands.options import read_assignments, read_config
+from slam_observer_ros.parameters import from_parameters, table
+from slam_observer_ros.recording.input_settings import InputSettings
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.topics import SelectedTopics, TopicNames
+
+_ROWS = {row.name: row for row in table(InputSettings)}
+INPUT_NAMES = frozenset(_ROWS)
+"""Parameters of the node that a replay knows, too."""
+
+
+def add_input_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that :func:`topic_names` and :func:`read_inputs` read."""
+    topics = parser.add_argument_group(
+        'topics', 'found by their types; a name is needed only where two fit'
+    )
+    for option, what in (
+        ('--velocity-topic', 'Twist, TwistStamped, TwistWithCovarianceStamped or Odometry'),
+        ('--landmarks-topic', 'PointCloud or PointCloud2 with ids, or /tf with fiducials'),
+        ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
+        ('--pose-truth-topic', 'true pose'),
+        ('--landmark-truth-topic', 'true landmarks'),
+    ):
+        topics.add_argument(option, metavar='TOPIC', help=what)
+    inputs = parser.add_argument_group(
+        'inputs', "the node's parameters of these names, which --config and --set give as well"
+    )
+    inputs.add_argument(
+        '--velocity-source',
+        choices=_ROWS['velocity_source'].choices,
+        help='what of Odometry is used: its twist (default), or the differences of its poses',
+    )
+    inputs.add_argument(
+        '--base-frame',
+        metavar='FRAME',
+        help='frame whose pose is estimated; other sensors are placed in it by /tf and '
+        '/tf_static (default: that of the velocities)',
+    )
+    inputs.add_argument(
+        '--tag-frame-prefix',
+        metavar='PREFIX',
+        help="fiducials on /tf: a tag's frame before its id (default: "
+        f'{_ROWS["tag_frame_prefix"].default}); family:id is known, too',
+    )
+
+
+def topic_names(args: argparse.Namespace) -> TopicNames:
+    """Return the topics that the user names."""
+    return TopicNames(
+        args.velocity_topic,
+        args.landmarks_topic,
+        args.pose_truth_topic,
+        args.landmark_truth_topic,
+        args.imu,
+    )
+
+
+def read_inputs(args: argparse.Namespace) -> InputSettings:
+    """Build settings from ``--config``, ``--set`` and the options themselves; later ones win.
+
+    The base frame is empty if the user names none.
+
+    Raises
+    ------
+    SlamObserverError
+        If a file or a value is wrong.
+
+    """
+    values: dict[str, object] = {'base_frame': ''}
+    given = read_config(args) | read_assignments(args)
+    values |= {name: value for name, value in given.items() if name in INPUT_NAMES}
+    options = {
+        'velocity_source': args.velocity_source,
+        'base_frame': args.base_frame,
+        'tag_frame_prefix': args.tag_frame_prefix,
+        'use_imu': None if args.imu is None else True,
+    }
+    values |= {name: value for name, value in options.items() if value is not None}
+    return from_parameters(InputSettings, values)
+
+
+def with_base_frame(
+    inputs: InputSettings, recording: Recording, selected: SelectedTopics
+) -> InputSettings:
+    """Name the base frame, if the user doesn't: that of the velocities, or of the landmarks."""
+    if inputs.base_frame:
+        return inputs
+    world = ('', inputs.map_frame, inputs.odom_frame)
+    frames = (name for name in recording.frames(selected, inputs) if name not in world)
+    return dataclasses.replace(inputs, base_frame=next(frames, ''))

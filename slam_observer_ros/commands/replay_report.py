@@ -1,0 +1,140 @@
+"""What ``slam-observer replay`` tells of its outcome."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+import dataclasses
+from dataclasses import dataclass
+import logging
+
+from slam_observer_ros.accuracy import Accuracy, measure, measure_hindsight
+from slam_observer_ros.commands.console import print_table
+from slam_observer_ros.estimates import Hindsight
+from slam_observer_ros.evaluation.metrics import Report, TrajectoryErrors
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.recording.truth import Truth
+from slam_observer_ros.replay import Replay
+
+MALFORMED = 'malformed'
+"""Reason under which messages that can't be decoded are counted."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A replay and all that is told about it; what is smoothed is None if it wasn't asked for."""
+
+    result: Replay
+    truth: Truth
+    accuracy: Accuracy
+    report: Report
+    hindsight: Hindsight | None = None
+    smoothed_errors: TrajectoryErrors | None = None
+    smoothed_landmark_rmse_m: float | None = None
+
+
+def outcome_of(
+    recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
+) -> Outcome:
+    """Measure a replay, and count what of the recording was dropped on the way."""
+    accuracy = measure(result, truth)
+    malformed = sum(recording.malformed[topic.name] for topic in selected.inputs)
+    unused = recording.dropped + Counter({MALFORMED: malformed})
+    report = Report(
+        events=result.events + unused.total(),
+        duration_s=recording.duration_s,
+        seconds=result.seconds,
+        landmarks=len(result.estimator.landmark_ids),
+        dropped=dict(result.estimator.dropped + unused),
+        landmark_rmse_m=accuracy.landmark_rmse_m,
+        configuration_rmse_m=accuracy.configuration_rmse_m,
+        anees=accuracy.anees,
+    )
+    if accuracy.pose_errors is not None:
+        report = dataclasses.replace(
+            report,
+            ate_rmse_m=accuracy.pose_errors.ate_rmse_m,
+            rotation_rmse_rad=accuracy.pose_errors.rotation_rmse_rad,
+            heading_rmse_rad=accuracy.pose_errors.heading_rmse_rad,
+        )
+    return Outcome(result, truth, accuracy, report)
+
+
+def with_hindsight(outcome: Outcome) -> Outcome:
+    """Add what the whole recording tells in hindsight."""
+    estimator = outcome.result.estimator
+    hindsight = estimator.smooth()
+    if len(hindsight.stamps_ns) < estimator.counts['observation']:
+        logger.warning(
+            'Only the last %d observations are smoothed; --set hindsight_window=0 for all.',
+            len(hindsight.stamps_ns),
+        )
+    errors, landmark_rmse_m = measure_hindsight(hindsight, outcome.truth)
+    return dataclasses.replace(
+        outcome,
+        hindsight=hindsight,
+        smoothed_errors=errors,
+        smoothed_landmark_rmse_m=landmark_rmse_m,
+    )
+
+
+def as_json(outcome: Outcome) -> dict[str, object]:
+    """Return the figures as ``--json`` prints them."""
+    return dataclasses.asdict(outcome.report) | {
+        'dead_reckoning_ate_rmse_m': _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
+        'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
+        'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,
+    }
+
+
+def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
+    return None if errors is None else errors.ate_rmse_m
+
+
+def print_summary(args: argparse.Namespace, selected: SelectedTopics, outcome: Outcome) -> None:
+    """Print the figures as a table."""
+    report = outcome.report
+    rows = {
+        'velocity topic': str(selected.velocity),
+        'landmarks topic': str(selected.landmarks),
+        **({} if selected.imu is None else {'Imu topic': str(selected.imu)}),
+        'events': f'{report.events} over {report.duration_s:.1f} s',
+        'estimator': f'{outcome.result.estimator.settings.gains} gains, '
+        f'{report.seconds:.2f} s of CPU time',
+        'landmarks': str(report.landmarks),
+        'dropped': ', '.join(f'{n} {reason}' for reason, n in report.dropped.items()) or 'none',
+    }
+    rows |= _accuracy_rows(outcome)
+    rows |= {
+        name: str(path)
+        for name, path in (('trajectory', args.tum), ('map', args.map), ('figures', args.plot))
+        if path is not None
+    }
+    print_table(str(args.recording), rows)
+
+
+def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
+    report = outcome.report
+    figures = {
+        'position error (ATE), RMS': (report.ate_rmse_m, 'm after alignment'),
+        'of the velocities alone': (
+            _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
+            'm after alignment',
+        ),
+        'heading error, RMS': (report.heading_rmse_rad, 'rad after alignment'),
+        'landmark error, RMS': (report.landmark_rmse_m, 'm after alignment'),
+        'configuration error, RMS': (report.configuration_rmse_m, 'm, not aligned'),
+        'ANEES': (report.anees, '(1 is honest)'),
+        'smoothed: position error, RMS': (
+            _ate_rmse_m(outcome.smoothed_errors),
+            'm after alignment',
+        ),
+        'smoothed: landmark error, RMS': (outcome.smoothed_landmark_rmse_m, 'm after alignment'),
+    }
+    rows = {
+        name: f'{value:.3f} {unit}' for name, (value, unit) in figures.items() if value is not None
+    }
+    return rows or {'accuracy': 'not known: the recording holds no truth to compare with'}

@@ -1,0 +1,74 @@
+"""Which decoder reads a recorded message, by its topic and what is wanted of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeAlias
+
+from slam_observer_ros.recording.detections import observed_tags
+from slam_observer_ros.recording.event_builder import Measured
+from slam_observer_ros.recording.input_settings import InputSettings, POSE_DIFFERENCES
+from slam_observer_ros.recording.messages import (
+    decode_imu,
+    decode_odometry_pose,
+    decode_transforms,
+    ImuMessage,
+    LANDMARK_DECODERS,
+    POSE_DECODERS,
+    PoseMessage,
+    VELOCITY_DECODERS,
+    VelocityMessage,
+)
+from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.recording.sources import RawMessage, Topic
+from slam_observer_ros.recording.topics import SelectedTopics, TRANSFORMS_TYPE
+
+Decode: TypeAlias = Callable[[RawMessage], Sequence[Measured]]
+"""From a message to what it measures; raises :class:`MessageError` if it is malformed."""
+
+
+def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topic, Decode]:
+    """Return how each of the estimator's topics is decoded."""
+    decoders: dict[Topic, Decode] = {
+        selected.velocity: _velocity,
+        selected.landmarks: lambda raw: [decode_landmarks(raw)],
+    }
+    if inputs.velocity_source == POSE_DIFFERENCES:
+        decoders[selected.velocity] = _odometry_pose
+    if selected.landmarks.message_type == TRANSFORMS_TYPE:
+        decoders[selected.landmarks] = partial(_tags, inputs.tag_frame_prefix)
+    if selected.imu is not None:
+        decoders[selected.imu] = _imu
+    return decoders
+
+
+def decode_landmarks(raw: RawMessage) -> ObservationMessage:
+    """Decode a cloud of landmarks, measured or true."""
+    return LANDMARK_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)
+
+
+def decode_pose(raw: RawMessage) -> PoseMessage:
+    """Decode a pose."""
+    return POSE_DECODERS[raw.topic.message_type](raw.data)
+
+
+def decode_transform_message(raw: RawMessage) -> list[PoseMessage]:
+    """Decode a message on /tf or /tf_static."""
+    return decode_transforms(raw.data)
+
+
+def _velocity(raw: RawMessage) -> list[VelocityMessage]:
+    return [VELOCITY_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)]
+
+
+def _odometry_pose(raw: RawMessage) -> list[PoseMessage]:
+    return [decode_odometry_pose(raw.data)]
+
+
+def _imu(raw: RawMessage) -> list[ImuMessage]:
+    return [decode_imu(raw.data)]
+
+
+def _tags(tag_frame_prefix: str, raw: RawMessage) -> list[ObservationMessage]:
+    return observed_tags(decode_transforms(raw.data), tag_frame_prefix)

@@ -1,0 +1,147 @@
+"""Events of what several sensors measure, as soon as it is known where the sensors are."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+import logging
+from typing import TypeAlias
+
+from slam_observer_ros.errors import TransformError
+from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.recording.detections import TagDetections
+from slam_observer_ros.recording.frames import BaseFrame
+from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
+from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.velocity_sources import AngularReplacement, PoseDifferences
+
+MAX_WAITING = 1000
+"""Most measurements that wait for a transform; the oldest go first."""
+
+NO_TRANSFORM = 'no_transform'
+"""Reason under which measurements are dropped that can't be brought into the base frame."""
+
+_InFrame: TypeAlias = VelocityMessage | ImuMessage | ObservationMessage | TagDetections
+Measured: TypeAlias = _InFrame | PoseMessage
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A measurement whose transform is not known yet."""
+
+    deadline_ns: int
+    measured: _InFrame
+
+
+class EventBuilder:
+    """Makes events in the base frame of measurements, in the order in which these come.
+
+    What needs a transform that is not known yet waits for it. After the timeout velocities are
+    taken to be those of the base, and all else is dropped.
+
+    Parameters
+    ----------
+    base_frame : BaseFrame
+        Brings measurements into the base frame.
+    transform_timeout_s : float
+        How long a measurement waits, seconds.
+    velocity_timeout_s : float
+        How long a velocity holds, seconds: poses further apart give none, and an angular one
+        joins no linear one that is older.
+    on_drop : callable
+        Called with why a measurement is dropped.
+
+    """
+
+    def __init__(
+        self,
+        base_frame: BaseFrame,
+        transform_timeout_s: float,
+        velocity_timeout_s: float,
+        on_drop: Callable[[TransformError], None],
+    ) -> None:
+        velocity_timeout_ns = round(velocity_timeout_s * NANOSECONDS_PER_SECOND)
+        self._base_frame = base_frame
+        self._transform_timeout_ns = round(transform_timeout_s * NANOSECONDS_PER_SECOND)
+        self._on_drop = on_drop
+        self._poses = PoseDifferences(velocity_timeout_ns)
+        self._joined = AngularReplacement(velocity_timeout_ns)
+        self._waiting: deque[_Waiting] = deque(maxlen=MAX_WAITING)
+        self._frames_taken_as_base: set[str] = set()
+
+    def add(self, measured: Measured, now_ns: int) -> list[Event]:
+        """Take a measurement; return the event that comes of it, unless it has to wait.
+
+        Parameters
+        ----------
+        measured : Measured
+            With the stamp that its event will have. Of poses, which are an odometry's, the
+            differences are used.
+        now_ns : int
+            Time of reception by any clock that goes on steadily, nanoseconds.
+
+        """
+        if isinstance(measured, PoseMessage):
+            velocity = self._poses.add(measured.stamp_ns, measured.pose)
+            if velocity is None:
+                return []
+            measured = VelocityMessage(measured.child_frame_id, velocity)
+        return self._attempt(_Waiting(now_ns + self._transform_timeout_ns, measured), now_ns)
+
+    def retry(self, now_ns: int) -> list[Event]:
+        """Return the events of what has waited long enough, or for what is known by now."""
+        waiting, self._waiting = self._waiting, deque(maxlen=MAX_WAITING)
+        return [event for item in waiting for event in self._attempt(item, now_ns)]
+
+    def finish(self) -> list[Event]:
+        """Return the events of what still waits, when nothing more will come."""
+        waiting, self._waiting = self._waiting, deque(maxlen=MAX_WAITING)
+        return [event for item in waiting for event in self._attempt(item, item.deadline_ns)]
+
+    def forget(self) -> None:
+        """Drop what waits, as after a jump of the clock."""
+        self._waiting.clear()
+
+    def _attempt(self, item: _Waiting, now_ns: int) -> list[Event]:
+        try:
+            event = self._event(item.measured)
+        except TransformError as error:
+            if now_ns < item.deadline_ns:
+                self._waiting.append(item)
+                return []
+            event = self._give_up(item.measured, error)
+        return [] if event is None else [event]
+
+    def _event(self, measured: _InFrame) -> Event | None:
+        if isinstance(measured, VelocityMessage):
+            return self._joined.add_velocity(self._velocity(measured))
+        if isinstance(measured, ImuMessage):
+            turned = self._base_frame.angular_velocity(measured)
+            return self._joined.add_angular(
+                turned.stamp_ns, turned.angular_velocity, turned.covariance
+            )
+        if isinstance(measured, TagDetections):
+            return self._base_frame.tags(measured)
+        return self._base_frame.observation(measured)
+
+    def _velocity(self, message: VelocityMessage) -> VelocityEvent:
+        if message.frame_id in self._frames_taken_as_base:
+            return message.event
+        return self._base_frame.velocity(message)
+
+    def _give_up(self, measured: _InFrame, error: TransformError) -> Event | None:
+        if not isinstance(measured, VelocityMessage):
+            self._on_drop(error)
+            return None
+        self._frames_taken_as_base.add(measured.frame_id)
+        _logger.warning(
+            "Velocities in frame '%s' are taken to be those of '%s': %s",
+            measured.frame_id,
+            self._base_frame.name,
+            error,
+        )
+        return self._joined.add_velocity(measured.event)

@@ -1,0 +1,48 @@
+"""What is used of the messages that come in, live or recorded, and in which frames it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam_observer_ros.parameters import parameter
+
+Pose6 = tuple[float, float, float, float, float, float]
+
+POSE_DIFFERENCES = 'pose_differences'
+"""Velocity source: the differences of an odometry's poses."""
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """How measurements become events; the node has these parameters, and so has a replay."""
+
+    velocity_source: str = parameter(
+        'twist',
+        'What of Odometry is used: its twist, or the differences of its poses',
+        choices=('twist', POSE_DIFFERENCES),
+    )
+    use_imu: bool = parameter(
+        False, 'Whether the angular velocity comes from the Imu on imu, the linear one from twist'
+    )
+    tag_frame_prefix: str = parameter(
+        'tag_', "Name of a fiducial's frame before its id; family:id, as of apriltag_ros, fits too"
+    )
+    map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks')
+    odom_frame: str = parameter(
+        'odom',
+        'Odometry frame: if /tf has odom_frame to base_frame, map_frame to odom_frame is '
+        'published; empty for never',
+    )
+    base_frame: str = parameter('base_link', 'Frame of the robot, whose pose is estimated')
+    sensor_frame: str = parameter(
+        '', "Frame of the landmarks; empty takes each message's own, base_frame needs no transform"
+    )
+    sensor_pose: Pose6 = parameter(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        "Pose of the landmarks' sensor in base_frame, x y z and roll pitch yaw, in place of /tf; "
+        'all zeros: from /tf',
+        unit='m, rad',
+    )
+    transform_timeout: float = parameter(
+        0.5, 'How long a message waits for a transform', unit='s', minimum=0.0, maximum=60.0
+    )

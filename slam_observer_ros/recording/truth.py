@@ -1,0 +1,60 @@
+"""What is known to be true, to compare an estimate with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.events import LandmarkTruth, UNKNOWN_ID
+from slam_observer_ros.recording.messages import pose_matrices, PoseMessage
+from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What the estimate is compared with, in the axes of the recording's world frame.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (k,) strictly increasing stamps of the true poses, nanoseconds.
+    poses : FloatArray
+        (k, 4, 4) true poses, body to world; k is 0 if the recording has none.
+    landmarks : LandmarkTruth or None
+        True landmark positions; None if the recording has none.
+
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+    landmarks: LandmarkTruth | None
+
+    @classmethod
+    def from_messages(
+        cls, poses: Iterable[PoseMessage], landmarks: Iterable[ObservationMessage]
+    ) -> Truth:
+        """Gather poses of any order, and landmarks of which the last position counts."""
+        return cls(*_gathered_poses(list(poses)), _gathered_landmarks(landmarks))
+
+
+def _gathered_poses(messages: Sequence[PoseMessage]) -> tuple[IntArray, FloatArray]:
+    stamps_ns, order = np.unique(
+        np.array([message.stamp_ns for message in messages], dtype=np.int64), return_index=True
+    )
+    positions = np.array([message.position for message in messages]).reshape(-1, 3)
+    quaternions = np.array([message.quaternion for message in messages]).reshape(-1, 4)
+    return stamps_ns, pose_matrices(positions[order], quaternions[order])
+
+
+def _gathered_landmarks(messages: Iterable[ObservationMessage]) -> LandmarkTruth | None:
+    positions: dict[int, FloatArray] = {}
+    for message in messages:
+        positions |= zip(message.event.ids.tolist(), message.event.points, strict=True)
+    positions.pop(UNKNOWN_ID, None)
+    if not positions:
+        return None
+    ids = np.array(sorted(positions), dtype=np.int64)
+    return LandmarkTruth(ids, np.array([positions[landmark_id] for landmark_id in ids]))

@@ -1,0 +1,266 @@
+"""``slam-observer replay`` makes of a recording what the live node made of its messages."""
+
+from __future__ import annotations
+
+from command_line import CommandLine
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+import ros_messages as ros
+
+from slam_observer_ros.evaluation.trajectory import read_tum
+from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.extrinsics import pose_from_rpy
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.recording.input_settings import InputSettings
+from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.topics import TopicNames
+from slam_observer_ros.recording.writer import RecordingWriter
+
+MS = 1_000_000
+STEP_NS = 50 * MS
+STEPS = 80
+V = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])
+WRONG_TURN = np.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0])
+LANDMARKS = np.random.default_rng(0).uniform([-4, -4, -1], [8, 8, 2], (12, 3))
+IDS = np.arange(12)
+PAN_RATE = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+CAMERA = pose_from_rpy((0.1, 0.0, 0.2, -np.pi / 2, 0.0, -np.pi / 2))
+IMU_MOUNT = pose_from_rpy((0.1, 0.2, 0.3, 0.0, np.pi / 2, 0.0))
+
+
+@pytest.fixture
+def slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+def true_pose(stamp_ns):
+    return se3.exp(V * (stamp_ns - ros.STAMP_NS) / 1e9)
+
+
+def turret(stamp_ns):
+    """The pan head, which turns on the robot."""
+    return pose_from_rpy((0.3, 0.0, 0.5, 0.0, 0.0, 0.0)) @ se3.exp(
+        PAN_RATE * (stamp_ns - ros.STAMP_NS) / 1e9
+    )
+
+
+def seen_by_base(stamp_ns):
+    return se3.transform(se3.inverse(true_pose(stamp_ns)), LANDMARKS)
+
+
+class Drive:
+    """Writes what a robot records on a drive in a circle."""
+
+    def __init__(self, writer):
+        self.writer = writer
+
+    def write(self, topic, message, receive_ns):
+        self.writer.write(topic, message.__msgtype__, ros.serialise(message), receive_ns)
+
+    def transforms(self, topic, receive_ns, *transforms):
+        """Write one message of (parent, child, pose, stamp)."""
+        messages = [
+            ros.transform_stamped(
+                (parent, child), pose[:3, 3], so3.to_quaternion(pose[:3, :3]), stamp_ns
+            )
+            for parent, child, pose, stamp_ns in transforms
+        ]
+        self.write(topic, ros.make('tf2_msgs/msg/TFMessage', messages), receive_ns)
+
+    def landmarks(self, stamp_ns, sensor=None, frame_id='base_link'):
+        points = seen_by_base(stamp_ns)
+        if sensor is not None:
+            points = se3.transform(se3.inverse(sensor), points)
+        self.writer.write_observation(ObservationEvent(stamp_ns, IDS, points), frame_id=frame_id)
+
+
+def stamps_ns():
+    return range(ros.STAMP_NS, ros.STAMP_NS + STEPS * STEP_NS, STEP_NS)
+
+
+@pytest.fixture
+def panning(tmp_path):
+    """A recording whose camera is on a pan head; /tf comes 10 ms after what it places."""
+    path = tmp_path / 'panning.mcap'
+    with RecordingWriter(path) as writer:
+        drive = Drive(writer)
+        mount = ('turret', 'camera', CAMERA, ros.STAMP_NS)
+        drive.transforms('/tf_static', ros.STAMP_NS, mount)
+        for stamp_ns in stamps_ns():
+            before_ns, after_ns = stamp_ns - 20 * MS, stamp_ns + 10 * MS
+            writer.write_velocity(VelocityEvent(stamp_ns, V))
+            drive.landmarks(stamp_ns, turret(stamp_ns) @ CAMERA, 'camera')
+            points = se3.transform(se3.inverse(turret(stamp_ns) @ CAMERA), seen_by_base(stamp_ns))
+            drive.transforms(
+                '/tf',
+                after_ns,
+                ('base_link', 'turret', turret(before_ns), before_ns),
+                ('base_link', 'turret', turret(after_ns), after_ns),
+                ('odom', 'base_link', true_pose(stamp_ns), stamp_ns),
+                ('world', 'true_robot', true_pose(stamp_ns), stamp_ns),
+                *(
+                    ('camera', f'tag_{number}', se3.pose(np.eye(3), point), stamp_ns)
+                    for number, point in enumerate(points)
+                ),
+            )
+            writer.write_pose(PoseTruth(stamp_ns, true_pose(stamp_ns)))
+        writer.write_landmarks(ros.STAMP_NS, LandmarkTruth(IDS, LANDMARKS))
+    return path
+
+
+class TestMovingMounts:
+    @pytest.mark.parametrize('topic', [None, '/tf'])
+    def test_a_camera_that_turns_on_the_robot_is_placed_by_tf(self, panning, topic):
+        with open_recording(panning) as recording:
+            events = list(recording.events(recording.find_topics(TopicNames(landmarks=topic))))
+        observations = [event for event in events if isinstance(event, ObservationEvent)]
+        assert [event.stamp_ns for event in observations] == list(stamps_ns())
+        for event in observations:
+            expected = seen_by_base(event.stamp_ns)[event.ids]
+            assert_allclose(event.points, expected, atol=1e-5)  # float32 in the cloud
+
+    @pytest.mark.parametrize('options', [(), ('--landmarks-topic', '/tf')])
+    def test_the_estimate_is_then_right(self, slam_observer, panning, options):
+        report = slam_observer.succeed('replay', panning, '--json', *options).json
+        assert report['dropped'] == {}
+        assert report['ate_rmse_m'] < 1e-3
+        assert report['configuration_rmse_m'] < 1e-3
+
+    def test_what_no_transform_places_is_dropped_and_told_once(self, slam_observer, panning):
+        ended = slam_observer('replay', panning, '--json', '--set', 'transform_timeout=0')
+        assert ended.code == 0
+        assert ended.json['dropped'] == {'no_transform': STEPS}
+        assert ended.json['events'] == 2 * STEPS
+        assert ended.errors.count('no_transform') == 1
+        assert "'camera' and 'base_link' are not connected" in ended.errors
+
+    def test_what_still_waits_at_the_end_is_dropped(self, slam_observer, tmp_path):
+        path = tmp_path / 'blind.mcap'
+        with RecordingWriter(path) as writer:
+            writer.write_velocity(VelocityEvent(ros.STAMP_NS, V))
+            Drive(writer).landmarks(ros.STAMP_NS, frame_id='camera')
+        ended = slam_observer('replay', path, '--json')
+        assert ended.json['dropped'] == {'no_transform': 1}
+        assert "'camera' and 'base_link' are not connected" in ended.errors
+
+    def test_a_sensor_that_is_not_on_tf_is_placed_by_parameter(self, slam_observer, tmp_path):
+        path = tmp_path / 'placed.mcap'
+        with RecordingWriter(path) as writer:
+            for stamp_ns in stamps_ns():
+                writer.write_velocity(VelocityEvent(stamp_ns, V))
+                Drive(writer).landmarks(stamp_ns, CAMERA, 'camera')
+                writer.write_pose(PoseTruth(stamp_ns, true_pose(stamp_ns)))
+        pose = [0.1, 0.0, 0.2, -np.pi / 2, 0.0, -np.pi / 2]
+        report = slam_observer.succeed(
+            'replay', path, '--json', '--set', f'sensor_pose={pose}'
+        ).json
+        assert report['ate_rmse_m'] < 1e-3
+
+
+@pytest.fixture
+def wheels_and_gyroscope(tmp_path):
+    """Odometry whose poses are right and whose twist turns wrongly, and an Imu on its side."""
+    path = tmp_path / 'wheels.mcap'
+    with RecordingWriter(path) as writer:
+        drive = Drive(writer)
+        mount = ('base_link', 'imu', IMU_MOUNT, ros.STAMP_NS)
+        drive.transforms('/tf_static', ros.STAMP_NS, mount)
+        for stamp_ns in stamps_ns():
+            pose = true_pose(stamp_ns)
+            odometry = ros.odometry(
+                WRONG_TURN, np.zeros((6, 6)), pose[:3, 3], so3.to_quaternion(pose[:3, :3]),
+                stamp_ns=stamp_ns,
+            )  # fmt: skip
+            drive.write('/odom', odometry, stamp_ns)
+            turn = IMU_MOUNT[:3, :3].T @ V[:3]
+            turned_ns = stamp_ns + 10 * MS
+            drive.write('/imu/data', ros.imu(turn, np.zeros((3, 3)), 'imu', turned_ns), turned_ns)
+            if stamp_ns == ros.STAMP_NS:
+                drive.landmarks(stamp_ns)
+            writer.write_pose(PoseTruth(stamp_ns, pose))
+    return path
+
+
+class TestVelocities:
+    @pytest.mark.parametrize(
+        'options',
+        [
+            ('--velocity-source', 'pose_differences'),
+            ('--set', 'velocity_source=pose_differences'),
+            ('--imu', '/imu/data'),
+            ('--set', 'use_imu=true'),
+        ],
+    )
+    def test_other_sources_than_the_twist(self, slam_observer, wheels_and_gyroscope, options):
+        arguments = ('replay', wheels_and_gyroscope, '--json')
+        plain = slam_observer.succeed(*arguments).json
+        assert plain['dead_reckoning_ate_rmse_m'] > 0.1
+        report = slam_observer.succeed(*arguments, *options).json
+        assert report['dead_reckoning_ate_rmse_m'] < 0.01
+        assert report['dropped'] == {}
+
+    def test_the_nodes_file_says_it_too(self, slam_observer, wheels_and_gyroscope, tmp_path):
+        config = tmp_path / 'robot.yaml'
+        config.write_text('/**: {ros__parameters: {use_imu: true}}')
+        output = slam_observer.succeed('replay', wheels_and_gyroscope, '--config', config).output
+        assert 'Imu topic' in output
+        config.write_text('/**: {ros__parameters: {velocity_source: pose_differences}}')
+        arguments = ('replay', wheels_and_gyroscope, '--config', config, '--json')
+        assert slam_observer.succeed(*arguments).json['dead_reckoning_ate_rmse_m'] < 0.01
+        wins = slam_observer.succeed(*arguments, '--velocity-source', 'twist').json
+        assert wins['dead_reckoning_ate_rmse_m'] > 0.1
+
+    def test_poses_are_asked_of_odometry_only(self, slam_observer, panning):
+        error = slam_observer.fail('replay', panning, '--velocity-source', 'pose_differences')
+        assert 'no odometry topic: none of type nav_msgs/msg/Odometry' in error
+        error = slam_observer.fail(
+            'replay', panning, '--velocity-source', 'pose_differences',
+            '--velocity-topic', '/twist',
+        )  # fmt: skip
+        assert 'can not be the odometry topic' in error
+
+    def test_an_imu_that_is_not_there(self, slam_observer, panning, wheels_and_gyroscope):
+        error = slam_observer.fail('replay', panning, '--set', 'use_imu=true')
+        assert 'no Imu topic' in error
+        error = slam_observer.fail('replay', wheels_and_gyroscope, '--imu', '/odom')
+        assert 'can not be the Imu topic' in error
+
+    def test_misspelt_source(self, slam_observer, panning):
+        error = slam_observer.fail('replay', panning, '--set', 'velocity_source=wheels')
+        assert "'velocity_source' takes one of twist, pose_differences" in error
+
+    def test_what_only_a_node_needs_is_still_refused(self, slam_observer, panning):
+        error = slam_observer.fail('replay', panning, '--set', 'publish_rate=3.0')
+        assert "that is the node's parameter" in error
+
+
+def test_the_base_frame_of_the_nodes_file_counts(slam_observer, tmp_path):
+    path, config = tmp_path / 'run.mcap', tmp_path / 'robot.yaml'
+    base_in_wheels = pose_from_rpy((0.5, 0.0, 0.0, 0.0, 0.0, 0.0))
+    with RecordingWriter(path) as writer:
+        mount = ('wheels', 'base_link', base_in_wheels, ros.STAMP_NS)
+        Drive(writer).transforms('/tf_static', ros.STAMP_NS, mount)
+        for stamp_ns in stamps_ns():
+            writer.write_velocity(VelocityEvent(stamp_ns, V), frame_id='wheels')
+            Drive(writer).landmarks(stamp_ns, base_in_wheels)
+    config.write_text('/**: {ros__parameters: {base_frame: base_link}}')
+    for arguments, start in (((), 0.0), (('--config', config), 0.5)):
+        poses = tmp_path / f'{start}.tum'
+        slam_observer.succeed('replay', path, '--tum', poses, *arguments)
+        start_in_wheels = se3.pose(np.eye(3), np.array([start, 0.0, 0.0]))
+        trajectory = read_tum(poses)
+        expected = se3.inverse(start_in_wheels) @ true_pose(trajectory.stamps_ns[-1])
+        assert_allclose(trajectory.poses[-1], expected @ start_in_wheels, atol=1e-3)
+
+
+def test_velocities_of_the_odometrys_own_frame_do_not_make_it_the_base(tmp_path):
+    path = tmp_path / 'odom.mcap'
+    with RecordingWriter(path) as writer:
+        writer.write_velocity(VelocityEvent(ros.STAMP_NS, V), frame_id='odom')
+        Drive(writer).landmarks(ros.STAMP_NS)
+    with open_recording(path) as recording:
+        inputs = InputSettings(transform_timeout=0.0)
+        events = list(recording.events(recording.find_topics(), inputs))
+    assert [type(event) for event in events] == [VelocityEvent, ObservationEvent]
+    assert_allclose(events[0].body_velocity, V)
