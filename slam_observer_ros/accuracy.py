@@ -36,7 +36,8 @@ class Accuracy:
     configuration_rmse_m : float or None
         See :class:`ConfigurationError`, metres.
     anees : float or None
-        Of the pose, per degree of freedom; None where the gains know no covariance, too.
+        Of the pose, per degree of freedom; None where the gains know no covariance, too, and in
+        a known map: the first pose there is no certain one, to which the truth could be moved.
 
     """
 
@@ -51,7 +52,7 @@ def measure(result: Replay, truth: Truth) -> Accuracy:
     """Compare a replay with the truth."""
     pose_truth = Trajectory(truth.stamps_ns, truth.poses)
     anees = None
-    if result.pose_covariances is not None:
+    if result.pose_covariances is not None and not result.in_known_map:
         anees = anchored_average_nees(result.trajectory, result.pose_covariances, pose_truth)
     return Accuracy(
         _pose_errors(result.trajectory, pose_truth),

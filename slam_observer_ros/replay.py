@@ -98,6 +98,8 @@ class Replay:
         Events taken in, dropped ones included.
     seconds : float
         CPU time of the estimator alone, without reading and measuring.
+    in_known_map : bool
+        Whether the poses are in the frame of a map that was known in advance.
 
     """
 
@@ -110,6 +112,7 @@ class Replay:
     residuals: FloatArray
     events: int
     seconds: float
+    in_known_map: bool
 
 
 def replay(
@@ -145,6 +148,7 @@ class _Run:
         self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
     ) -> None:
         self._estimator = Estimator(settings, on_update=self._on_update)
+        self._in_known_map = landmark_map is not None
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
         self._sampler = TrajectorySampler(self._estimator)
@@ -185,6 +189,7 @@ class _Run:
             np.concatenate([np.empty((0, 3)), *(update.residuals for update in self._updates)]),
             self._events,
             self._seconds,
+            self._in_known_map,
         )
 
     def _on_update(self, update: Update) -> None:

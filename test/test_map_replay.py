@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.evaluation.trajectory import read_tum
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.map_file import read_map
 from slam_observer_ros.recording.writer import RecordingWriter
@@ -31,6 +31,7 @@ def record(path, start, seed):
             noise = random.normal(scale=0.01, size=6)
             writer.write_velocity(VelocityEvent(step * 10**8, BODY_VELOCITY + noise))
             pose = start @ se3.exp(BODY_VELOCITY * 0.1 * step)
+            writer.write_pose(PoseTruth(step * 10**8, pose))
             points = se3.transform(se3.inverse(pose), landmarks)
             seen = np.flatnonzero(np.linalg.norm(points, axis=1) < 6.0)
             points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
@@ -57,6 +58,19 @@ def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path
     known, after = read_map(saved), read_map(again)
     assert set(known.ids) <= set(after.ids)
     assert (len(after.ids) > len(known.ids)) == (mode == 'off')
+
+
+def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
+    slam_observer, tmp_path
+):
+    path, saved = record(tmp_path / 'run.mcap', np.eye(4), seed=1), tmp_path / 'map.yaml'
+    report = slam_observer.succeed('replay', path, '--map', saved, '--json', *SETTINGS).json
+    assert 0.2 < report['anees'] < 5.0
+    arguments = ('replay', path, '--load-map', saved, *SETTINGS)
+    again = slam_observer(*arguments, '--json').json
+    assert again['anees'] is None
+    assert again['ate_rmse_m'] is not None
+    assert 'ANEES' not in slam_observer(*arguments).output
 
 
 def test_a_map_that_cannot_be_read_is_refused_before_anything_is_done(slam_observer, tmp_path):

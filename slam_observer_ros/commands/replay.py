@@ -62,7 +62,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         '--load-map',
         type=Path,
         metavar='FILE',
-        help='known landmarks, as --map writes them: the estimate is then in their frame',
+        help='known landmarks, as --map writes them: the estimate is then in their frame, and no '
+        'ANEES is told',
     )
     parser.add_argument(
         '--smooth',
