@@ -73,6 +73,21 @@ def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
     assert 'ANEES' not in slam_observer(*arguments).output
 
 
+def test_covariances_of_a_smoothed_map_are_those_in_hindsight(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    smoothed, looked_back = tmp_path / 'smoothed.yaml', tmp_path / 'looked_back.yaml'
+    slam_observer.succeed('replay', path, '--smooth', '--map', smoothed, *SETTINGS)
+    at_the_end = ('--set', 'hindsight_interval=80', '--set', 'hindsight_turn=0')
+    slam_observer.succeed('replay', path, '--map', looked_back, *SETTINGS, *at_the_end)
+    online, exact = read_map(smoothed), read_map(looked_back)
+    np.testing.assert_array_equal(online.ids, exact.ids)
+    np.testing.assert_allclose(
+        np.trace(online.covariances, axis1=1, axis2=2),
+        np.trace(exact.covariances, axis1=1, axis2=2),
+        rtol=0.15,
+    )
+
+
 def test_a_map_that_cannot_be_read_is_refused_before_anything_is_done(slam_observer, tmp_path):
     recording = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     missing = tmp_path / 'no.yaml'

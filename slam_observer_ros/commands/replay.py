@@ -31,6 +31,7 @@ from slam_observer_ros.commands.replay_report import (
     print_summary,
     with_hindsight,
 )
+from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.plots import plot_errors, plot_map, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.landmark_map import LandmarkMap
@@ -115,6 +116,7 @@ def _write_files(args: argparse.Namespace, outcome: Outcome) -> None:
     landmark_map = estimator.landmark_map
     trajectory = outcome.result.trajectory
     if hindsight is not None:
+        # The covariances stay: what the filter knows of the map in the end is hindsight, too.
         landmark_map = dataclasses.replace(landmark_map, world_points=hindsight.world_points)
         trajectory = trajectory_of(hindsight)
     if args.tum is not None:
@@ -132,7 +134,7 @@ def _draw(
     result, truth = outcome.result, outcome.truth
     plot_map(
         directory / 'map.png',
-        trajectory,
+        trajectory if outcome.hindsight is None else fill_gaps(trajectory, result.dead_reckoning),
         landmark_map.ids,
         landmark_map.world_points,
         Trajectory(truth.stamps_ns, truth.poses) if outcome.accuracy.pose_errors else None,
