@@ -26,6 +26,7 @@ from slam_observer_ros.nodes.observer_node import ObserverNode
 from slam_observer_ros.nodes.settings import AUTO, ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.nodes.simulator_node import SimulatorNode
 from slam_observer_ros.parameters import Parameter, table
+from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario
 
@@ -194,7 +195,8 @@ def tables(observer: Interface, simulator: Interface) -> dict[str, str]:
         'simulator-outputs': topic_table('topic', simulator.published, SIMULATED),
         'main-parameters': parameter_table(main_parameters()),
         'estimator-parameters': parameter_table(table(Settings)),
-        'observer-node-parameters': parameter_table(table(ObserverNodeSettings)),
+        'input-parameters': parameter_table(table(InputSettings)),
+        'observer-node-parameters': parameter_table(own_parameters()),
         'scenario-parameters': parameter_table(table(Scenario)),
         'simulator-node-parameters': parameter_table(table(SimulatorNodeSettings)),
     }
@@ -234,6 +236,12 @@ def main_parameters() -> list[Parameter]:
     """Return the rows of MAIN_PARAMETERS, in their order."""
     rows = {row.name: row for row in (*table(Settings), *table(ObserverNodeSettings))}
     return [rows[name] for name in MAIN_PARAMETERS]
+
+
+def own_parameters() -> list[Parameter]:
+    """Return the rows that the observer node adds to those of its inputs."""
+    inherited = table(InputSettings)
+    return [row for row in table(ObserverNodeSettings) if row not in inherited]
 
 
 def parameter_table(parameters: Iterable[Parameter]) -> str:
