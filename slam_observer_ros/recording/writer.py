@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 import tempfile
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 from rosbags.interfaces import (
@@ -24,15 +23,13 @@ from rosbags.rosbag2 import (
     Writer,
     WriterError,
 )
-from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
-from slam_observer_ros.geometry import so3
 from slam_observer_ros.recording.cdr import Buffer
-from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout, PointCloud2Layout
+from slam_observer_ros.recording.message_factory import MessageFactory
+from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 VELOCITY_TOPIC = '/twist'
 LANDMARKS_TOPIC = '/landmarks'
@@ -77,7 +74,7 @@ class RecordingWriter:
         self.path = Path(path)
         self._overwrite = overwrite
         self._connections: dict[tuple[str, str], Connection] = {}
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._messages = MessageFactory()
         if self.path.suffix != '.mcap':
             raise RecordingError(f'{self.path}: recordings are written as .mcap files')
         self._refuse_to_overwrite()
@@ -152,7 +149,7 @@ class RecordingWriter:
             self._connections[key] = self._bag.add_connection(
                 topic,
                 message_type,
-                typestore=self._typestore,
+                typestore=self._messages.typestore,
                 offered_qos_profiles=[_LATCHED] if latched else [],
             )
         self._bag.write(self._connections[key], receive_stamp_ns, memoryview(data))
@@ -174,10 +171,10 @@ class RecordingWriter:
             Time of reception if it isn't the event's stamp.
 
         """
-        message = self._make(
+        message = self._messages.make(
             'geometry_msgs/msg/TwistStamped',
-            self._header(event.stamp_ns, frame_id),
-            self._twist(event.body_velocity),
+            self._messages.header(event.stamp_ns, frame_id),
+            self._messages.twist(event.body_velocity),
         )
         self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
@@ -199,17 +196,17 @@ class RecordingWriter:
 
         """
         layout = point_cloud2_layout(event.ids, event.points, event.covariances, event.velocities)
-        message = self._point_cloud2(event.stamp_ns, frame_id, layout)
+        message = self._messages.point_cloud2(event.stamp_ns, frame_id, layout)
         self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
     def write_pose(
         self, truth: PoseTruth, topic: str = POSE_TRUTH_TOPIC, frame_id: str = MAP_FRAME
     ) -> None:
         """Write a true pose as PoseStamped."""
-        message = self._make(
+        message = self._messages.make(
             'geometry_msgs/msg/PoseStamped',
-            self._header(truth.stamp_ns, frame_id),
-            self._pose(truth.pose),
+            self._messages.header(truth.stamp_ns, frame_id),
+            self._messages.pose(truth.pose),
         )
         self._write_message(topic, message, truth.stamp_ns)
 
@@ -222,7 +219,7 @@ class RecordingWriter:
     ) -> None:
         """Write true landmark positions as a latched PointCloud2 with ids."""
         layout = point_cloud2_layout(truth.ids, truth.world_points)
-        message = self._point_cloud2(stamp_ns, frame_id, layout)
+        message = self._messages.point_cloud2(stamp_ns, frame_id, layout)
         self._write_message(topic, message, stamp_ns, latched=True)
 
     def write_odometry(
@@ -250,20 +247,22 @@ class RecordingWriter:
         """
         unknown = np.zeros(36)
         unknown[0] = -1.0
-        message = self._make(
+        message = self._messages.make(
             'nav_msgs/msg/Odometry',
-            self._header(stamp_ns, MAP_FRAME),
+            self._messages.header(stamp_ns, MAP_FRAME),
             BASE_FRAME,
-            self._make(
+            self._messages.make(
                 'geometry_msgs/msg/PoseWithCovariance',
-                self._pose(pose),
+                self._messages.pose(pose),
                 # ROS puts position before rotation.
                 unknown
                 if pose_covariance is None
                 else np.roll(pose_covariance, 3, (0, 1)).ravel(),
             ),
-            self._make(
-                'geometry_msgs/msg/TwistWithCovariance', self._twist(body_velocity), unknown
+            self._messages.make(
+                'geometry_msgs/msg/TwistWithCovariance',
+                self._messages.twist(body_velocity),
+                unknown,
             ),
         )
         self._write_message(topic, message, stamp_ns)
@@ -277,52 +276,10 @@ class RecordingWriter:
         latched: bool = False,
     ) -> None:
         message_type: str = message.__msgtype__  # type: ignore[attr-defined]
-        data = self._typestore.serialize_cdr(message, message_type)
+        data = self._messages.typestore.serialize_cdr(message, message_type)
         received = stamp_ns if receive_stamp_ns is None else receive_stamp_ns
         self.write(topic, message_type, data, received, latched)
 
     def _refuse_to_overwrite(self) -> None:
         if self.path.exists() and not self._overwrite:
             raise RecordingError(f'{self.path}: exists already, and is not overwritten')
-
-    def _make(self, message_type: str, *fields: Any) -> Any:
-        return self._typestore.types[message_type](*fields)
-
-    def _header(self, stamp_ns: int, frame_id: str) -> object:
-        stamp = self._make(
-            'builtin_interfaces/msg/Time', *divmod(stamp_ns, NANOSECONDS_PER_SECOND)
-        )
-        return self._make('std_msgs/msg/Header', stamp, frame_id)
-
-    def _twist(self, body_velocity: FloatArray) -> object:
-        components = body_velocity.tolist()
-        return self._make(
-            'geometry_msgs/msg/Twist',
-            self._make('geometry_msgs/msg/Vector3', *components[3:]),
-            self._make('geometry_msgs/msg/Vector3', *components[:3]),
-        )
-
-    def _pose(self, pose: FloatArray) -> object:
-        return self._make(
-            'geometry_msgs/msg/Pose',
-            self._make('geometry_msgs/msg/Point', *pose[:3, 3].tolist()),
-            self._make('geometry_msgs/msg/Quaternion', *so3.to_quaternion(pose[:3, :3]).tolist()),
-        )
-
-    def _point_cloud2(self, stamp_ns: int, frame_id: str, layout: PointCloud2Layout) -> object:
-        fields = [
-            self._make('sensor_msgs/msg/PointField', f.name, f.offset, f.datatype, f.count)
-            for f in layout.fields
-        ]
-        return self._make(
-            'sensor_msgs/msg/PointCloud2',
-            self._header(stamp_ns, frame_id),
-            1,
-            layout.width,
-            fields,
-            False,
-            layout.point_step,
-            layout.point_step * layout.width,
-            np.frombuffer(layout.data, np.uint8),
-            True,
-        )
