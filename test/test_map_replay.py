@@ -60,6 +60,14 @@ def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path
     assert (len(after.ids) > len(known.ids)) == (mode == 'off')
 
 
+def test_a_map_keeps_the_name_of_its_frame(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
+    slam_observer.succeed('replay', path, '--map', first, '--set', 'map_frame=hall', *SETTINGS)
+    slam_observer('replay', path, '--load-map', first, '--map', again, *SETTINGS)
+    assert [read_map(file).frame_id for file in (first, again)] == ['hall', 'hall']
+
+
 def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
     slam_observer, tmp_path
 ):

@@ -230,10 +230,6 @@ class TestVelocities:
         error = slam_observer.fail('replay', panning, '--set', 'velocity_source=wheels')
         assert "'velocity_source' takes one of twist, pose_differences" in error
 
-    def test_what_only_a_node_needs_is_still_refused(self, slam_observer, panning):
-        error = slam_observer.fail('replay', panning, '--set', 'publish_rate=3.0')
-        assert "that is the node's parameter" in error
-
 
 def test_the_base_frame_of_the_nodes_file_counts(slam_observer, tmp_path):
     path, config = tmp_path / 'run.mcap', tmp_path / 'robot.yaml'

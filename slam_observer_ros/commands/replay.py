@@ -104,16 +104,16 @@ def run(args: argparse.Namespace) -> None:
         outcome = outcome_of(recording, selected, result, truth)
     if args.smooth:
         outcome = with_hindsight(outcome)
-    _write_files(args, outcome)
+    _write_files(args, outcome, landmark_map.frame_id if landmark_map else inputs.map_frame)
     if args.json:
         print_json(as_json(outcome))
     else:
         print_summary(args, selected, outcome)
 
 
-def _write_files(args: argparse.Namespace, outcome: Outcome) -> None:
+def _write_files(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> None:
     estimator, hindsight = outcome.result.estimator, outcome.hindsight
-    landmark_map = estimator.landmark_map
+    landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=map_frame)
     trajectory = outcome.result.trajectory
     if hindsight is not None:
         # The covariances stay: what the filter knows of the map in the end is hindsight, too.
