@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -12,7 +12,12 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
 from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.input_settings import InputSettings
-from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
+from slam_observer_ros.recording.messages import (
+    ImuMessage,
+    pose_matrices,
+    PoseMessage,
+    VelocityMessage,
+)
 from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.transform_buffer import TransformBuffer
 from slam_observer_ros.types import FloatArray
@@ -21,15 +26,18 @@ MeasuredT = TypeVar('MeasuredT', ObservationEvent, VelocityEvent, ImuMessage)
 
 
 def insert_transforms(
-    buffer: TransformBuffer, transforms: Iterable[PoseMessage], *, is_static: bool
+    buffer: TransformBuffer, transforms: Sequence[PoseMessage], *, is_static: bool
 ) -> None:
     """Put the transforms of a message on /tf or /tf_static into a buffer."""
-    for transform in transforms:
+    positions = np.array([transform.position for transform in transforms]).reshape(-1, 3)
+    quaternions = np.array([transform.quaternion for transform in transforms]).reshape(-1, 4)
+    poses = pose_matrices(positions, quaternions)
+    for transform, pose in zip(transforms, poses, strict=True):
         buffer.insert(
             transform.frame_id,
             transform.child_frame_id,
             transform.stamp_ns,
-            transform.pose,
+            pose,
             is_static=is_static,
         )
 
