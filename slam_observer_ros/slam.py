@@ -289,11 +289,12 @@ class Slam:
 
         The noise model is told where a landmark should be, not where it was measured: a landmark
         measured too near would be believed more than one measured too far, and all would be
-        drawn towards the robot. Only if it is in doubt, the measured point is the better guess.
+        drawn towards the robot. Where it should be is not known of one that is in doubt, or that
+        was seen so seldom that it may itself be an outlier.
         """
-        points = np.where(
-            self._in_doubt(rows)[:, None], event.points, self.observer.body_points(rows)
-        )
+        sure = self.landmarks.counts[rows] >= self.settings.confirmations
+        sure &= ~self._in_doubt(rows)
+        points = np.where(sure[:, None], self.observer.body_points(rows), event.points)
         return self._noise.observation(replace(event, points=points))
 
     def _in_doubt(self, rows: IntArray) -> BoolArray:

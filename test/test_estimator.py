@@ -101,7 +101,7 @@ def test_events_shuffled_within_the_window_give_the_same_bits(random):
 
 
 def test_asking_for_the_pose_never_changes_the_estimate():
-    asked = Estimator(Settings())
+    asked = Estimator(Settings(confirmations=1))
     for event in drive():
         asked.add(event)
         _ = asked.pose, asked.pose_at(event.stamp_ns + 123_456_789), asked.body_velocity
@@ -155,7 +155,7 @@ def test_a_forgotten_landmark_leaves_the_others_alone_and_may_come_back():
 
 
 def test_reset_forgets_everything_so_that_a_recording_may_start_over():
-    estimator = Estimator(Settings())
+    estimator = Estimator(Settings(confirmations=1))
     for event in drive():
         estimator.add(event)
     estimator.reset()

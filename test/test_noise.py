@@ -223,3 +223,19 @@ def test_what_is_no_covariance_matrix_is_refused(covariance):
     six = np.kron(np.eye(2), covariance)
     assert not estimator.add(VelocityEvent(0, np.zeros(6), six))
     assert estimator.dropped == {'bad_covariance': 2}
+
+
+def test_a_first_sighting_that_was_an_outlier_does_not_make_a_sensor_look_blunt():
+    """Stereo errors grow with the square of the range: at 60 m anything would agree."""
+    settings = Settings(observation_model='stereo', reorder_window=0.0)
+    estimator = Estimator(settings)
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 3.0]])
+    for step in range(20):
+        seen = points.copy()
+        if step == 0:
+            seen[0] = [60.0, 0.0, 0.0]
+        stamp_ns = step * 100_000_000
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        estimator.add(ObservationEvent(stamp_ns, np.arange(3), seen))
+    np.testing.assert_allclose(estimator.pose, np.eye(4), atol=0.01)
+    np.testing.assert_allclose(estimator.world_points, points, atol=0.02)
