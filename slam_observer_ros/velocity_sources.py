@@ -40,7 +40,8 @@ class PoseDifferences:
 class AngularReplacement:
     """Joins one sensor's linear velocity with another's angular velocity, as wheels and an IMU.
 
-    Each new message of either gives a velocity at its stamp, with the other's latest part.
+    Each new message of either gives a velocity at its stamp, with the other's latest part; the
+    second of two with the same stamp gives one a nanosecond later, which replaces the first's.
 
     Parameters
     ----------
@@ -89,6 +90,8 @@ class AngularReplacement:
             return None
         if abs(velocity.stamp_ns - angular.stamp_ns) > self._timeout_ns:
             return None
+        if velocity.stamp_ns == angular.stamp_ns:  # the estimator takes one velocity a stamp
+            stamp_ns += 1
         return replace(
             velocity,
             stamp_ns=stamp_ns,

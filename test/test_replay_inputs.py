@@ -200,6 +200,27 @@ class TestVelocities:
         assert report['dead_reckoning_ate_rmse_m'] < 0.01
         assert report['dropped'] == {}
 
+    def test_an_imu_with_the_stamps_of_the_odometry_turns_it_at_once(
+        self, slam_observer, tmp_path
+    ):
+        path = tmp_path / 'synchronous.mcap'
+        pose = np.eye(4)
+        with RecordingWriter(path) as writer:
+            drive = Drive(writer)
+            drive.landmarks(ros.STAMP_NS)
+            for step, stamp_ns in enumerate(stamps_ns()):
+                turned = V * (1, 1, 4.0 * (-1) ** (step // 2), 1, 1, 1)
+                drive.write(
+                    '/odom', ros.odometry(V, np.zeros((6, 6)), stamp_ns=stamp_ns), stamp_ns
+                )
+                imu = ros.imu(turned[:3], np.zeros((3, 3)), 'base_link', stamp_ns)
+                drive.write('/imu', imu, stamp_ns + 5 * MS)
+                writer.write_pose(PoseTruth(stamp_ns, pose))
+                pose = pose @ se3.exp(turned * STEP_NS / 1e9)
+        report = slam_observer.succeed('replay', path, '--json', '--imu', '/imu').json
+        assert report['dropped'] == {}
+        assert report['dead_reckoning_ate_rmse_m'] < 1e-3
+
     def test_the_nodes_file_says_it_too(self, slam_observer, wheels_and_gyroscope, tmp_path):
         config = tmp_path / 'robot.yaml'
         config.write_text('/**: {ros__parameters: {use_imu: true}}')

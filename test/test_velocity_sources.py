@@ -5,11 +5,14 @@ from __future__ import annotations
 from hypothesis import given
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+import pytest
 from strategies import poses
 
 from slam_observer_ros.clock_offset import ClockOffset, SAMPLES
+from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.velocity_history import VelocityHistory
 from slam_observer_ros.velocity_sources import AngularReplacement, PoseDifferences
 
 SECOND = 1_000_000_000
@@ -48,6 +51,27 @@ def test_imu_replaces_the_angular_part_while_it_is_in_time():
     late = VelocityEvent(3 * SECOND, wheels.body_velocity)
     assert joined.add_velocity(late) is late, 'the IMU has timed out'
     assert joined.add_angular(5 * SECOND, np.zeros(3), None) is None, 'the wheels have'
+
+
+@pytest.mark.parametrize('is_imu_first', [False, True])
+def test_both_parts_count_if_wheels_and_imu_have_the_same_stamps(is_imu_first):
+    joined, history = AngularReplacement(SECOND), VelocityHistory(SECOND)
+    queue = EventQueue(SECOND, 10 * SECOND, SECOND)
+    stamps_ns = [SECOND, SECOND + SECOND // 10, SECOND + SECOND // 5]
+    for number, stamp_ns in enumerate(stamps_ns):
+        wheels = VelocityEvent(stamp_ns, np.array([9.0, 9.0, 9.0, number, 0.0, 0.0]))
+        turn = np.array([0.0, 0.0, -number])
+        for is_imu in (is_imu_first, not is_imu_first):
+            event = (
+                joined.add_angular(stamp_ns, turn, None) if is_imu else joined.add_velocity(wheels)
+            )
+            if event is not None:
+                queue.push(event)  # raises if it is a duplicate
+    for event in queue.pop_all():
+        history.append(event)
+    for number, stamp_ns in enumerate(stamps_ns):
+        expected = [0.0, 0.0, -number, number, 0.0, 0.0]
+        assert_array_equal(history.latest(stamp_ns + 1).body_velocity, expected)
 
 
 def test_another_clock_is_found_and_corrected_once():
