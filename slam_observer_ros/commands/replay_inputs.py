@@ -23,7 +23,11 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     )
     for option, what in (
         ('--velocity-topic', 'Twist, TwistStamped, TwistWithCovarianceStamped or Odometry'),
-        ('--landmarks-topic', 'PointCloud or PointCloud2 with ids, or /tf with fiducials'),
+        (
+            '--landmarks-topic',
+            'PointCloud or PointCloud2 with ids, Detection3DArray or AprilTagDetectionArray; if '
+            'named, also clouds without ids, PoseArray, and /tf with fiducials',
+        ),
         ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
         ('--pose-truth-topic', 'true pose'),
         ('--landmark-truth-topic', 'true landmarks'),

@@ -11,14 +11,16 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.nodes.inputs import Decoder, Input
 from slam_observer_ros.nodes.intake import Intake
-from slam_observer_ros.nodes.settings import AUTO, ObserverNodeSettings
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.recording.cdr import Buffer
 from slam_observer_ros.recording.detections import (
+    APRILTAGS_TYPE,
     decode_apriltags,
     decode_detections,
     decode_pose_array,
     observed_tags,
 )
+from slam_observer_ros.recording.input_settings import AUTO, ON_TF
 from slam_observer_ros.recording.messages import (
     decode_imu,
     decode_odometry_pose,
@@ -38,7 +40,6 @@ from slam_observer_ros.recording.point_clouds import (
 )
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
-APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 IMU = 'sensor_msgs/msg/Imu'
 
@@ -91,11 +92,11 @@ def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
 
 def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
-    if settings.landmarks_type == 'tf':
+    if settings.landmarks_type == ON_TF:
         decode = partial(_decode_tags, settings.tag_frame_prefix)
         return Input(node, '/tf', {TRANSFORMS: decode}, intake.add_observations, qos)
     if settings.landmarks_type == 'AprilTagDetectionArray':
-        return Input(node, 'landmarks', {APRILTAGS: decode_apriltags}, intake.add_tags, qos)
+        return Input(node, 'landmarks', {APRILTAGS_TYPE: decode_apriltags}, intake.add_tags, qos)
     if settings.landmarks_type == AUTO:
         return Input(node, 'landmarks', CLOUD_DECODERS, intake.add_observation, qos)
     decoders = _chosen(CLOUD_DECODERS | DETECTION_DECODERS, settings.landmarks_type)

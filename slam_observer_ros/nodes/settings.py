@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam_observer_ros.parameters import parameter
-from slam_observer_ros.recording.input_settings import InputSettings
-
-AUTO = 'auto'
-"""Message type parameter: take the type that is found on the topic."""
+from slam_observer_ros.recording.input_settings import AUTO, InputSettings
 
 
 @dataclass(frozen=True)
@@ -19,20 +16,6 @@ class ObserverNodeSettings(InputSettings):
         AUTO,
         'Message type on twist; auto takes the type found on the topic',
         choices=(AUTO, 'Twist', 'TwistStamped', 'TwistWithCovarianceStamped', 'Odometry'),
-    )
-    landmarks_type: str = parameter(
-        AUTO,
-        'Message type on landmarks; auto takes the type found on the topic; tf takes fiducials '
-        'that a detector publishes on /tf',
-        choices=(
-            AUTO,
-            'PointCloud',
-            'PointCloud2',
-            'PoseArray',
-            'Detection3DArray',
-            'AprilTagDetectionArray',
-            'tf',
-        ),
     )
     twist_qos: str = parameter(
         'best_effort',

@@ -6,7 +6,13 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeAlias
 
-from slam_observer_ros.recording.detections import observed_tags
+from slam_observer_ros.recording.detections import (
+    APRILTAGS_TYPE,
+    decode_apriltags,
+    DETECTION_DECODERS,
+    observed_tags,
+    TagDetections,
+)
 from slam_observer_ros.recording.event_builder import Measured
 from slam_observer_ros.recording.input_settings import InputSettings, POSE_DIFFERENCES
 from slam_observer_ros.recording.messages import (
@@ -28,24 +34,29 @@ Decode: TypeAlias = Callable[[RawMessage], Sequence[Measured]]
 """From a message to what it measures; raises :class:`MessageError` if it is malformed."""
 
 
+_OBSERVATION_DECODERS = LANDMARK_DECODERS | DETECTION_DECODERS
+
+
 def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topic, Decode]:
     """Return how each of the estimator's topics is decoded."""
     decoders: dict[Topic, Decode] = {
         selected.velocity: _velocity,
-        selected.landmarks: lambda raw: [decode_landmarks(raw)],
+        selected.landmarks: _landmarks,
     }
     if inputs.velocity_source == POSE_DIFFERENCES:
         decoders[selected.velocity] = _odometry_pose
     if selected.landmarks.message_type == TRANSFORMS_TYPE:
-        decoders[selected.landmarks] = partial(_tags, inputs.tag_frame_prefix)
+        decoders[selected.landmarks] = partial(_tags_on_tf, inputs.tag_frame_prefix)
+    elif selected.landmarks.message_type == APRILTAGS_TYPE:
+        decoders[selected.landmarks] = _tags
     if selected.imu is not None:
         decoders[selected.imu] = _imu
     return decoders
 
 
 def decode_landmarks(raw: RawMessage) -> ObservationMessage:
-    """Decode a cloud of landmarks, measured or true."""
-    return LANDMARK_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)
+    """Decode landmarks, measured or true."""
+    return _OBSERVATION_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)
 
 
 def decode_pose(raw: RawMessage) -> PoseMessage:
@@ -70,5 +81,13 @@ def _imu(raw: RawMessage) -> list[ImuMessage]:
     return [decode_imu(raw.data)]
 
 
-def _tags(tag_frame_prefix: str, raw: RawMessage) -> list[ObservationMessage]:
+def _landmarks(raw: RawMessage) -> list[ObservationMessage]:
+    return [decode_landmarks(raw)]
+
+
+def _tags(raw: RawMessage) -> list[TagDetections]:
+    return [decode_apriltags(raw.data)]
+
+
+def _tags_on_tf(tag_frame_prefix: str, raw: RawMessage) -> list[ObservationMessage]:
     return observed_tags(decode_transforms(raw.data), tag_frame_prefix)

@@ -6,6 +6,12 @@ from dataclasses import dataclass
 
 from slam_observer_ros.parameters import parameter
 
+AUTO = 'auto'
+"""Message type parameter: take the type that is found on the topic."""
+
+ON_TF = 'tf'
+"""Landmarks are fiducials whose positions, and ids in the names of frames, are on /tf."""
+
 Pose6 = tuple[float, float, float, float, float, float]
 
 POSE_DIFFERENCES = 'pose_differences'
@@ -23,6 +29,20 @@ class InputSettings:
     )
     use_imu: bool = parameter(
         False, 'Whether the angular velocity comes from the Imu on imu, the linear one from twist'
+    )
+    landmarks_type: str = parameter(
+        AUTO,
+        'Message type on landmarks; auto takes the type found on the topic; tf takes fiducials '
+        'that a detector publishes on /tf',
+        choices=(
+            AUTO,
+            'PointCloud',
+            'PointCloud2',
+            'PoseArray',
+            'Detection3DArray',
+            'AprilTagDetectionArray',
+            ON_TF,
+        ),
     )
     tag_frame_prefix: str = parameter(
         'tag_', "Name of a fiducial's frame before its id; family:id, as of apriltag_ros, fits too"

@@ -232,7 +232,7 @@ LANDMARK_DECODERS: dict[str, ObservationDecoder] = {
     'sensor_msgs/msg/PointCloud': decode_point_cloud,
     'sensor_msgs/msg/PointCloud2': decode_point_cloud2,
 }
-"""Message types that give landmark observations."""
+"""Clouds, which give landmarks, measured or true."""
 
 POSE_DECODERS: dict[str, PoseDecoder] = {
     'geometry_msgs/msg/PoseStamped': decode_pose_stamped,

@@ -120,9 +120,11 @@ class BagSource:
         return self._topics[connection.topic, connection.msgtype]
 
     def _cdr(self, connection: Connection, data: bytes) -> Buffer:
-        if self._is_ros1:
-            return self._typestore.ros1_to_cdr(data, connection.msgtype)
-        return data
+        if not self._is_ros1:
+            return data
+        if connection.msgtype not in self._typestore.types:
+            raise RecordingError(f'messages of type {connection.msgtype} are read of ROS 2 only')
+        return self._typestore.ros1_to_cdr(data, connection.msgtype)
 
 
 class SalvagedMcap:

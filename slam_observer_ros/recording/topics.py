@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.recording.input_settings import InputSettings, POSE_DIFFERENCES
+from slam_observer_ros.recording.detections import (
+    APRILTAGS_TYPE,
+    DETECTIONS_TYPE,
+    POSE_ARRAY_TYPE,
+)
+from slam_observer_ros.recording.input_settings import (
+    AUTO,
+    InputSettings,
+    ON_TF,
+    POSE_DIFFERENCES,
+)
 from slam_observer_ros.recording.messages import (
     LANDMARK_DECODERS,
     POSE_DECODERS,
@@ -22,7 +32,7 @@ ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
 
 
 TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
-"""Type of /tf, which holds landmarks if they are fiducials; taken only if chosen by name."""
+"""Type of /tf, which holds landmarks if they are fiducials."""
 
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 IMU_TYPE = 'sensor_msgs/msg/Imu'
@@ -80,9 +90,11 @@ class _Role:
 
     name: str
     option: str
-    message_types: Iterable[str]
+    message_types: Collection[str]
     is_truth: bool
     rank: Callable[[str], int]
+    types_by_name: Collection[str] = ()
+    """Types that hold other things, too: taken only of a topic that the user names."""
 
 
 def select_topics(
@@ -100,7 +112,7 @@ def select_topics(
     names : TopicNames
         What the user chose; any topic of a fitting type is allowed.
     inputs : InputSettings
-        What of the velocities is used, and whether an Imu is.
+        What of the velocities is used, whether an Imu is, and of which type landmarks are.
     identifies : callable
         Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
         them, such as a lidar's, are taken only if they are chosen by name.
@@ -131,7 +143,7 @@ def select_topics(
     is_of_poses = inputs.velocity_source == POSE_DIFFERENCES
     return SelectedTopics(
         require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity),
-        require(_LANDMARKS, names.landmarks),
+        require(*_landmark_choice(names.landmarks, inputs.landmarks_type)),
         pick(_POSE_TRUTH, names.pose_truth),
         pick(_LANDMARK_TRUTH, names.landmark_truth),
         require(_IMU, names.imu) if inputs.use_imu else None,
@@ -159,11 +171,30 @@ def _pose_rank(name: str) -> int:
 _VELOCITY = _Role('velocity', '--velocity-topic', VELOCITY_DECODERS, False, _velocity_rank)
 _ODOMETRY = _Role('odometry', '--velocity-topic', (ODOMETRY_TYPE,), False, _velocity_rank)
 _IMU = _Role('Imu', '--imu', (IMU_TYPE,), False, lambda _name: 0)
-_LANDMARKS = _Role('landmark', '--landmarks-topic', LANDMARK_DECODERS, False, _landmark_rank)
+_LANDMARKS = _Role(
+    'landmark',
+    '--landmarks-topic',
+    (*LANDMARK_DECODERS, DETECTIONS_TYPE, APRILTAGS_TYPE),
+    False,
+    _landmark_rank,
+    types_by_name=(POSE_ARRAY_TYPE, TRANSFORMS_TYPE),
+)
 _POSE_TRUTH = _Role('true pose', '--pose-truth-topic', POSE_DECODERS, True, _pose_rank)
 _LANDMARK_TRUTH = _Role(
     'true landmark', '--landmark-truth-topic', LANDMARK_DECODERS, True, _landmark_rank
 )
+
+
+def _landmark_choice(name: str | None, landmarks_type: str) -> tuple[_Role, str | None]:
+    """Return which types landmarks may have, and the name of their topic if it is known."""
+    if landmarks_type == AUTO:
+        return _LANDMARKS, name
+    if landmarks_type == ON_TF:
+        types, name = [TRANSFORMS_TYPE], name or '/tf'
+    else:
+        known = (*_LANDMARKS.message_types, *_LANDMARKS.types_by_name)
+        types = [known_type for known_type in known if _last_part(known_type) == landmarks_type]
+    return replace(_LANDMARKS, message_types=types, types_by_name=()), name
 
 
 def _is_truth(name: str) -> bool:
@@ -176,14 +207,13 @@ def _last_part(name: str) -> str:
 
 def _named(topics: Sequence[Topic], role: _Role, name: str) -> Topic:
     same_name = [topic for topic in topics if topic.name.strip('/') == name.strip('/')]
-    types = {*role.message_types, *((TRANSFORMS_TYPE,) if role is _LANDMARKS else ())}
+    types = (*role.message_types, *role.types_by_name)
     fitting = [topic for topic in same_name if topic.message_type in types]
     if fitting:
         return fitting[0]
     if same_name:
         raise RecordingError(
-            f'{same_name[0]} can not be the {role.name} topic, which is one of '
-            f'{_join(role.message_types)}'
+            f'{same_name[0]} can not be the {role.name} topic, which is one of {_join(types)}'
         )
     raise RecordingError(f'no topic {name}; the recording holds {_join(topics)}')
 
@@ -204,7 +234,7 @@ def _best(fitting: Sequence[Topic], role: _Role) -> Topic | None:
 def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topic:
     if topic is not None:
         return topic
-    with_ids = ' with ids' if role is _LANDMARKS else ''
+    with_ids = '' if LANDMARK_DECODERS.keys().isdisjoint(role.message_types) else ' with ids'
     raise RecordingError(
         f'no {role.name} topic: none of type {_join(role.message_types)}{with_ids}; '
         f'choose another with {role.option}; the recording holds {_join(topics)}'

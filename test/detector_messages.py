@@ -1,0 +1,89 @@
+"""Builds what detectors publish, with the definitions of the optional packages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import ros_messages as ros
+from rosbags.typesys import get_types_from_msg
+
+NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+DEFINITIONS = {
+    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
+    'vision_msgs/msg/ObjectHypothesisWithPose': (
+        'ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
+    ),
+    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
+    'vision_msgs/msg/Detection3D': (
+        'std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n'
+        'string id\n'
+    ),
+    'vision_msgs/msg/Detection3DArray': 'std_msgs/Header header\nDetection3D[] detections\n',
+    'apriltag_msgs/msg/Point': 'float64 x\nfloat64 y\n',
+    'apriltag_msgs/msg/AprilTagDetection': (
+        'string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n'
+        'Point centre\nPoint[4] corners\nfloat64[9] homography\n'
+    ),
+    'apriltag_msgs/msg/AprilTagDetectionArray': (
+        'std_msgs/Header header\nAprilTagDetection[] detections\n'
+    ),
+}
+
+for type_name, text in DEFINITIONS.items():
+    ros.TYPESTORE.register(get_types_from_msg(text, type_name))
+
+
+def pose_array(
+    points: Iterable[Sequence[float]], frame_id: str, stamp_ns: int = ros.STAMP_NS
+) -> object:
+    """geometry_msgs/PoseArray."""
+    poses = [ros.pose(point, NO_TURN) for point in points]
+    return ros.make('geometry_msgs/msg/PoseArray', ros.header(frame_id, stamp_ns), poses)
+
+
+def detection(
+    name: str,
+    class_id: str | None = None,
+    covariance: np.ndarray | None = None,
+    centre: Sequence[float] = (7.0, 8.0, 9.0),
+) -> object:
+    """vision_msgs/Detection3D of a box, and of a result at (1, 2, 3) if it has a class."""
+    results = []
+    if class_id is not None:
+        hypothesis = ros.make('vision_msgs/msg/ObjectHypothesis', class_id, 0.9)
+        whole = np.zeros((6, 6))
+        if covariance is not None:
+            whole[:3, :3] = covariance
+        pose = ros.make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            ros.pose((1.0, 2.0, 3.0), NO_TURN),
+            whole.ravel(),
+        )
+        results = [ros.make('vision_msgs/msg/ObjectHypothesisWithPose', hypothesis, pose)]
+    box = ros.make(
+        'vision_msgs/msg/BoundingBox3D',
+        ros.pose(centre, NO_TURN),
+        ros.vector((1.0, 1.0, 1.0)),
+    )
+    return ros.make('vision_msgs/msg/Detection3D', ros.header('camera'), results, box, name)
+
+
+def detections(items: Iterable[object], frame_id: str, stamp_ns: int = ros.STAMP_NS) -> object:
+    """vision_msgs/Detection3DArray."""
+    header = ros.header(frame_id, stamp_ns)
+    return ros.make('vision_msgs/msg/Detection3DArray', header, list(items))
+
+
+def apriltags(
+    tags: Iterable[tuple[str, int]], frame_id: str, stamp_ns: int = ros.STAMP_NS
+) -> object:
+    """apriltag_msgs/AprilTagDetectionArray of (family, id)."""
+    point = ros.make('apriltag_msgs/msg/Point', 0.0, 0.0)
+    seen = [
+        ros.make('apriltag_msgs/msg/AprilTagDetection', family, number, 0, 1.0, 2.0, point,
+                 [point] * 4, np.zeros(9))
+        for family, number in tags
+    ]  # fmt: skip
+    header = ros.header(frame_id, stamp_ns)
+    return ros.make('apriltag_msgs/msg/AprilTagDetectionArray', header, seen)
