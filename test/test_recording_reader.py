@@ -262,6 +262,10 @@ class TestTopics:
         (tmp_path / 'topics.mcap').unlink()
         assert self.find(tmp_path, messages, landmarks='lidar')['landmarks'] == '/lidar'
 
+    def test_a_cloud_called_landmarks_needs_no_ids(self, tmp_path):
+        messages = {'/twist': self.TWIST, '/landmarks': self.LIDAR, '/beacons': self.CLOUD}
+        assert self.find(tmp_path, messages)['landmarks'] == '/landmarks'
+
     @pytest.mark.parametrize(
         ('others', 'reason'),
         [

@@ -115,7 +115,8 @@ def select_topics(
         What of the velocities is used, whether an Imu is, and of which type landmarks are.
     identifies : callable
         Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
-        them, such as a lidar's, are taken only if they are chosen by name.
+        them, such as a lidar's, are taken only if they are chosen by name, or are called
+        ``landmarks``.
 
     Raises
     ------
@@ -128,14 +129,21 @@ def select_topics(
     def pick(role: _Role, name: str | None) -> Topic | None:
         if name is not None:
             return _named(topics, role, name)
+        right = [topic for topic in used if _is_truth(topic.name) == role.is_truth]
+        called_so = [
+            topic
+            for topic in right
+            if topic.message_type in (*role.message_types, *role.types_by_name)
+            and not role.is_truth
+            and _last_part(topic.name) == 'landmarks'
+        ]
         fitting = [
             topic
-            for topic in used
+            for topic in right
             if topic.message_type in role.message_types
-            and _is_truth(topic.name) == role.is_truth
             and (topic.message_type not in LANDMARK_DECODERS or identifies(topic))
         ]
-        return _best(fitting, role)
+        return _best(called_so or fitting, role)
 
     def require(role: _Role, name: str | None) -> Topic:
         return _required(pick(role, name), role, used)
