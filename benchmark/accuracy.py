@@ -82,13 +82,12 @@ def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:
     """Yield all jobs on the worlds of these names, the longest first."""
     for name in names:
         yield Job(report.CLEAN, name, GTSAM_JOB, first_s)
+        yield Job(report.NO_IDS, name, 'riccati', first_s)
     for name in names:
         for column in (*estimators.ONLINE, estimators.SMOOTHED):
             yield Job(report.CLEAN, name, column, first_s)
         for column in report.OUTLIER_COLUMNS:
             yield Job(report.OUTLIERS, name, column, first_s)
-        if 'MRCLAM' in name:
-            yield Job(report.NO_IDS, name, 'riccati', first_s)
 
 
 def run_jobs(pool: ProcessPoolExecutor, jobs: list[Job]) -> report.Tables:

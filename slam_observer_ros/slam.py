@@ -185,11 +185,11 @@ class Slam:
         return events
 
     def is_where(self, other: Slam, event: ObservationEvent) -> bool:
-        """Return whether the robot is where ``other`` has it, as far as the sensor can tell."""
+        """Return whether the robot is where ``other`` has it, as far as the points seen tell."""
         here, there = self.observer.pose, other.observer.pose
         shifts = se3.transform(here, event.points) - se3.transform(there, event.points)
         noise = here[:3, :3] @ self._noise.observation(event) @ here[:3, :3].T
-        return bool(np.max(mahalanobis(shifts, noise), initial=0.0) <= RESOLUTION)
+        return len(shifts) > 0 and bool(np.max(mahalanobis(shifts, noise)) <= RESOLUTION)
 
     def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the state's instant.

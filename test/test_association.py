@@ -117,6 +117,8 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     for step in range(100, 105):
         observe(estimator, 0.1 * step, seen[1:2])
     followed = len(estimator._hypotheses)
+    observe(estimator, 10.45, np.empty((0, 3)))  # tells nothing, and so decides nothing
+    assert len(estimator._hypotheses) == followed
     for step in range(105, 110):
         observe(estimator, 0.1 * step, seen[1:])
     assert followed > 1
