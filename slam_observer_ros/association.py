@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import block_diagonal, mahalanobis
@@ -84,7 +84,11 @@ def find_readings(
     axes = PLANAR if settings.two_d_mode else SPATIAL
     gate, m, k = settings.rejection_distance, len(points), axes.point
     at, rows = _pairs_within(gate, observer, gains, index, points, noise, known_rows)
-    pairs, PC = _joined(observer, gains, axes, at, rows, points, noise)
+    innovation = _as_innovation(observer, rows, points[at], noise[at])
+    PC, CPC = gains.foretold(innovation)
+    own_noise = innovation.covariances[:, :k, :k]
+    S = CPC + block_diagonal(own_noise)
+    pairs = Pairs(at, rows, innovation.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
     search = JointSearch(pairs, nearly, gate, 0.0 if nearly.all() else MARGIN)
     lonely_cost = (m - len(np.unique(at))) * gate**2
@@ -93,8 +97,8 @@ def find_readings(
     moves: list[FloatArray] = []
     for pairing in search.pairings():
         columns = columns_of(pairing.chosen, k)
-        S, r = pairs.covariances[np.ix_(columns, columns)], pairs.residuals[pairing.chosen]
-        move = J @ (PC[:, columns] @ np.linalg.solve(S, r.ravel()))
+        r = pairs.residuals[pairing.chosen].ravel()
+        move = J @ (PC[:, columns] @ np.linalg.solve(S[np.ix_(columns, columns)], r))
         if all(np.max(mahalanobis(move - other, R)) > RESOLUTION for other in moves):
             found = np.full(m, -1)
             found[at[pairing.chosen]] = rows[pairing.chosen]
@@ -120,37 +124,20 @@ def _pairs_within(
     at, rows = index.near(landmarks, points, gate * spread_m)
     allowed = np.where(known_rows[at] >= 0, rows == known_rows[at], ~np.isin(rows, known_rows))
     at, rows = at[allowed], rows[allowed]
-    a = observer.a[rows]
-    e = points[at] - a
-    pairs = Innovation(rows, e, e - observer.y_ref[rows], a, noise[at], 0.0)
-    distances = gains.distances(pairs)
+    distances = gains.distances(_as_innovation(observer, rows, points[at], noise[at]))
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
     near = order[(rank < MAX_CANDIDATES) & (distances[order] <= gate)]
     return at[near], rows[near]
 
 
-def _joined(
-    observer: Observer,
-    gains: RiccatiGains,
-    axes: Axes,
-    at: IntArray,
-    rows: IntArray,
-    points: FloatArray,
-    noise: FloatArray,
-) -> tuple[Pairs, FloatArray]:
-    """Return pairs with the joint covariance of their residuals, and that with the pose."""
-    p, k, q = len(axes.pose), axes.point, len(at)
-    landmarks = (observer.y_ref + observer.a)[rows]
-    different, columns = np.unique(rows, return_inverse=True)
-    P = gains.joint_covariance(different)
-    H = np.zeros((q, k, len(P)))
-    H[:, :, :p] = axes.output_matrix(0.5 * (points[at] + landmarks))
-    H[np.arange(q)[:, None], np.arange(k), p + k * columns[:, None] + np.arange(k)] = -1.0
-    C = H.reshape(q * k, len(P))
-    CP, R = C @ P, noise[at, :k, :k]
-    r = (points[at] - landmarks)[:, :k]
-    return Pairs(at, rows, r, CP @ C.T + block_diagonal(R), R), CP[:, :p].T
+def _as_innovation(
+    observer: Observer, rows: IntArray, points: FloatArray, noise: FloatArray
+) -> Innovation:
+    """Return what it would be to see the landmarks ``rows`` (q,) at ``points`` (q, 3)."""
+    a = observer.a[rows]
+    e = points - a
+    return Innovation(rows, e, e - observer.y_ref[rows], a, noise, 0.0)
 
 
 def _spread_m(covariances: FloatArray) -> FloatArray:

@@ -11,7 +11,6 @@ import numpy as np
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import mahalanobis
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.types import FloatArray, IntArray
@@ -40,20 +39,6 @@ class FixedMapGains(RiccatiGains):
         """(n, 3, 3) covariances of the landmarks, as the map has them."""
         return self._landmark_covariances
 
-    def joint_covariance(self, indices: IntArray) -> FloatArray:
-        """Return the covariance (p + m k, p + m k) of ε and m landmarks, which have no error."""
-        size = self._p + self._axes.point * len(indices)
-        covariance = np.zeros((size, size))
-        covariance[: self._p, : self._p] = self._P[: self._p, : self._p]
-        return covariance
-
-    def distances(self, innovation: Innovation) -> FloatArray:
-        """Return the Mahalanobis distance (m,) of each residual."""
-        k, P = self._axes.point, self._P[: self._p, : self._p]
-        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r)
-        CPC = C @ P @ so3.transpose(C)
-        return mahalanobis(innovation.r[:, :k], CPC + innovation.covariances[:, :k, :k])
-
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose's covariance."""
         predict(self._P, self._axes, self._calibration, motion)
@@ -77,11 +62,12 @@ class FixedMapGains(RiccatiGains):
         PC = self._P[:, : self._p] @ C.T
         return PC, C @ PC[: self._p]
 
-    def _foretold(self, innovation: Innovation) -> FloatArray:
-        """Return the covariance (m k, m k) of the residuals: the pose's error alone."""
-        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r).reshape(-1, self._p)
-        CPC: FloatArray = C @ self._P[: self._p, : self._p] @ C.T
-        return CPC
+    def _output_covariances(
+        self, C: FloatArray, columns: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances of C ε with ε (…, p, j), and of its own (…, j, j)."""
+        PC = self._P[: self._p, : self._p] @ so3.transpose(C)
+        return PC, C @ PC
 
     def _as_correction(self, x: FloatArray) -> Correction:
         """Return the group element exp(x); it moves no landmark."""

@@ -188,7 +188,7 @@ class RiccatiGains:
         k, P = self._axes.point, self._P
         PC, CPC = self._project(innovation)
         r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
-        weights = observation_weights(r, self._foretold(innovation), noise, self._settings)
+        weights = observation_weights(r, self.foretold(innovation)[1], noise, self._settings)
         passed = weights > 0.0
         used = np.flatnonzero(np.repeat(passed, k))
         R = block_diagonal(noise[passed] / weights[passed, None, None])
@@ -202,12 +202,22 @@ class RiccatiGains:
         """Return the Mahalanobis distance (m,) of each residual."""
         k = self._axes.point
         columns = self._columns(innovation.indices).reshape(-1, k)
-        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r)
-        cross = self._P[columns, : self._p] @ so3.transpose(C)
-        own = self._P[columns[:, :, None], columns[:, None, :]]
-        CPC = C @ self._P[: self._p, : self._p] @ so3.transpose(C)
-        CPC += own - cross - so3.transpose(cross)
+        _, CPC = self._output_covariances(self._chord_output(innovation), columns)
         return mahalanobis(innovation.r[:, :k], CPC + innovation.covariances[:, :k, :k])
+
+    def foretold(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+        """Return what the state foretells of m residuals, as it is to judge them by.
+
+        Returns
+        -------
+        PC : FloatArray
+            (p, m k) their covariances with ε.
+        CPC : FloatArray
+            (m k, m k) their covariance, without the noise of the observations, m².
+
+        """
+        C = self._chord_output(innovation).reshape(-1, self._p)
+        return self._output_covariances(C, self._columns(innovation.indices))
 
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
@@ -221,18 +231,26 @@ class RiccatiGains:
         y_ref = innovation.e - innovation.r
         return self._axes.output_matrix(y_ref).reshape(-1, self._p)
 
-    def _foretold(self, innovation: Innovation) -> FloatArray:
-        """Return the covariance (m k, m k) of the residuals, as it is to judge them by.
+    def _chord_output(self, innovation: Innovation) -> FloatArray:
+        """Return C_i (m, k, p) at the middle of the chord from y_i° to e_i.
 
         Turning y_i° to e_i, by however much, moves it at right angles to (e_i + y_i°)/2; with C
         at y_i° a robot that has turned further than it knows would reject what it sees.
         """
-        columns = self._columns(innovation.indices)
-        C = self._axes.output_matrix(innovation.e - 0.5 * innovation.r).reshape(-1, self._p)
-        cross = self._P[columns, : self._p] @ C.T
-        own = self._P[columns[:, None], columns]
-        CPC: FloatArray = C @ self._P[: self._p, : self._p] @ C.T - cross - cross.T + own
-        return CPC
+        return self._axes.output_matrix(innovation.e - 0.5 * innovation.r)
+
+    def _output_covariances(
+        self, C: FloatArray, columns: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances of C ε − ã with ε (…, p, j), and of its own (…, j, j).
+
+        C is (…, j, p), and ``columns`` (…, j) are those of ã in P.
+        """
+        P, to_pose = self._P[: self._p, : self._p], self._P[columns, : self._p]
+        cross = to_pose @ so3.transpose(C)
+        own = self._P[columns[..., :, None], columns[..., None, :]]
+        CPC = C @ P @ so3.transpose(C) - cross - so3.transpose(cross) + own
+        return P @ so3.transpose(C) - so3.transpose(to_pose), CPC
 
     def settle(self, observer: Observer) -> None:
         """Take the landmarks' estimates for their reference, so that â_i = 0.
