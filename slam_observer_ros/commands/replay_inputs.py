@@ -26,7 +26,8 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         (
             '--landmarks-topic',
             'PointCloud or PointCloud2 with ids, Detection3DArray or AprilTagDetectionArray; if '
-            'named, also clouds without ids, PoseArray, and /tf with fiducials',
+            'named here or called landmarks, also clouds without ids and PoseArray; if named, /tf '
+            'with fiducials',
         ),
         ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
         ('--pose-truth-topic', 'true pose'),

@@ -126,24 +126,18 @@ def select_topics(
     """
     used = [topic for topic in topics if topic.count > 0]
 
+    def fits(topic: Topic, role: _Role) -> bool:
+        if not role.is_truth and _last_part(topic.name) == 'landmarks':
+            return topic.message_type in (*role.message_types, *role.types_by_name)
+        if topic.message_type not in role.message_types:
+            return False
+        return topic.message_type not in LANDMARK_DECODERS or identifies(topic)
+
     def pick(role: _Role, name: str | None) -> Topic | None:
         if name is not None:
             return _named(topics, role, name)
         right = [topic for topic in used if _is_truth(topic.name) == role.is_truth]
-        called_so = [
-            topic
-            for topic in right
-            if topic.message_type in (*role.message_types, *role.types_by_name)
-            and not role.is_truth
-            and _last_part(topic.name) == 'landmarks'
-        ]
-        fitting = [
-            topic
-            for topic in right
-            if topic.message_type in role.message_types
-            and (topic.message_type not in LANDMARK_DECODERS or identifies(topic))
-        ]
-        return _best(called_so or fitting, role)
+        return _best([topic for topic in right if fits(topic, role)], role)
 
     def require(role: _Role, name: str | None) -> Topic:
         return _required(pick(role, name), role, used)
