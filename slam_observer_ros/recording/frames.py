@@ -14,7 +14,7 @@ from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.messages import (
     ImuMessage,
-    pose_matrices,
+    pose_stack,
     PoseMessage,
     VelocityMessage,
 )
@@ -29,10 +29,7 @@ def insert_transforms(
     buffer: TransformBuffer, transforms: Sequence[PoseMessage], *, is_static: bool
 ) -> None:
     """Put the transforms of a message on /tf or /tf_static into a buffer."""
-    positions = np.array([transform.position for transform in transforms]).reshape(-1, 3)
-    quaternions = np.array([transform.quaternion for transform in transforms]).reshape(-1, 4)
-    poses = pose_matrices(positions, quaternions)
-    for transform, pose in zip(transforms, poses, strict=True):
+    for transform, pose in zip(transforms, pose_stack(transforms), strict=True):
         buffer.insert(
             transform.frame_id,
             transform.child_frame_id,

@@ -8,7 +8,7 @@ first.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -108,6 +108,13 @@ ObservationDecoder: TypeAlias = Callable[[Buffer, int], ObservationMessage]
 """As :data:`VelocityDecoder`, for landmarks."""
 
 PoseDecoder: TypeAlias = Callable[[Buffer], PoseMessage]
+
+
+def pose_stack(messages: Sequence[PoseMessage]) -> FloatArray:
+    """Return the poses (m, 4, 4) of several messages, built at once."""
+    positions = np.array([message.position for message in messages]).reshape(-1, 3)
+    quaternions = np.array([message.quaternion for message in messages]).reshape(-1, 4)
+    return pose_matrices(positions, quaternions)
 
 
 def pose_matrices(positions: FloatArray, quaternions: FloatArray) -> FloatArray:

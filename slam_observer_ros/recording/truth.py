@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.events import LandmarkTruth, UNKNOWN_ID
-from slam_observer_ros.recording.messages import pose_matrices, PoseMessage
+from slam_observer_ros.recording.messages import pose_stack, PoseMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -44,9 +44,7 @@ def _gathered_poses(messages: Sequence[PoseMessage]) -> tuple[IntArray, FloatArr
     stamps_ns, order = np.unique(
         np.array([message.stamp_ns for message in messages], dtype=np.int64), return_index=True
     )
-    positions = np.array([message.position for message in messages]).reshape(-1, 3)
-    quaternions = np.array([message.quaternion for message in messages]).reshape(-1, 4)
-    return stamps_ns, pose_matrices(positions[order], quaternions[order])
+    return stamps_ns, pose_stack([messages[i] for i in order])
 
 
 def _gathered_landmarks(messages: Iterable[ObservationMessage]) -> LandmarkTruth | None:
