@@ -10,9 +10,13 @@ import shutil
 import signal
 import socket
 import tempfile
+from typing import TYPE_CHECKING
 
 from hypothesis import settings
 import pytest
+
+if TYPE_CHECKING:
+    from node_processes import Client
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 SESSION_VARIABLE = 'SLAM_OBSERVER_TEST_SESSION'
@@ -53,6 +57,15 @@ def ros_domain_id() -> Iterator[int]:
         domain_id = next(i for i in DOMAIN_IDS if reserve(reservation, i))
         patch.setenv('ROS_DOMAIN_ID', str(domain_id))
         yield domain_id
+
+
+@pytest.fixture(scope='module')
+def ros(ros_domain_id: int) -> Iterator[Client]:
+    """Listen and talk to nodes in the module's domain."""
+    from node_processes import client  # rclpy, which tests without nodes can do without
+
+    with client() as opened:
+        yield opened
 
 
 def reserve(reservation: socket.socket, domain_id: int) -> bool:

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from node_processes import client, running
+from node_processes import running
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -39,12 +39,6 @@ WHEEL_POSE = pose_from_rpy((-0.4, 0.3, 0.0, 0.0, 0.0, 0.7))
 SCENARIO = Scenario(
     velocity_rate=40.0, observation_rate=20.0, duration=2.0, initial_bias=0.0, landmark_count=6
 )
-
-
-@pytest.fixture(scope='module')
-def ros(ros_domain_id):
-    with client() as opened:
-        yield opened
 
 
 def seen_from(sensor_pose, event):

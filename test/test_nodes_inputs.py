@@ -8,7 +8,7 @@ import time
 
 from geometry_msgs.msg import Pose, PoseArray, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from node_processes import client, NodeProcess, running
+from node_processes import NodeProcess, running
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -37,12 +37,6 @@ STEP_NS = SECOND // 20
 STEPS = 30
 V = np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0])
 WRONG_TURN = np.array([0.0, 0.0, -0.8, 1.0, 0.0, 0.0])
-
-
-@pytest.fixture(scope='module')
-def ros(ros_domain_id):
-    with client() as opened:
-        yield opened
 
 
 def true_pose(stamp_ns, start_ns):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
-from node_processes import client, running
+from node_processes import running
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
@@ -18,12 +18,6 @@ from slam_observer_ros.simulation import Scenario
 pytestmark = pytest.mark.ros
 
 RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=0.6)
-
-
-@pytest.fixture(scope='module')
-def ros(ros_domain_id):
-    with client() as opened:
-        yield opened
 
 
 class Manager:

@@ -8,7 +8,7 @@ import time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
-from node_processes import client, NodeProcess, running
+from node_processes import NodeProcess, running
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -37,12 +37,6 @@ from slam_observer_ros.simulation import Scenario
 pytestmark = pytest.mark.ros
 
 RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=1.0)
-
-
-@pytest.fixture(scope='module')
-def ros(ros_domain_id):
-    with client() as opened:
-        yield opened
 
 
 @pytest.fixture(scope='module')

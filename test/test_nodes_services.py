@@ -10,7 +10,7 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
-from node_processes import client, running
+from node_processes import running
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
@@ -30,12 +30,6 @@ pytestmark = pytest.mark.ros
 
 RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=0.6)
 SECOND = 1_000_000_000
-
-
-@pytest.fixture(scope='module')
-def ros(ros_domain_id):
-    with client() as opened:
-        yield opened
 
 
 class Diagnostics:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
-from node_processes import client, running
+from node_processes import running
 from numpy.testing import assert_allclose
 import pytest
 from rclpy.serialization import serialize_message
@@ -20,12 +20,6 @@ from slam_observer_ros.recording.point_clouds import decode_point_cloud, decode_
 pytestmark = pytest.mark.ros
 
 PAPER_LANDMARKS = [[4, 0, 0], [-4, 0, 0], [0, 4, 0], [0, -4, 0]]
-
-
-@pytest.fixture(scope='module')
-def ros(ros_domain_id):
-    with client() as opened:
-        yield opened
 
 
 def stamp_ns(message):

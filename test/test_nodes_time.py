@@ -8,7 +8,7 @@ import time
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from node_processes import client, running
+from node_processes import running
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
@@ -27,12 +27,6 @@ pytestmark = pytest.mark.ros
 
 SECOND = 1_000_000_000
 RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=1.5, initial_bias=0.0)
-
-
-@pytest.fixture(scope='module')
-def ros(ros_domain_id):
-    with client() as opened:
-        yield opened
 
 
 @pytest.fixture(scope='module')
