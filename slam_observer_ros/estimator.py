@@ -289,7 +289,7 @@ class Estimator:
     @property
     def world_points(self) -> FloatArray:
         """(n, 3) estimated landmarks, metres, world."""
-        return self._slam.observer.world_points[self._slam.confirmed]
+        return self._slam.world_points[self._slam.confirmed]
 
     @property
     def landmark_covariances(self) -> FloatArray | None:

@@ -63,6 +63,7 @@ def enter_map(slam: Slam, known: LandmarkMap) -> bool:
         Whether the estimate is now in the map's frame.
 
     """
+    slam.gains.recall(slam.observer, np.arange(len(slam.landmarks)))
     rows = slam.landmarks.indices_of(known.ids)
     shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
     found = _find_frame(slam, rows[shared], known.select(shared))
@@ -118,7 +119,6 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
 
 def find_transform(
     source: FloatArray,
-    source_reference: FloatArray,
     source_covariance: FloatArray,
     target: FloatArray,
     target_covariances: FloatArray,
@@ -132,8 +132,6 @@ def find_transform(
     ----------
     source : FloatArray
         (m, 3) landmarks in the robot's own frame, metres.
-    source_reference : FloatArray
-        (m, 3) the same as y_i°, for which their covariance holds.
     source_covariance : FloatArray
         (p + m k, p + m k) covariance of the pose's error and theirs together, rad² and m².
     target : FloatArray
@@ -151,7 +149,7 @@ def find_transform(
 
     """
     p, k = len(axes.pose), axes.point
-    J = axes.output_matrix(source_reference).reshape(len(source) * k, p)
+    J = axes.output_matrix(source).reshape(len(source) * k, p)
     G = np.vstack([np.eye(p), J])
     agree = np.ones(len(source), dtype=np.bool_)
     while agree.sum() >= k:
@@ -213,15 +211,14 @@ def _find_frame(
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
     axes = _axes(slam)
-    y_ref = slam.observer.y_ref[rows]
     covariance = slam.gains.joint_covariance(rows)
     if covariance is None:
         variance = slam.settings.point_noise**2
         pose = np.zeros(len(axes.pose))
         covariance = np.diag(np.append(pose, np.full(axes.point * len(rows), variance)))
     covariances = known.covariances_or(slam.settings.map_noise)
-    points = y_ref + slam.observer.a[rows]
-    return find_transform(points, y_ref, covariance, known.world_points, covariances, axes)
+    points = slam.observer.y_ref[rows] + slam.observer.a[rows]
+    return find_transform(points, covariance, known.world_points, covariances, axes)
 
 
 def _without_negative(covariances: FloatArray) -> FloatArray:

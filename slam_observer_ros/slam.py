@@ -77,6 +77,13 @@ class Slam:
         return np.flatnonzero(self.landmarks.counts >= self.settings.confirmations)
 
     @property
+    def world_points(self) -> FloatArray:
+        """(n, 3) estimated landmarks, metres, world."""
+        observer = self.observer
+        shifts = se3.rotate(observer.reference_pose, self.gains.postponed_shifts())
+        return observer.world_points + shifts
+
+    @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
         covariances = self.gains.landmark_covariances
@@ -261,6 +268,7 @@ class Slam:
         """Correct the state by m known landmarks; return their residuals (m, 3)."""
         if not len(rows):
             return np.empty((0, 3))
+        self.gains.recall(self.observer, rows)
         innovation = self._innovation(event, rows)
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)

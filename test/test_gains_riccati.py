@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 import tracemalloc
 
+from bare_filter import Filter, PLAIN, random_covariances
 from gain_worlds import drive, estimate
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,81 +15,15 @@ from strategies import generators, poses
 
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.gains.base import Innovation, Motion
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 
-PLAIN = Settings(huber_threshold=0.0, rejection_distance=1e9, hindsight_interval=0)
-"""No robustness, no looking back: a plain filter."""
-
-
-class Filter:
-    """Observer and Riccati gains, without the handling of time and ids."""
-
-    def __init__(self, settings=PLAIN):
-        self.observer = Observer(np.eye(4))
-        self.gains = RiccatiGains(settings)
-
-    def move(self, body_velocities, dt_s, covariances):
-        path = self.observer.path(self.gains.calibrated(body_velocities), dt_s)
-        self.observer.propagate(path)
-        no_gaps = np.zeros(len(dt_s))
-        self.gains.predict(Motion(path, body_velocities, dt_s, no_gaps, covariances))
-
-    def add(self, points, covariances):
-        self.observer.add_landmarks(points)
-        y_ref = self.observer.y_ref[-len(points) :]
-        self.gains.add_landmarks(y_ref, self._turned(covariances))
-
-    def relocate(self, indices, points, covariances):
-        self.observer.relocate_landmarks(indices, points)
-        self.gains.relocate_landmarks(
-            indices, self.observer.y_ref[indices], self._turned(covariances)
-        )
-
-    def innovation(self, indices, points, covariances):
-        e, r = self.observer.errors(indices, points)
-        return Innovation(indices, e, r, self.observer.a[indices], self._turned(covariances), 0.1)
-
-    def see(self, indices, points, covariances):
-        correction, weights = self.gains.correct(self.innovation(indices, points, covariances))
-        self.observer.correct(correction)
-        return weights
-
-    def expected(self, indices):
-        """Where the landmarks should be seen, (m, 3)."""
-        points = self.observer.y_ref[indices] + self.observer.a[indices]
-        return se3.transform(se3.inverse(self.observer.A), points)
-
-    def step(self, rng, motion_variance, point_variance):
-        """One random motion and one random sight of some of the landmarks."""
-        n = len(self.observer.y_ref)
-        V = rng.normal(size=(2, 6))
-        self.move(V, np.array([0.05, 0.1]), motion_variance * random_covariances(rng, 2, 6))
-        indices = np.sort(rng.permutation(n)[: rng.integers(1, n)])
-        points = self.expected(indices)
-        points = points + np.sqrt(point_variance) * rng.normal(size=points.shape)
-        self.see(indices, points, point_variance * random_covariances(rng, len(indices), 3))
-
-    @property
-    def covariance(self):
-        return self.gains._P
-
-    def _turned(self, covariances):
-        R = self.observer.A[:3, :3]
-        return R @ covariances @ R.T
-
-
-def random_covariances(rng, count, size):
-    roots = rng.normal(size=(count, size, size))
-    return roots @ roots.swapaxes(1, 2) / size + 0.1 * np.eye(size)
-
 
 def started(rng, settings=PLAIN, n=4):
     """A filter that has seen n landmarks, then moved and seen some of them again."""
-    slam = Filter(settings)
+    slam = Filter(RiccatiGains(settings))
     slam.add(rng.normal(scale=4.0, size=(n, 3)), 0.01 * random_covariances(rng, n, 3))
     for _ in range(5):
         slam.step(rng, 1e-4, 1e-2)
@@ -134,7 +69,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     pieces, dt_s = 20, 0.01
     V = rng.normal(size=(pieces, 6))
     Q = random_covariances(rng, pieces, 6)
-    slam = Filter()
+    slam = Filter(RiccatiGains(PLAIN))
     slam.observer.A = start = se3.exp(rng.normal(size=6))
     slam.move(V, np.full(pieces, dt_s), Q)
 
@@ -157,7 +92,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
 
 def test_prediction_costs_the_same_however_large_the_map():
     def peak_bytes(landmarks):
-        slam, rng = Filter(), np.random.default_rng(0)
+        slam, rng = Filter(RiccatiGains(PLAIN)), np.random.default_rng(0)
         slam.add(rng.normal(size=(landmarks, 3)), random_covariances(rng, landmarks, 3))
         V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
         tracemalloc.start()
@@ -181,7 +116,7 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     Q[axes.pose, axes.pose] = 1e-4
     R = np.diag([1e-3, 2e-3, 3e-3])
     point = np.array([[2.0, -1.0, 0.0 if two_d_mode else 0.5]])
-    slam = Filter(replace(PLAIN, two_d_mode=two_d_mode))
+    slam = Filter(RiccatiGains(replace(PLAIN, two_d_mode=two_d_mode)))
     slam.add(point, R[None])
     slam.move(V, np.full(pieces, 0.1), np.tile(Q, (pieces, 1, 1)))
     seen = se3.transform(se3.inverse(slam.observer.A), point)
@@ -209,7 +144,7 @@ def test_observations_never_tell_where_the_worlds_frame_is(rng):
 
     def run(frame_covariance):
         random = np.random.default_rng(seed)
-        slam = Filter()
+        slam = Filter(RiccatiGains(PLAIN))
         slam.gains.set_pose_covariance(frame_covariance)
         slam.add(random.normal(scale=4.0, size=(4, 3)), 0.01 * random_covariances(random, 4, 3))
         for _ in range(20):
@@ -229,7 +164,7 @@ def test_covariance_stays_symmetric_and_positive_over_hours_of_any_noise(
     point_variance_exponents,
 ):
     rng = np.random.default_rng(4)
-    slam = Filter()
+    slam = Filter(RiccatiGains(PLAIN))
     slam.add(rng.normal(scale=4.0, size=(3, 3)), np.tile(1e-2 * np.eye(3), (3, 1, 1)))
     steps, dt_s = 8_000, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
@@ -370,7 +305,7 @@ def test_the_order_of_landmarks_in_a_message_does_not_matter():
 
 
 def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees():
-    slam = Filter(PLAIN)
+    slam = Filter(RiccatiGains(PLAIN))
     slam.add(np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1)))
     # It takes itself to be at rest, but may have turned by 0.3 rad; it has turned by 0.6.
     Q = np.diag([1e-8, 1e-8, 0.3**2, 1e-4, 1e-4, 1e-4])

@@ -180,7 +180,7 @@ def test_a_frame_that_lies_anyhow_to_robot_and_landmarks_alike_is_no_obstacle(ax
     tilted = G @ G.T + 1e-4 * np.eye(p + 6 * k)  # by 1 rad, in common
     true = se3.exp(np.array([0.0, 0.0, 1.0, 2.0, 3.0, 0.0]))
     known = se3.transform(true, source), np.tile(1e-4 * np.eye(3), (6, 1, 1))
-    transform, agree = find_transform(source, source, tilted, *known, axes)
+    transform, agree = find_transform(source, tilted, *known, axes)
     assert_allclose(transform, true, atol=1e-9)
     assert agree.all()
 

@@ -144,6 +144,12 @@ class GainDesign(Protocol):
     def calibrated(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (k, 6) with what is known of their scale and bias put right."""
 
+    def recall(self, observer: Observer, indices: IntArray) -> None:
+        """Move landmarks (m,) that are about to be used, where the design had put that off."""
+
+    def postponed_shifts(self) -> FloatArray:
+        """Return how far landmarks have yet to be moved, (n, 3), metres; (1, 3) if it is zero."""
+
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return the correction and the weights (m,) of the observations, 0 for a rejected one."""
 

@@ -94,6 +94,13 @@ class ConstantGains:
         """Return the velocities as they are."""
         return body_velocities
 
+    def recall(self, observer: Observer, indices: IntArray) -> None:
+        """Do nothing: these gains put nothing off."""
+
+    def postponed_shifts(self) -> FloatArray:
+        """Return zero (1, 3): these gains put nothing off."""
+        return np.zeros((1, 3))
+
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return the innovation; all observations take part."""
         k = np.full(len(innovation.r), self.gain_k)

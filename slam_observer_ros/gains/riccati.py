@@ -183,6 +183,13 @@ class RiccatiGains:
         self._history.remove_landmarks(indices)
         self._P = np.delete(np.delete(self._P, columns, axis=0), columns, axis=1)
 
+    def recall(self, observer: Observer, indices: IntArray) -> None:
+        """Do nothing: these gains put nothing off."""
+
+    def postponed_shifts(self) -> FloatArray:
+        """Return zero (1, 3): these gains put nothing off."""
+        return np.zeros((1, 3))
+
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each observation was given."""
         k, P = self._axes.point, self._P
@@ -261,9 +268,7 @@ class RiccatiGains:
         if not observer.a.any():
             return
         columns = self._map_columns
-        L = self._axes.output_matrix(observer.a)
-        L[:, :, self._axes.pose >= 3] = 0.0
-        L = L.reshape(-1, self._p)
+        L = self._axes.turn_matrix(observer.a).reshape(-1, self._p)
         self._P[columns] += L @ self._P[: self._p]
         self._P[:, columns] += self._P[:, : self._p] @ L.T
         observer.rebase(observer.A, observer.y_ref + observer.a)

@@ -1,27 +1,42 @@
 """Variance-scheduled gains: the paper's k_i and l_i, set by what is known, at O(m) for m seen.
 
-Kept are a covariance P of the pose error ε (with the velocity's calibration) and a covariance L_i
-of each landmark by itself; how they are correlated is not kept. Landmark errors are those of
-p̂_i itself, so that landmarks out of view have none to correct. With C_i = [−[e_i + â_i]×, I] and
+Errors of landmarks are correlated, as each was seen from a pose that is not quite known. But two
+landmarks have little to do with each other beyond where the robot and the landmarks about it are.
+So a full covariance P is kept of the errors of a small *core* z = (ε, c, ã_1 … ã_K) alone: pose,
+calibration of the velocity, and the K landmarks seen last. The error of any other landmark is told
+by that of the core, and by a part of its own, which is taken to be independent of all others:
+
+    ã_i = F_i z + η_i,  η_i ~ N(0, N_i);  when first seen, F_i = [−[y_i°]×, I, 0 …] and N_i = R_i.
+
+The residual is r_i ≈ C_i ε − ã_i = H_i z − η_i with C_i = [−[p̂_i]×, I] and H_i = C_i − F_i: what
+pose and landmark have in common cancels, so seeing it again and again tells nothing of that. With
 the noise R_i of the observation, the gains of (30) and (31) become matrices
 
-    k_i = (L_i + R_i)⁻¹,                 Δ = −P⁺ Σ C_iᵀ k_i r_i
-    l_i / k_i · dt = L_i (L_i + R_i)⁻¹,  δ_i = L_i k_i (r_i + C_i Δ)
+    k_i = (N_i + R_i)⁻¹,                 Δ = −P⁺ Σ H_iᵀ k_i r_i,  P⁺ = (P⁻¹ + Σ H_iᵀ k_i H_i)⁻¹
+    l_i / k_i · dt = N_i (N_i + R_i)⁻¹,  δ_i = F_i Δ + N_i k_i (r_i + H_i Δ)
 
-where P⁺ = (P⁻¹ + Σ C_iᵀ k_i C_i)⁻¹. Since correlations are ignored, P and L_i come out too small:
-they set gains, and are not published as covariances.
+where Δ is a step of all of z, and F_i ← F_i + N_i k_i H_i, N_i ← N_i − N_i k_i N_i. A landmark out
+of view keeps F_i and N_i, and moves by F_i Δ. As far as P, F_i and N_i are right, this is what a
+Kalman filter does with the covariance of everything.
+
+They are not quite, because of what happens between observations: where the core becomes another
+one (:mod:`slam_observer_ros.gains.core`), landmarks that hung on the old one have in common what
+the new one does not tell of it. That is added to each N_i as if it were its own. So P is not that
+of an exact filter, and not published as a covariance.
+
+An observation costs O(m) for the m landmarks seen, and O(log n) in the mean for the n known ones,
+which follow when they are seen again (:mod:`slam_observer_ros.gains.leaves`).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
-from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import block_diagonal, huber_weights, mahalanobis
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, Observer
@@ -31,16 +46,9 @@ from slam_observer_ros.types import FloatArray, IntArray
 REWEIGHTINGS = 3
 """Rounds of reweighted least squares."""
 
-NOISE_INFLATION = 3.0
-"""Factor on the observations' standard deviations.
-
-A landmark seen again and again tells less and less about the pose, as their errors have become
-the same; a design that does not know this must believe each observation less.
-"""
-
 
 class ScheduledGains:
-    """Gains from a pose covariance and a covariance per landmark.
+    """Gains from the covariance of a small core and how each landmark hangs on it.
 
     Parameters
     ----------
@@ -56,8 +64,8 @@ class ScheduledGains:
         self._settings = settings
         self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
         self._calibration = Calibration(settings, self._axes)
-        self._P = initial_covariance(self._axes, self._calibration)
-        self._L: FloatArray = np.empty((0, self._axes.point, self._axes.point))
+        self._core = Core(self._axes, self._calibration)
+        self._leaves = self._core.leaves
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
@@ -68,89 +76,133 @@ class ScheduledGains:
         return self._calibration.apply(body_velocities)
 
     def predict(self, motion: Motion) -> None:
-        """Add the motion's noise to the pose's covariance."""
-        predict(self._P, self._axes, self._calibration, motion)
+        """Add the motion's noise to the core's covariance."""
+        self._core.predict(motion)
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Append landmarks (m, 3): as uncertain as the pose and the observation together."""
-        self._L = np.concatenate([self._L, self._first_variances(y_ref, covariances)])
+        """Append landmarks (m, 3): their error is that of the pose and of the observation."""
+        self._leaves.add(self._output_matrix(y_ref), self._noise(covariances))
 
     def relocate_landmarks(
         self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
     ) -> None:
         """Take landmarks for new ones."""
-        self._L[indices] = self._first_variances(y_ref, covariances)
+        self._core.dismiss(indices)
+        self._leaves.update(indices, self._output_matrix(y_ref), self._noise(covariances))
 
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Append landmarks (m,) as certain as the map has them, or exact in a fixed map."""
-        self._L = np.concatenate([self._L, self._map_variances(covariances)])
+        N = self._map_variances(covariances)
+        self._leaves.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
 
     def pose_covariance_after(self, motion: Motion) -> None:
-        """Return None: the covariance that sets the gains is too small to be published."""
+        """Return None: the covariance that sets the gains is not published."""
 
     def set_pose_covariance(self, covariance: FloatArray) -> None:
-        """Take over the covariance (6, 6) of ε."""
-        p, pose = len(self._axes.pose), self._axes.pose
-        self._P[:p] = self._P[:, :p] = 0.0
-        self._P[:p, :p] = covariance[np.ix_(pose, pose)]
+        """Take over the covariance (6, 6) of ε, independent of all else."""
+        self._core.set_pose_covariance(covariance[np.ix_(self._axes.pose, self._axes.pose)])
 
     def joint_covariance(self, indices: IntArray) -> FloatArray:
-        """Return the covariance (p + m k, p + m k) of ε and m landmarks, without correlations."""
-        p = len(self._axes.pose)
-        return np.asarray(block_diag(self._P[:p, :p], block_diagonal(self._L[indices])))
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
+        F, N, _ = self._leaves.now(indices)
+        p, q = len(self._axes.pose), len(self._core.P)
+        joint = self._with_landmarks(F, N)
+        rows = np.append(np.arange(p), np.arange(q, len(joint)))
+        return joint[np.ix_(rows, rows)]
 
     def anchor(
         self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
-        """Return the correction that puts pose and known landmarks where these are known to be."""
-        points = observer.y_ref + observer.a
-        first, p, m, k = len(self._P), len(self._axes.pose), len(r), self._axes.point
-        P = block_diag(self._P, block_diagonal(self._L[indices]))
-        G = np.zeros((len(P), p))
-        G[:p] = np.eye(p)
-        G[first:] = self._axes.output_matrix(points[indices]).reshape(-1, p)
+        """Return the correction that puts pose and known landmarks where these are known to be.
+
+        The motion γ of everything, see :mod:`slam_observer_ros.gains.gauge`, is estimated, too.
+        Other landmarks' errors are ã_i = F_i (z − γ) + J_i γ + η_i, the core being the pose alone.
+        """
+        self._core.dismiss(self._core.rows)
+        everything, p = np.arange(len(self._leaves)), len(self._axes.pose)
+        m, k, q = len(r), self._axes.point, len(self._core.P)
+        F, N, _ = self._leaves.now(everything)
+        J = self._axes.output_matrix(observer.y_ref + observer.a)
+        z, known, gamma = np.split(np.arange(q + m * k + p), [q, q + m * k])
+        P, G = np.zeros((gamma[-1] + 1,) * 2), np.zeros((gamma[-1] + 1, p))
+        P[: gamma[0], : gamma[0]] = self._with_landmarks(F[indices], N[indices])
+        G[:p] = G[gamma] = np.eye(p)
+        G[known] = J[indices].reshape(-1, p)
         R = block_diagonal(self._map_variances(covariances))
-        x, P = anchor(P, G, np.arange(first, len(P)), R, r[:, :k].ravel())
-        self._P = P[:first, :first]
-        own = P[first:, first:].reshape(m, k, m, k)[np.arange(m), :, np.arange(m)]
-        self._L[indices] = own * (self._settings.localization_mode != 'fixed')
-        shifts = self._axes.output_matrix(points) @ x[:p]
-        shifts[indices] = x[first:].reshape(m, k)
-        everything = np.arange(len(points))
-        return self._as_correction(everything, -x[:first], -shifts.ravel(), observer.a)
+        x, P = anchor(P, G, known, R, r[:, :k].ravel())
+
+        self._core.P = P[:q, :q]
+        J -= F[:, :, :p]
+        shifts = F @ x[z] + J @ x[gamma]
+        B, left = regression(P, gamma, z)
+        F, N = F + J @ B, N + J @ left @ so3.transpose(J)
+        shifts[indices] = x[known].reshape(m, k)
+        B, left = regression(P, known, z)
+        F[indices] = B.reshape(m, k, q)
+        N[indices] = _symmetric(left.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)])
+        shifts = -self._axes.full_points(shifts.ravel())
+        F[:, :, :p] += self._axes.turn_matrix(shifts)
+        if self._settings.localization_mode == 'fixed':
+            F[indices] = N[indices] = 0.0
+        self._leaves.update(everything, F, N)
+        return self._as_correction(everything, -x[z], shifts, observer.a)
+
+    def recall(self, observer: Observer, indices: IntArray) -> None:
+        """Move landmarks that are about to be used to where they should have been moved by now."""
+        rows = np.union1d(indices, self._leaves.due())
+        F, N, shifts = self._leaves.now(rows)
+        self._leaves.update(rows, F, N)
+        observer.a[rows] += shifts
+
+    def postponed_shifts(self) -> FloatArray:
+        """Return how far each landmark (n, 3) has yet to be moved, metres, reference frame."""
+        return self._leaves.now(np.arange(len(self._leaves)))[2]
 
     def restart(self, observer: Observer) -> None:
         """Do nothing: these gains keep no history."""
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
-        self._L = np.delete(self._L, indices, axis=0)
+        self._core.remove(indices)
 
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return the innovation and the weight that each observation was given."""
-        passed = self.distances(innovation) <= self._settings.rejection_distance
-        k, rows = self._axes.point, innovation.indices[passed]
-        r, a = innovation.r[passed][:, :k, None], innovation.a[passed]
-        C, L = self._output_matrix(innovation.e[passed] + a), self._L[rows]
-        R = self._noise(innovation.covariances[passed])
-        weights = np.ones(len(r))
+        rows, r = innovation.indices, innovation.r[:, : self._axes.point, None]
+        F, N, _ = self._leaves.now(rows)
+        R, threshold = self._noise(innovation.covariances), self._settings.huber_threshold
+        passed = self._distances(innovation, F, N) <= self._settings.rejection_distance
+        H = self._output_matrix(innovation.e + innovation.a - innovation.r) - F
+        weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
         for _ in range(REWEIGHTINGS):
-            gain_k = np.asarray(np.linalg.inv(L + R / weights[:, None, None]))
-            P_new, x = self._pose_step(C, gain_k, r)
-            pull = gain_k @ (r + C @ x)
-            weights = huber_weights(pull[:, :, 0], R, weights, self._settings.huber_threshold)
-        spread = gain_k - gain_k @ C @ P_new @ so3.transpose(C) @ gain_k
-        self._P, self._L[rows] = P_new, L - L @ spread @ L
-        correction = self._as_correction(rows, x[:, 0], (L @ pull)[:, :, 0], a)
-        all_weights = np.zeros(len(passed))
-        all_weights[passed] = weights
-        return correction, all_weights
+            noise = R[passed] / weights[passed, None, None]
+            gain_k[passed] = np.linalg.inv(N[passed] + noise)
+            x = self._core.step(H, gain_k, r)
+            pull = gain_k @ (r + H @ x)
+            weights[passed] = huber_weights(
+                pull[passed, :, 0], R[passed], weights[passed], threshold
+            )
+            if (weights[passed] == 1.0).all():
+                break
+        shifts = self._axes.full_points((F @ x + N @ pull).ravel())
+        F = F + N @ gain_k @ H
+        F[:, :, : len(self._axes.pose)] += self._axes.turn_matrix(shifts)
+        N[passed] = _symmetric(N[passed] @ gain_k[passed] @ noise)  # = N − N k N, but positive
+        self._core.shrink(H[passed], gain_k[passed])
+        self._leaves.shift(x[:, 0])
+        self._leaves.update(rows, F, N)
+        self._core.turn(x[:, 0])
+        self._core.admit(rows[passed])
+        return self._as_correction(rows, x[:, 0], shifts, innovation.a), weights
 
     def distances(self, innovation: Innovation) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
-        C = self._output_matrix(innovation.e + innovation.a)
-        L, R = self._L[innovation.indices], self._noise(innovation.covariances)
-        S = C @ self._P @ so3.transpose(C) + L + R
+        F, N, _ = self._leaves.now(innovation.indices)
+        return self._distances(innovation, F, N)
+
+    def _distances(self, innovation: Innovation, F: FloatArray, N: FloatArray) -> FloatArray:
+        """Return them with C_i at the middle of the chord, for the reason Riccati gains have."""
+        H = self._output_matrix(innovation.e + innovation.a - 0.5 * innovation.r) - F
+        S = H @ self._core.P @ so3.transpose(H) + N + self._noise(innovation.covariances)
         return mahalanobis(innovation.r[:, : self._axes.point], S)
 
     def settle(self, observer: Observer) -> None:
@@ -159,38 +211,38 @@ class ScheduledGains:
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Do nothing: these gains keep no history."""
 
-    def _pose_step(
-        self, C: FloatArray, gain_k: FloatArray, r: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return P⁺ (p + c, p + c) and the step (p + c, 1) of pose and calibration."""
-        pull = so3.transpose(C) @ gain_k
-        G = np.sum(pull @ C, axis=0)
-        P_new = np.linalg.solve(np.eye(len(G)) + self._P @ G, self._P)
-        P_new = 0.5 * (P_new + P_new.T)
-        return P_new, -P_new @ np.sum(pull @ r, axis=0)
+    def _with_landmarks(self, F: FloatArray, N: FloatArray) -> FloatArray:
+        """Return the covariance (q + m k, q + m k) of z and m landmarks."""
+        q = len(self._core.P)
+        J = np.vstack([np.eye(q), F.reshape(-1, q)])
+        joint: FloatArray = J @ self._core.P @ J.T
+        joint[q:, q:] += block_diagonal(N)
+        return joint
 
     def _output_matrix(self, lever_arms: FloatArray) -> FloatArray:
-        """Return C_i (m, k, p + c), with zeros for the calibration."""
+        """Return C_i (m, k, q), with zeros for all of z but ε."""
         C = self._axes.output_matrix(lever_arms)
-        return np.concatenate([C, np.zeros((*C.shape[:2], self._calibration.count))], axis=2)
-
-    def _first_variances(self, y_ref: FloatArray, covariances: FloatArray) -> FloatArray:
-        J = self._output_matrix(y_ref)
-        return J @ self._P @ so3.transpose(J) + self._noise(covariances)
+        full = np.zeros((*C.shape[:2], len(self._core.P)))
+        full[:, :, : C.shape[2]] = C
+        return full
 
     def _map_variances(self, covariances: FloatArray) -> FloatArray:
-        k = self._axes.point
-        return covariances[:, :k, :k] * (self._settings.localization_mode != 'fixed')
+        return self._noise(covariances) * (self._settings.localization_mode != 'fixed')
 
     def _noise(self, covariances: FloatArray) -> FloatArray:
         k = self._axes.point
-        return NOISE_INFLATION**2 * covariances[:, :k, :k]
+        return covariances[:, :k, :k]
 
     def _as_correction(
         self, rows: IntArray, x: FloatArray, shifts: FloatArray, a: FloatArray
     ) -> Correction:
-        """Return the element that moves the pose by x and â_i (m, 3) by ``shifts`` alone."""
+        """Return the element that moves the core by x and â_i (m, 3) by ``shifts`` alone."""
         p = len(self._axes.pose)
-        self._calibration.shift(x[p:])
+        self._calibration.shift(x[p : p + self._calibration.count])
         D = se3.exp(self._axes.full_pose(x[:p]))
-        return Correction(D, rows, self._axes.full_points(shifts) + a - se3.rotate(D, a))
+        return Correction(D, rows, shifts + a - se3.rotate(D, a))
+
+
+def _symmetric(P: FloatArray) -> FloatArray:
+    symmetric: FloatArray = 0.5 * (P + so3.transpose(P))
+    return symmetric

@@ -1,0 +1,82 @@
+"""Observer and gains without the handling of time and ids, to test the gains alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.gains.base import Innovation, Motion
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.observer import Observer
+from slam_observer_ros.settings import Settings
+
+PLAIN = Settings(huber_threshold=0.0, rejection_distance=1e9, hindsight_interval=0)
+"""No robustness, no looking back: a plain filter."""
+
+
+class Filter:
+    """An observer and its gains, of any design."""
+
+    def __init__(self, gains):
+        self.observer = Observer(np.eye(4))
+        self.gains = gains
+
+    def move(self, body_velocities, dt_s, covariances):
+        path = self.observer.path(self.gains.calibrated(body_velocities), dt_s)
+        self.observer.propagate(path)
+        no_gaps = np.zeros(len(dt_s))
+        self.gains.predict(Motion(path, body_velocities, dt_s, no_gaps, covariances))
+
+    def add(self, points, covariances):
+        self.observer.add_landmarks(points)
+        y_ref = self.observer.y_ref[-len(points) :]
+        self.gains.add_landmarks(y_ref, self._turned(covariances))
+
+    def relocate(self, indices, points, covariances):
+        self.observer.relocate_landmarks(indices, points)
+        self.gains.relocate_landmarks(
+            indices, self.observer.y_ref[indices], self._turned(covariances)
+        )
+
+    def innovation(self, indices, points, covariances):
+        e, r = self.observer.errors(indices, points)
+        return Innovation(indices, e, r, self.observer.a[indices], self._turned(covariances), 0.1)
+
+    def see(self, indices, points, covariances):
+        self.gains.recall(self.observer, indices)
+        correction, weights = self.gains.correct(self.innovation(indices, points, covariances))
+        self.observer.correct(correction)
+        return weights
+
+    def expected(self, indices):
+        """Where the landmarks should be seen, (m, 3)."""
+        points = self.observer.y_ref[indices] + self.observer.a[indices]
+        return se3.transform(se3.inverse(self.observer.A), points)
+
+    def step(self, rng, motion_variance, point_variance):
+        """One random motion and one random sight of some of the landmarks."""
+        n = len(self.observer.y_ref)
+        V = rng.normal(size=(2, 6))
+        self.move(V, np.array([0.05, 0.1]), motion_variance * random_covariances(rng, 2, 6))
+        indices = np.sort(rng.permutation(n)[: rng.integers(1, n)])
+        points = self.expected(indices)
+        points = points + np.sqrt(point_variance) * rng.normal(size=points.shape)
+        self.see(indices, points, point_variance * random_covariances(rng, len(indices), 3))
+
+    @property
+    def covariance(self):
+        """Joint covariance of the pose and all landmarks."""
+        return self.gains.joint_covariance(np.arange(len(self.observer.y_ref)))
+
+    @property
+    def points(self):
+        """Landmarks (n, 3), reference frame."""
+        return self.observer.y_ref + self.observer.a + self.gains.postponed_shifts()
+
+    def _turned(self, covariances):
+        R = self.observer.A[:3, :3]
+        return R @ covariances @ R.T
+
+
+def random_covariances(rng, count, size):
+    roots = rng.normal(size=(count, size, size))
+    return roots @ roots.swapaxes(1, 2) / size + 0.1 * np.eye(size)
