@@ -24,8 +24,8 @@ one (:mod:`slam_observer_ros.gains.core`), landmarks that hung on the old one ha
 the new one does not tell of it. That is added to each N_i as if it were its own. So P is not that
 of an exact filter, and not published as a covariance.
 
-An observation costs O(m) for the m landmarks seen, and O(log n) in the mean for the n known ones,
-which follow when they are seen again (:mod:`slam_observer_ros.gains.leaves`).
+An observation costs O(m) for the m landmarks seen. The n known ones follow when they are seen
+again (:mod:`slam_observer_ros.gains.leaves`), which makes it O(m log n) in the mean.
 """
 
 from __future__ import annotations
