@@ -105,6 +105,28 @@ class Solution:
     points: FloatArray
 
 
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One Gauss–Newton step.
+
+    Attributes
+    ----------
+    start, end : Solution
+        Where all was linearised, and where that led.
+    factors : Factors
+        Of the equations at ``start``.
+
+    """
+
+    start: Solution
+    end: Solution
+    factors: Factors
+
+    def marginal(self) -> FloatArray:
+        """Return the covariance of (η, dc, dp) at ``start``, η being that of the last pose."""
+        return self.factors.marginal()
+
+
 class Smoother:
     """Gauss–Newton iterations over a prior and frames.
 
@@ -129,19 +151,19 @@ class Smoother:
         self._motion_information = _inverse(frames.motion_covariances)
         self._prior_information = _inverse(prior.covariance)
 
-    def smooth(self, start: Solution, iterations: int, tolerance: float) -> Solution:
-        """Iterate from ``start`` until no unknown moves by more than ``tolerance`` (m, rad)."""
-        solution = start
+    def smooth(self, start: Solution, iterations: int, tolerance: float) -> Step:
+        """Iterate from ``start`` until no unknown moves by more than ``tolerance`` (m, rad).
+
+        Returns the last step.
+        """
         for _ in range(iterations):
-            change, border_change = Factors(self._linearise(solution)).solve()
-            solution = self._moved(solution, change, border_change)
+            factors = Factors(self._linearise(start))
+            change, border_change = factors.solve()
+            step = Step(start, self._moved(start, change, border_change), factors)
             if max(np.abs(change).max(), np.abs(border_change).max(initial=0.0)) < tolerance:
                 break
-        return solution
-
-    def marginal(self, solution: Solution) -> FloatArray:
-        """Return the covariance of (η, dc, dp), η being that of the last pose."""
-        return Factors(self._linearise(solution)).marginal()
+            start = step.end
+        return step
 
     def _moved(
         self, solution: Solution, change: FloatArray, border_change: FloatArray

@@ -35,7 +35,7 @@ from slam_observer_ros.gains.robust import block_diagonal, mahalanobis, observat
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Prior, Smoother, Solution
+from slam_observer_ros.smoothing import Prior, Smoother, Solution, Step
 from slam_observer_ros.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
@@ -287,14 +287,14 @@ class RiccatiGains:
         rested = self._observations >= self._settings.hindsight_interval
         turned_far = self._turn_squared > self._settings.hindsight_turn**2
         if in_doubt or self._window_is_full or (turned_far and rested):
-            self._rebase(observer)
+            self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
         if self._window_is_full and not in_doubt:
             self.restart(observer)
 
     def smooth(self, observer: Observer) -> Solution:
         """Return the estimates in hindsight of everything since the history's prior."""
-        return self._smoother().smooth(self._in_hindsight(observer), 50, 1e-6)
+        return self._smoother().smooth(self._in_hindsight(observer), 50, 1e-6).end
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -320,21 +320,33 @@ class RiccatiGains:
         points = observer.y_ref + observer.a - observer.shifts
         return Solution(np.array(self._history.poses), self._calibration.values, points)
 
-    def _rebase(self, observer: Observer) -> None:
+    def _linearise_anew(self, observer: Observer) -> None:
         smoother = self._smoother()
         self._observations, self._turn_squared = 0, 0.0
         try:
-            solution = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
-            covariance = smoother.marginal(solution)
+            step = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
+            covariance = step.marginal()
         except np.linalg.LinAlgError:
             logger.warning('Could not look back: the observations so far leave something open.')
             return
-        observer.rebase(solution.poses[-1], solution.points + observer.shifts)
-        self._calibration.shift(solution.calibration - self._calibration.values)
+        self._rebase(observer, step, covariance)
+        self._history.poses = list(step.end.poses)
+
+    def _rebase(self, observer: Observer, step: Step, covariance: FloatArray) -> None:
+        """Take where all was linearised for the reference; the step from there is a correction.
+
+        ``covariance`` belongs to the step's start. Taken for that of its end it would tell
+        something of the gauge, of which nothing is known; settling carries it over.
+        """
+        start, end, pose = step.start, step.end, self._axes.pose
+        observer.rebase(start.poses[-1], start.points + observer.shifts)
         J = np.eye(len(covariance))
-        J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(self._axes.pose, self._axes.pose)]
+        J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(pose, pose)]
         self._P = J @ covariance @ J.T
-        self._history.poses = list(solution.poses)
+        self._calibration.shift(end.calibration - self._calibration.values)
+        D = end.poses[-1] @ se3.inverse(start.poses[-1])
+        observer.correct(Correction(D, slice(None), end.points - start.points))
+        self.settle(observer)
 
     @property
     def _looks_back(self) -> bool:
