@@ -21,6 +21,8 @@ import math
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky_banded
 from scipy.linalg.blas import dtbsv
+from scipy.linalg.lapack import dtbtrs
+from scipy.sparse import csc_array
 
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.types import FloatArray, IntArray
@@ -44,7 +46,7 @@ class Equations:
     shared : FloatArray
         (S, d, c) blocks of B that link poses to the first c unknowns of the border.
     poses, landmarks : IntArray
-        (M,) which pose saw which landmark.
+        (M,) which pose saw which landmark; no two are the same.
     seen : FloatArray
         (M, d, k) blocks of B that link the two.
     first : FloatArray
@@ -87,13 +89,12 @@ class Factors:
 
     def __init__(self, equations: Equations) -> None:
         self._stretches = _Stretches(equations)
-        diagonal, above, border, gradient = self._stretches.kept_chain(equations)
+        diagonal, above, rows = self._stretches.kept_chain(equations)
         corner, self._border_gradient = self._stretches.border(equations)
-        self._d, b = border.shape[1:]
+        self._d = rows.shape[2]
         self._chain = np.asfortranarray(cholesky_banded(_banded(diagonal, above)))
-        self._gradient = self._forward(gradient.ravel())
-        columns = border.reshape(gradient.size, b).T
-        self._border = np.reshape([self._forward(column) for column in columns], columns.shape)
+        rows = _forward(self._chain, rows.reshape(len(rows), -1))
+        self._border, self._gradient = rows[:-1], rows[-1]
         self._corner = cho_factor(corner - self._border @ self._border.T)
 
     def solve(self) -> tuple[FloatArray, FloatArray]:
@@ -108,8 +109,7 @@ class Factors:
         """Return the covariance (d + b, d + b) of the last pose and the border."""
         d, b = self._d, len(self._border)
         corner = cho_solve(self._corner, np.eye(b))
-        units = np.eye(d, len(self._gradient), len(self._gradient) - d)
-        root = np.array([self._forward(unit)[-d:] for unit in units])  # U⁻¹ of the last pose
+        root = _forward(self._chain[:, -d:], np.eye(d))  # U⁻¹ of the last pose
         tail = root @ self._border[:, -d:].T
         covariance = np.empty((d + b, d + b))
         covariance[:d, :d] = root @ root.T + tail @ corner @ tail.T
@@ -117,10 +117,6 @@ class Factors:
         covariance[d:, :d] = covariance[:d, d:].T
         covariance[d:, d:] = corner
         return covariance
-
-    def _forward(self, right: FloatArray) -> FloatArray:
-        """Return U⁻ᵀ b, T = Uᵀ U: half of what solving by T costs, and all that is needed."""
-        return np.asarray(dtbsv(len(self._chain) - 1, self._chain, right, trans=1))
 
 
 class _Stretches:
@@ -160,29 +156,20 @@ class _Stretches:
         local, slots = _group(stretch, equations.landmarks[self._is_inner], J, beyond)
         own = landmark_columns(local, c, k).reshape(J, k * local.shape[1])
         self._columns = np.hstack([np.tile(np.arange(c), (J, 1)), own])
-        seen = sum_at(
-            (J, STRIDE - 1, d, k * local.shape[1]),
-            (
-                stretch[:, None, None],
-                place[:, None, None] - 1,
-                np.arange(d)[:, None],
-                landmark_columns(slots, 0, k)[:, None],
-            ),
-            equations.seen[self._is_inner],
-        )
+        seen = np.zeros((J, STRIDE - 1, d, local.shape[1], k))
+        seen[stretch, place - 1, :, slots] = equations.seen[self._is_inner]
         to_start, to_end = np.zeros((2, J, STRIDE - 1, d, d))
         to_start[:, 0] = so3.transpose(equations.above[self._inner[:, 0] - 1])
         to_end[:, -1] = equations.above[self._inner[:, -1]]
         shared, gradient = equations.shared[self._inner], equations.gradient[self._inner]
-        X = np.concatenate([to_start, to_end, shared, seen, gradient[..., None]], axis=-1)
+        own_links = seen.reshape(J, STRIDE - 1, d, own.shape[1])
+        X = np.concatenate([to_start, to_end, shared, own_links, gradient[..., None]], axis=-1)
         return X.reshape(J, (STRIDE - 1) * d, X.shape[-1])
 
-    def kept_chain(
-        self, equations: Equations
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the blocks (R, d, d), (R − 1, d, d) and (R, d, b) of the R poses that are left.
+    def kept_chain(self, equations: Equations) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the blocks (R, d, d) and (R − 1, d, d) of the R poses that are left, and rows.
 
-        The last (R, d) is their gradient.
+        The rows (b + 1, R, d) are their links to the border, and last their gradient.
         """
         J, d, start, end = self._count, self._d, slice(self._d), slice(self._d, 2 * self._d)
         diagonal, gradient = equations.diagonal[self._kept], equations.gradient[self._kept]
@@ -191,37 +178,36 @@ class _Stretches:
         gradient[:J] -= self._lost[:, start, -1]
         gradient[1 : J + 1] -= self._lost[:, end, -1]
         above = np.concatenate([-self._lost[:, start, end], equations.above[STRIDE * J :]])
-        border = self._kept_border(equations)
-        stretch, axis, columns = np.arange(J)[:, None, None], np.arange(d)[:, None], self._columns
-        border[stretch, axis, columns[:, None]] -= self._lost[:, start, 2 * d : -1]
-        border[stretch + 1, axis, columns[:, None]] -= self._lost[:, end, 2 * d : -1]
-        return diagonal, above, border[:, :, : len(equations.corner)], gradient
+        rows, stretch = self._kept_links(equations), np.arange(J)[:, None]
+        rows[self._columns, stretch] -= so3.transpose(self._lost[:, start, 2 * d : -1])
+        rows[self._columns, stretch + 1] -= so3.transpose(self._lost[:, end, 2 * d : -1])
+        b = len(equations.corner)
+        rows[b] = gradient
+        return diagonal, above, rows[: b + 1]
 
-    def _kept_border(self, equations: Equations) -> FloatArray:
-        """Return the links (R, d, b + k) of the poses that are left to the border and beyond."""
-        k, c, is_kept = equations.seen.shape[2], equations.shared.shape[2], ~self._is_inner
+    def _kept_links(self, equations: Equations) -> FloatArray:
+        """Return the links (b + k, R, d) of the poses that are left to the border and beyond."""
+        b, k, c = len(equations.corner), equations.seen.shape[2], equations.shared.shape[2]
+        is_kept = ~self._is_inner
         columns = landmark_columns(equations.landmarks[is_kept], c, k)
-        border = sum_at(
-            (len(self._kept), self._d, len(equations.corner) + k),
-            (
-                np.searchsorted(self._kept, equations.poses[is_kept])[:, None, None],
-                np.arange(self._d)[:, None],
-                columns[:, None],
-            ),
-            equations.seen[is_kept],
-        )
-        border[:, :, :c] += equations.shared[self._kept]
-        border[0, :, : len(equations.corner)] += equations.first
-        return border
+        places = np.searchsorted(self._kept, equations.poses[is_kept])
+        rows = np.zeros((b + k, len(self._kept), self._d))
+        rows[columns, places[:, None]] = so3.transpose(equations.seen[is_kept])
+        rows[:c] += equations.shared[self._kept].transpose(2, 0, 1)
+        rows[:b, 0] += equations.first.T
+        return rows
 
     def border(self, equations: Equations) -> tuple[FloatArray, FloatArray]:
         """Return what is left of D (b, b) and of its gradient (b,)."""
         b, columns = len(equations.corner), self._columns
         size, own = b + equations.seen.shape[2], slice(2 * self._d, -1)
-        lost = self._lost[:, own, own]
-        corner = sum_at((size, size), (columns[:, :, None], columns[:, None]), lost)
-        gradient = sum_at((size,), (columns,), self._lost[:, own, -1])
-        return equations.corner - corner[:b, :b], equations.border_gradient - gradient[:b]
+        places = size * columns[:, :, None] + columns[:, None]
+        corner = sum_by(places.ravel(), size**2, self._lost[:, own, own].ravel())
+        gradient = sum_by(columns.ravel(), size, self._lost[:, own, -1].ravel())
+        return (
+            equations.corner - corner.reshape(size, size)[:b, :b],
+            equations.border_gradient - gradient[:b],
+        )
 
     def fill_in(self, kept: FloatArray, border: FloatArray) -> FloatArray:
         """Return the changes (S, d) of all poses from those (R, d) left and (b,) of the border."""
@@ -239,13 +225,12 @@ def landmark_columns(landmarks: IntArray, c: int, k: int) -> IntArray:
     return c + k * landmarks[..., None] + np.arange(k)
 
 
-def sum_at(shape: tuple[int, ...], places: tuple[IntArray, ...], values: FloatArray) -> FloatArray:
-    """Return an array of ``shape`` with ``values`` added up at ``places``, which broadcast."""
-    flat = places[0]
-    for length, place in zip(shape[1:], places[1:], strict=True):
-        flat = flat * length + place
-    sums = np.bincount(flat.ravel(), values.ravel(), math.prod(shape))
-    return sums.reshape(shape).astype(np.float64, copy=False)  # of nothing they are integers
+def sum_by(labels: IntArray, count: int, values: FloatArray) -> FloatArray:
+    """Return the sums (count, …) of those of the ``values`` (M, …) that have the same label."""
+    M = len(labels)
+    selection = csc_array((np.ones(M), labels, np.arange(M + 1)), (count, M))
+    sums: FloatArray = selection @ values.reshape(M, math.prod(values.shape[1:]))
+    return sums.reshape(count, *values.shape[1:])
 
 
 def _group(
@@ -267,6 +252,15 @@ def _group(
     local = np.full((count, number.max(initial=-1) + 1), beyond)
     local[of_stretch, number] = landmark
     return local, number[inverse]
+
+
+def _forward(chain: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return U⁻ᵀ b for each row b: half of what solving by T = Uᵀ U costs, and all it takes.
+
+    There must be a row: of none, SciPy 1.17 writes beyond the end.
+    """
+    solved: FloatArray = dtbtrs(chain, rows.T, trans='T')[0].T
+    return solved
 
 
 def _banded(diagonal: FloatArray, above: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.axes import Axes
-from slam_observer_ros.bordered_chain import Equations, Factors, landmark_columns, sum_at
+from slam_observer_ros.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -181,20 +181,22 @@ class Smoother:
         c, k, frames = len(solution.calibration), self._axes.point, self._frames
         S, d, b = len(solution.poses), len(self._axes.pose), c + k * len(solution.points)
         H, pull = self._observations(solution)
-        poses = frames.frames + 1
-        columns = landmark_columns(frames.landmarks, c, k)
-        axes = np.arange(d)
+        poses, landmarks, n = frames.frames + 1, frames.landmarks, len(solution.points)
+        columns = landmark_columns(np.arange(n), c, k)
+        corner, border_gradient = np.zeros((b, b)), np.zeros(b)
+        corner[columns[:, :, None], columns[:, None]] = sum_by(landmarks, n, H[:, d:, d:])
+        border_gradient[columns] = sum_by(landmarks, n, pull[:, d:])
         equations = Equations(
-            sum_at((S, d, d), (poses[:, None, None], axes[:, None], axes), H[:, :d, :d]),
-            np.zeros((S - 1, d, d)),
-            np.zeros((S, d, c)),
-            poses,
-            frames.landmarks,
-            H[:, :d, d:],
-            np.zeros((d, b)),
-            sum_at((b, b), (columns[:, :, None], columns[:, None]), H[:, d:, d:]),
-            sum_at((S, d), (poses[:, None], axes), pull[:, :d]),
-            sum_at((b,), (columns,), pull[:, d:]),
+            diagonal=sum_by(poses, S, H[:, :d, :d]),
+            above=np.zeros((S - 1, d, d)),
+            shared=np.zeros((S, d, c)),
+            poses=poses,
+            landmarks=landmarks,
+            seen=H[:, :d, d:],
+            first=np.zeros((d, b)),
+            corner=corner,
+            gradient=sum_by(poses, S, pull[:, :d]),
+            border_gradient=border_gradient,
         )
         self._add_prior(equations, solution)
         self._add_motions(equations, solution)
