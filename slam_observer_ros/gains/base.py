@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +63,19 @@ class Innovation:
     a: FloatArray
     covariances: FloatArray
     dt_s: float
+
+    def select(self, mask: BoolArray) -> Innovation:
+        """Return the part of it that ``mask`` (m,) picks."""
+        if mask.all():
+            return self
+        return replace(
+            self,
+            indices=self.indices[mask],
+            e=self.e[mask],
+            r=self.r[mask],
+            a=self.a[mask],
+            covariances=self.covariances[mask],
+        )
 
 
 @dataclass(frozen=True, slots=True)

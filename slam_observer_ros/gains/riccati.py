@@ -31,7 +31,12 @@ from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.prediction import initial_covariance, predict
-from slam_observer_ros.gains.robust import block_diagonal, mahalanobis, observation_weights
+from slam_observer_ros.gains.robust import (
+    block_diagonal,
+    mahalanobis,
+    observation_weights,
+    with_blocks,
+)
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
@@ -193,13 +198,11 @@ class RiccatiGains:
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each observation was given."""
         k, P = self._axes.point, self._P
-        PC, CPC = self._project(innovation)
         r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
         weights = observation_weights(r, self.foretold(innovation)[1], noise, self._settings)
         passed = weights > 0.0
-        used = np.flatnonzero(np.repeat(passed, k))
-        R = block_diagonal(noise[passed] / weights[passed, None, None])
-        S, PC = CPC[used][:, used] + R, PC[:, used]
+        PC, CPC = self._project(innovation.select(passed))
+        S = with_blocks(CPC, noise[passed] / weights[passed, None, None])
         K = np.linalg.solve(S, PC.T).T
         half = K @ (0.5 * S @ K.T - PC.T)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out

@@ -28,22 +28,19 @@ def observation_weights(
         ``rejection_distance`` and ``huber_threshold``.
 
     """
-    k = r.shape[1]
     passed = distances(r, predicted, noise) <= settings.rejection_distance
-    weights = passed.astype(np.float64)
-    if passed.any() and settings.huber_threshold > 0.0:
-        used = np.flatnonzero(np.repeat(passed, k))
-        weights[passed] = _reweighted(
-            r[passed], predicted[used][:, used], noise[passed], settings.huber_threshold
-        )
+    if passed.all():
+        return _reweighted(r, predicted, noise, settings.huber_threshold)
+    weights, used = np.zeros(len(r)), np.flatnonzero(np.repeat(passed, r.shape[1]))
+    weights[passed] = _reweighted(
+        r[passed], predicted[used][:, used], noise[passed], settings.huber_threshold
+    )
     return weights
 
 
 def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
     """Return the Mahalanobis distance (m,) of each residual; parameters as above."""
-    m, k = r.shape
-    i = np.arange(m)
-    return mahalanobis(r, predicted.reshape(m, k, m, k)[i, :, i] + noise)
+    return mahalanobis(r, _diagonal_blocks(predicted, r.shape[1]) + noise)
 
 
 def huber_weights(
@@ -78,9 +75,22 @@ def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
 def block_diagonal(blocks: FloatArray) -> FloatArray:
     """Return the block-diagonal matrix (m k, m k) of blocks (m, k, k)."""
     m, k = blocks.shape[:2]
-    matrix = np.zeros((m, k, m, k))
-    matrix[np.arange(m), :, np.arange(m)] = blocks
-    return matrix.reshape(m * k, m * k)
+    return with_blocks(np.zeros((m * k, m * k)), blocks)
+
+
+def with_blocks(matrix: FloatArray, blocks: FloatArray) -> FloatArray:
+    """Return a matrix (m k, m k) plus the block-diagonal one of blocks (m, k, k)."""
+    total: FloatArray = matrix.copy()
+    diagonal = _diagonal_blocks(total, blocks.shape[1])
+    diagonal += blocks
+    return total
+
+
+def _diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
+    """Return the blocks (m, k, k) on the diagonal of a matrix (m k, m k), as a view of it."""
+    m = len(matrix) // k
+    blocks: FloatArray = np.einsum('ijik->ijk', matrix.reshape(m, k, m, k))
+    return blocks
 
 
 def _reweighted(
@@ -93,9 +103,9 @@ def _reweighted(
     """
     weights = np.ones(len(r))
     for _ in range(REWEIGHTINGS):
-        R = block_diagonal(noise / weights[:, None, None])
-        pull = np.asarray(np.linalg.solve(predicted + R, r.ravel()), dtype=np.float64)
+        S = with_blocks(predicted, noise / weights[:, None, None])
+        pull = np.asarray(np.linalg.solve(S, r.ravel()), dtype=np.float64)
         weights = huber_weights(pull.reshape(r.shape), noise, weights, threshold)
-        if weights.min() == 1.0:
+        if weights.min(initial=1.0) == 1.0:
             break
     return weights
