@@ -218,17 +218,17 @@ class Slam:
         if not self.is_mapping:
             self.counts['unmapped_landmark'] += int(np.sum(~known))
             event, rows, known = _select(event, known), rows[known], known[known]
-        residuals = self._innovate(_select(event, known), rows[known])
-        self._initialise(_select(event, ~known))
-        ids = event.ids[known]
-        event = _select(event, self.landmarks.indices_of(event.ids) >= 0)
-        rows = self.landmarks.indices_of(event.ids)
+        self.gains.recall(self.observer, rows[known])
+        ids, covariances = event.ids[known], self._covariances(event, rows)
+        residuals = self._innovate(_select(event, known), rows[known], covariances[known])
+        if not known.all():
+            self._initialise(_select(event, ~known), covariances[~known])
+            rows = self.landmarks.indices_of(event.ids)
+            kept = rows >= 0
+            event, rows, covariances = _select(event, kept), rows[kept], covariances[kept]
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows, event.velocities)
-        in_doubt = self._in_doubt(rows) if self.is_mapping else np.zeros(len(rows), np.bool_)
-        seen = Seen(event.stamp_ns, rows, event.points, self._covariances(event, rows))
-        self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
-        self._relocate(_select(event, in_doubt), rows[in_doubt])
+        self._look_back(event, rows, covariances)
         return ids, residuals
 
     def smooth(self) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -264,12 +264,13 @@ class Slam:
         J[3:, :3] = -so3.hat(A[:3, 3])
         return np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
 
-    def _innovate(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    def _innovate(
+        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
+    ) -> FloatArray:
         """Correct the state by m known landmarks; return their residuals (m, 3)."""
         if not len(rows):
             return np.empty((0, 3))
-        self.gains.recall(self.observer, rows)
-        innovation = self._innovation(event, rows)
+        innovation = self._innovation(event, rows, covariances)
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
@@ -283,27 +284,50 @@ class Slam:
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return innovation.r
 
-    def _innovation(self, event: ObservationEvent, rows: IntArray) -> Innovation:
+    def _innovation(
+        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
+    ) -> Innovation:
         e, r = self.observer.errors(rows, event.points)
-        R = self.observer.A[:3, :3]
         since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
-        covariances = R @ self._covariances(event, rows) @ R.T
         return Innovation(
-            rows, e, r, self.observer.a[rows], covariances, (event.stamp_ns - since_ns) * 1e-9
+            rows,
+            e,
+            r,
+            self.observer.a[rows],
+            self._turned(covariances),
+            (event.stamp_ns - since_ns) * 1e-9,
         )
 
+    def _turned(self, covariances: FloatArray) -> FloatArray:
+        """Return covariances (m, 3, 3) from the body frame in the reference frame."""
+        R = self.observer.A[:3, :3]
+        turned: FloatArray = R @ covariances @ R.T
+        return turned
+
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
-        """Return the covariances (m, 3, 3) of observed landmarks, body frame, m².
+        """Return the covariances (m, 3, 3) of observed points, body frame, m².
 
         The noise model is told where a landmark should be, not where it was measured: a landmark
         measured too near would be believed more than one measured too far, and all would be
-        drawn towards the robot. Where it should be is not known of one that is in doubt, or that
-        was seen so seldom that it may itself be an outlier.
+        drawn towards the robot. Where it should be is not known of one that is new (row −1), that
+        is in doubt, or that was seen so seldom that it may itself be an outlier.
         """
-        sure = self.landmarks.counts[rows] >= self.settings.confirmations
-        sure &= ~self._in_doubt(rows)
-        points = np.where(sure[:, None], self.observer.body_points(rows), event.points)
+        sure = rows >= 0
+        sure[sure] = self.landmarks.counts[rows[sure]] >= self.settings.confirmations
+        sure[sure] = ~self._in_doubt(rows[sure])
+        points = event.points.copy()
+        points[sure] = self.observer.body_points(rows[sure])
         return self._noise.observation(replace(event, points=points))
+
+    def _look_back(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
+        """Let the gains look back; start landmarks in doubt anew if that doesn't explain them."""
+        in_doubt = self._in_doubt(rows) & self.is_mapping
+        if in_doubt.any():
+            covariances = self._covariances(event, rows)
+        seen = Seen(event.stamp_ns, rows, event.points, covariances)
+        self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
+        if in_doubt.any():
+            self._relocate(_select(event, in_doubt), rows[in_doubt], covariances[in_doubt])
 
     def _in_doubt(self, rows: IntArray) -> BoolArray:
         """Return which of the landmarks seen (m,) have been rejected too often to be trusted."""
@@ -316,26 +340,19 @@ class Slam:
         in_doubt: BoolArray = rejections >= needed
         return in_doubt
 
-    def _relocate(self, event: ObservationEvent, rows: IntArray) -> None:
+    def _relocate(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Start landmarks anew that are still far from where they were expected."""
-        if not len(rows):
-            return
-        far = (
-            self.gains.distances(self._innovation(event, rows)) > self.settings.rejection_distance
-        )
+        innovation = self._innovation(event, rows, covariances)
+        far = self.gains.distances(innovation) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():
             self.counts['moved_landmark'] += int(np.sum(moved))
             logger.warning('Landmarks %s have moved.', event.ids[moved].tolist())
         if far.any():
-            self._restart(_select(event, far), rows[far])
-
-    def _restart(self, event: ObservationEvent, rows: IntArray) -> None:
-        R = self.observer.A[:3, :3]
-        self.observer.relocate_landmarks(rows, event.points)
-        covariances = R @ self._noise.observation(event) @ R.T
-        self.gains.relocate_landmarks(rows, self.observer.y_ref[rows], covariances)
-        self.landmarks.restart(rows)
+            self.observer.relocate_landmarks(rows[far], event.points[far])
+            y_ref = self.observer.y_ref[rows[far]]
+            self.gains.relocate_landmarks(rows[far], y_ref, innovation.covariances[far])
+            self.landmarks.restart(rows[far])
 
     def _forget_unsupported(self, stamp_ns: int) -> None:
         """Forget landmarks without an id that were seen too seldom, and not lately."""
@@ -362,15 +379,14 @@ class Slam:
         self.counts['unmapped_landmark'] += new - fitting
         return _select(event, np.arange(new) < fitting)
 
-    def _initialise(self, event: ObservationEvent) -> None:
+    def _initialise(self, event: ObservationEvent, covariances: FloatArray) -> None:
         """Add landmarks where they were seen."""
         event = self._make_room(event)
-        if not len(event.ids):
+        m = len(event.ids)
+        if not m:
             return
-        R = self.observer.A[:3, :3]
         self.observer.add_landmarks(event.points)
-        y_ref = self.observer.y_ref[-len(event.ids) :]
-        self.gains.add_landmarks(y_ref, R @ self._noise.observation(event) @ R.T)
+        self.gains.add_landmarks(self.observer.y_ref[-m:], self._turned(covariances[:m]))
         self.landmarks.add(event.ids, event.stamp_ns)
         if self._innovation_ns is None:
             self._innovation_ns = event.stamp_ns
