@@ -152,15 +152,15 @@ class Smoother:
         self._prior_information = _inverse(prior.covariance)
 
     def smooth(self, start: Solution, iterations: int, tolerance: float) -> Step:
-        """Iterate from ``start`` until no unknown moves by more than ``tolerance`` (m, rad).
+        """Iterate from ``start``; return the last step.
 
-        Returns the last step.
+        That is one which moves neither the last pose nor the border by ``tolerance`` (m, rad).
         """
         for _ in range(iterations):
             factors = Factors(self._linearise(start))
             change, border_change = factors.solve()
             step = Step(start, self._moved(start, change, border_change), factors)
-            if max(np.abs(change).max(), np.abs(border_change).max(initial=0.0)) < tolerance:
+            if max(np.abs(change[-1]).max(), np.abs(border_change).max(initial=0.0)) < tolerance:
                 break
             start = step.end
         return step

@@ -46,7 +46,10 @@ from slam_observer_ros.types import FloatArray, IntArray
 logger = logging.getLogger(__name__)
 
 ITERATIONS = 2
-TOLERANCE = 1e-2
+"""Steps of looking back at most; the next time it goes on from where they led."""
+
+TOLERANCE = 2e-2
+"""Change of pose and map, rad and m, below which one step will do."""
 
 
 class RiccatiGains:
