@@ -85,6 +85,22 @@ class Frames:
     information: FloatArray
 
 
+def no_frames(d: int, c: int, k: int) -> Frames:
+    """Return what happened while nothing did; d, c and k as in :class:`Smoother`."""
+    none = np.empty(0, dtype=np.int64)
+    return Frames(
+        motions=np.empty((0, 4, 4)),
+        motion_covariances=np.empty((0, d, d)),
+        sensitivities=np.empty((0, d, c)),
+        calibrations=np.empty((0, c)),
+        frames=none,
+        landmarks=none,
+        points=np.empty((0, 3)),
+        shifts=np.empty((0, 3)),
+        information=np.empty((0, k, k)),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Solution:
     """Estimates in hindsight.

@@ -3,18 +3,44 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.smoothing import Frames, Prior
+from slam_observer_ros.smoothing import Frames, no_frames, Prior
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 ANYWHERE_M = 1e3
 """Standard deviation of a prior that says nothing, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """An observation and the motion that led to it.
+
+    Attributes
+    ----------
+    start, end : FloatArray
+        (4, 4) poses before and after the motion.
+    noise, sensitivity, calibration : FloatArray
+        As :meth:`History.move` is given them, of the whole motion.
+    seen : Seen
+        The observation.
+    shifts : FloatArray
+        (m, 3) how far the landmarks seen had moved by themselves, metres.
+
+    """
+
+    start: FloatArray
+    end: FloatArray
+    noise: FloatArray
+    sensitivity: FloatArray
+    calibration: FloatArray
+    seen: Seen
+    shifts: FloatArray
 
 
 class History:
@@ -41,19 +67,12 @@ class History:
         self.prior = prior
         self.stamps_ns: list[int] = []
         self.poses: list[FloatArray] = [prior.pose]
-        self._starts: list[FloatArray] = []
-        self._ends: list[FloatArray] = []
-        self._noises: list[FloatArray] = []
-        self._sensitivities: list[FloatArray] = []
-        self._calibrations: list[FloatArray] = []
-        self._landmarks: list[IntArray] = []
-        self._points: list[FloatArray] = []
-        self._shifts: list[FloatArray] = []
-        self._information: list[FloatArray] = []
         self._calibration = prior.calibration
         self._start: FloatArray | None = None
         self._end = prior.pose
         self._noise, self._sensitivity = self._at_rest()
+        self._frames = no_frames(len(axes.pose), len(prior.calibration), axes.point)
+        self._new: list[_Frame] = []
 
     def __deepcopy__(self, memo: dict[int, object]) -> History:
         """Return a history that goes its own way from here: no array is ever changed in place."""
@@ -91,28 +110,22 @@ class History:
 
         ``shifts`` (m, 3) is how far the landmarks had moved by themselves, metres.
         """
-        k = self._axes.point
         self.stamps_ns.append(seen.stamp_ns)
         self.poses.append(pose)
-        self._starts.append(self._end if self._start is None else self._start)
-        self._ends.append(self._end)
-        self._noises.append(self._noise)
-        self._sensitivities.append(self._sensitivity)
-        self._calibrations.append(self._calibration)
-        self._landmarks.append(seen.indices)
-        self._points.append(seen.points)
-        self._shifts.append(shifts)
-        information = np.linalg.inv(seen.covariances[:, :k, :k])
-        self._information.append(np.asarray(information, dtype=np.float64))
+        start = self._end if self._start is None else self._start
+        self._new.append(
+            _Frame(
+                start, self._end, self._noise, self._sensitivity, self._calibration, seen, shifts
+            )
+        )
         self._start = None
         self._noise, self._sensitivity = self._at_rest()
 
     def relocate_landmarks(self, indices: IntArray) -> None:
         """Forget all about the landmarks at ``indices`` but their latest observation."""
-        for s in range(len(self._landmarks) - 1):
-            kept = ~np.isin(self._landmarks[s], indices)
-            if not kept.all():
-                self._keep(s, kept)
+        frames = self.frames()
+        latest = frames.frames == len(self.stamps_ns) - 1
+        self._keep(latest | ~np.isin(frames.landmarks, indices))
         known = indices[indices < len(self.prior.points)]
         columns = self._prior_columns(known)
         covariance = self.prior.covariance.copy()
@@ -122,10 +135,10 @@ class History:
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices`` and all observations of them."""
-        for s, landmarks in enumerate(self._landmarks):
-            self._keep(s, ~np.isin(landmarks, indices))
-            rows = self._landmarks[s]
-            self._landmarks[s] = rows - np.searchsorted(np.sort(indices), rows)
+        self._keep(~np.isin(self.frames().landmarks, indices))
+        rows = self._frames.landmarks
+        rows = rows - np.searchsorted(np.sort(indices), rows)
+        self._frames = replace(self._frames, landmarks=rows)
         known = indices[indices < len(self.prior.points)]
         columns = self._prior_columns(known)
         covariance = np.delete(np.delete(self.prior.covariance, columns, 0), columns, 1)
@@ -134,30 +147,48 @@ class History:
 
     def frames(self) -> Frames:
         """Return all frames as arrays."""
-        S, pose, k = len(self.stamps_ns), self._axes.pose, self._axes.point
-        d, c = len(pose), len(self._calibration)
-        back = se3.inverse(np.reshape(self._ends, (S, 4, 4)))
+        if self._new:
+            new = self._as_arrays(self._new, len(self._frames.motions))
+            pairs = [
+                (getattr(self._frames, field.name), getattr(new, field.name))
+                for field in fields(Frames)
+            ]
+            self._frames = Frames(*map(np.concatenate, pairs))
+            self._new = []
+        return self._frames
+
+    def _as_arrays(self, frames: list[_Frame], first: int) -> Frames:
+        """Return frames as arrays; ``first`` is the number of the first one."""
+        pose, k, seen = self._axes.pose, self._axes.point, [frame.seen for frame in frames]
+        back = se3.inverse(np.array([frame.end for frame in frames]))
+        starts = np.array([frame.start for frame in frames])
         to_body = se3.adjoint(back)[:, pose][:, :, pose]
-        counts = [len(landmarks) for landmarks in self._landmarks]
-        none = np.empty(0, dtype=np.int64)
+        noises = np.array([frame.noise for frame in frames])
+        covariances = np.concatenate([part.covariances for part in seen])[:, :k, :k]
+        numbers = np.arange(first, first + len(frames))
         return Frames(
-            se3.inverse(back @ np.reshape(self._starts, (S, 4, 4))),
-            to_body @ np.reshape(self._noises, (S, d, d)) @ so3.transpose(to_body),
-            to_body @ np.reshape(self._sensitivities, (S, d, c)),
-            np.reshape(self._calibrations, (S, c)),
-            np.repeat(np.arange(S), counts),
-            np.concatenate([none, *self._landmarks]),
-            np.concatenate([np.empty((0, 3)), *self._points]),
-            np.concatenate([np.empty((0, 3)), *self._shifts]),
-            np.concatenate([np.empty((0, k, k)), *self._information]),
+            motions=se3.inverse(back @ starts),
+            motion_covariances=to_body @ noises @ so3.transpose(to_body),
+            sensitivities=to_body @ np.array([frame.sensitivity for frame in frames]),
+            calibrations=np.array([frame.calibration for frame in frames]),
+            frames=np.repeat(numbers, [len(part.indices) for part in seen]),
+            landmarks=np.concatenate([part.indices for part in seen]),
+            points=np.concatenate([part.points for part in seen]),
+            shifts=np.concatenate([frame.shifts for frame in frames]),
+            information=np.asarray(np.linalg.inv(covariances)),
         )
 
-    def _keep(self, s: int, kept: BoolArray) -> None:
-        """Keep only some of the points of frame ``s``."""
-        self._landmarks[s] = self._landmarks[s][kept]
-        self._points[s] = self._points[s][kept]
-        self._shifts[s] = self._shifts[s][kept]
-        self._information[s] = self._information[s][kept]
+    def _keep(self, kept: BoolArray) -> None:
+        """Keep only some of the points (M,)."""
+        frames = self._frames
+        self._frames = replace(
+            frames,
+            frames=frames.frames[kept],
+            landmarks=frames.landmarks[kept],
+            points=frames.points[kept],
+            shifts=frames.shifts[kept],
+            information=frames.information[kept],
+        )
 
     def _prior_columns(self, indices: IntArray) -> IntArray:
         k = self._axes.point
