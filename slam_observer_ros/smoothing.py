@@ -242,15 +242,16 @@ class Smoother:
         eta = np.zeros((len(frames.motions), 6))
         off = solution.calibration - frames.calibrations
         eta[:, pose] = (frames.sensitivities @ off[:, :, None])[:, :, 0]
-        step = se3.inverse(solution.poses[:-1]) @ solution.poses[1:]
-        error = se3.log(se3.inverse(frames.motions @ se3.exp(eta)) @ step)
-        J_to = se3.left_jacobian_inverse(-error)
-        J_from = -J_to @ se3.adjoint(se3.inverse(step))
+        back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
+        motions = frames.motions @ se3.exp(eta)
+        error = se3.log(se3.inverse(back @ motions))
+        J_to = self._estimated(se3.left_jacobian_inverse(-error))
+        J_from = -J_to @ self._estimated(se3.adjoint(back))
         F = frames.sensitivities
         if c:
-            J_off = -se3.left_jacobian_inverse(error) @ se3.left_jacobian(-eta)
-            F = J_off[:, pose][:, :, pose] @ F
-        J = np.concatenate([J_from[:, pose][:, :, pose], J_to[:, pose][:, :, pose], F], axis=2)
+            J_off = -J_to @ self._estimated(se3.adjoint(back @ motions) @ se3.left_jacobian(-eta))
+            F = J_off @ F
+        J = np.concatenate([J_from, J_to, F], axis=2)
         H, pull = _normal(J, self._motion_information, error[:, pose])
         equations.diagonal[:-1] += H[:, :d, :d]
         equations.diagonal[1:] += H[:, d : 2 * d, d : 2 * d]
@@ -261,6 +262,11 @@ class Smoother:
         equations.gradient[:-1] += pull[:, :d]
         equations.gradient[1:] += pull[:, d : 2 * d]
         equations.border_gradient[:c] += np.sum(pull[:, 2 * d :], axis=0)
+
+    def _estimated(self, matrices: FloatArray) -> FloatArray:
+        """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""
+        pose = self._axes.pose
+        return matrices[:, pose[:, None], pose]
 
     def _observations(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return the normal equations of R_Âᵀ (p_i − x_Â) − y, with Huber's weight.
