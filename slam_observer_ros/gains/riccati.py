@@ -30,6 +30,7 @@ from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.history import History
+from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import (
     block_diagonal,
@@ -206,7 +207,7 @@ class RiccatiGains:
         passed = weights > 0.0
         PC, CPC = self._project(innovation.select(passed))
         S = with_blocks(CPC, noise[passed] / weights[passed, None, None])
-        K = np.linalg.solve(S, PC.T).T
+        K = solve(S, PC.T).T
         half = K @ (0.5 * S @ K.T - PC.T)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
         return self._as_correction(-K @ r[passed].ravel()), weights

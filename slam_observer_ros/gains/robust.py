@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 
@@ -104,8 +105,8 @@ def _reweighted(
     weights = np.ones(len(r))
     for _ in range(REWEIGHTINGS):
         S = with_blocks(predicted, noise / weights[:, None, None])
-        pull = np.asarray(np.linalg.solve(S, r.ravel()), dtype=np.float64)
-        weights = huber_weights(pull.reshape(r.shape), noise, weights, threshold)
+        pull = solve(S, r.ravel()).reshape(r.shape)
+        weights = huber_weights(pull, noise, weights, threshold)
         if weights.min(initial=1.0) == 1.0:
             break
     return weights
