@@ -117,8 +117,10 @@ def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
         Element of SLAM_n(3).
 
     """
-    J = so3.left_jacobian(Delta[..., :3])
-    return SlamElement(se3.exp(Delta), d @ so3.transpose(J))
+    phi, v = Delta[..., :3], Delta[..., 3:, None]
+    J = so3.left_jacobian(phi)
+    R = np.eye(3) + so3.hat(phi) @ J  # exp φ, as J is the integral of exp(s φ)
+    return SlamElement(se3.pose(R, (J @ v)[..., 0]), d @ so3.transpose(J))
 
 
 def alpha(S: FloatArray, Xi: TotalState) -> TotalState:
