@@ -8,7 +8,7 @@ from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 
-REWEIGHTINGS = 3
+REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
 
 
