@@ -31,7 +31,7 @@ from slam_observer_ros.velocity_history import VelocityHistory
 
 logger = logging.getLogger(__name__)
 
-MAX_PENDING_VELOCITIES = 64
+MAX_PENDING_VELOCITIES = 128
 """Velocities that may wait for an observation before the state is moved on without one."""
 
 
