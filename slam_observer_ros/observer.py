@@ -91,7 +91,9 @@ class Observer:
 
     def body_points(self, indices: IntArray) -> FloatArray:
         """Return where landmarks should be seen, Â⁻¹ (y_i° + â_i) (m, 3), metres, body frame."""
-        return se3.transform(se3.inverse(self.A), self.y_ref[indices] + self.a[indices])
+        arms = self.y_ref[indices] + self.a[indices] - self.A[:3, 3]
+        points: FloatArray = arms @ self.A[:3, :3]
+        return points
 
     def add_landmarks(self, points: FloatArray) -> None:
         """Append landmarks seen for the first time, so that their residual is zero.
