@@ -216,7 +216,8 @@ class Settings:
     )
     hindsight_interval: int = parameter(
         50,
-        'Riccati gains: least observations between looking back over all of them; 0 for never',
+        'Riccati gains: least observations between looking back over all of them, or a tenth of '
+        'these if that is more; 0 for never',
         minimum=0,
     )
     hindsight_turn: float = parameter(

@@ -314,3 +314,19 @@ def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees(
     seen = se3.transform(se3.inverse(turned), np.array([[5.0, 0.0, 0.0]]))
     innovation = slam.innovation(np.array([0]), seen, 1e-4 * np.eye(3)[None])
     assert slam.gains.distances(innovation)[0] == pytest.approx(2.0, abs=0.1)
+
+
+def test_looking_back_waits_until_a_tenth_of_the_history_is_new(monkeypatch):
+    lengths = []
+    linearise = RiccatiGains._linearise_anew
+
+    def noted(gains, observer):
+        lengths.append(len(gains.stamps_ns))
+        linearise(gains, observer)
+
+    monkeypatch.setattr(RiccatiGains, '_linearise_anew', noted)
+    settings = Settings(hindsight_interval=2, hindsight_turn=0.0)
+    estimate(drive(settings, 30.0), settings)
+    new = np.diff(lengths)
+    assert len(new) > 10
+    assert np.all(new >= np.maximum(2, 0.1 * np.array(lengths[1:])))

@@ -46,6 +46,11 @@ from slam_observer_ros.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
+GROWTH = 0.1
+"""Share of the history that is new at least when looking back at all of it; with any less, the
+cost of each observation would grow with the history.
+"""
+
 ITERATIONS = 2
 """Steps of looking back at most; the next time it goes on from where they led."""
 
@@ -291,7 +296,8 @@ class RiccatiGains:
             return
         self._history.see(seen, observer.A, observer.shifts[seen.indices])
         self._observations += 1
-        rested = self._observations >= self._settings.hindsight_interval
+        least = max(self._settings.hindsight_interval, GROWTH * len(self._history.stamps_ns))
+        rested = self._observations >= least
         turned_far = self._turn_squared > self._settings.hindsight_turn**2
         if in_doubt or self._window_is_full or (turned_far and rested):
             self._linearise_anew(observer)
