@@ -25,7 +25,7 @@ from slam_observer_ros.types import FloatArray, IntArray
 MARGIN = 40.0
 """How much more than the cheapest a reading may cost: at odds of e²⁰ it is given up."""
 
-RESOLUTION = 3.0
+RESOLUTION = 2.0
 """Two places are one if the sensor can't tell them apart by this many standard deviations."""
 
 MAX_CANDIDATES = 10

@@ -39,15 +39,6 @@ class Axes:
         C: FloatArray = lever_arms @ self._turns
         return C.reshape(self._shape)
 
-    def turn_matrix(self, arms: FloatArray) -> FloatArray:
-        """Return (m, point, p) blocks [−[d]×, 0]: what ``output_matrix`` gains when points move.
-
-        ``arms`` (m, 3) are how far the points have moved, metres.
-        """
-        C = self.output_matrix(arms)
-        C[:, :, self.pose >= 3] = 0.0
-        return C
-
     def full_pose(self, error: FloatArray) -> FloatArray:
         """Return ε (6,) with zeros on the axes that are not estimated."""
         full = np.zeros(6)
