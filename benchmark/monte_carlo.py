@@ -10,11 +10,11 @@ import numpy as np
 from worlds import drive, Loop, shipped_settings, without_calibration, World
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import (
+from slam_observer_ros.evaluation.consistency import (
     average_nees_band,
     normalised_squared_errors,
-    pose_errors,
 )
+from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.types import FloatArray
 

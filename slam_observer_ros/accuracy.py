@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import logging
 
 from slam_observer_ros.estimates import Hindsight
+from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import (
-    anchored_average_nees,
     landmark_errors,
     trajectory_errors,
     TrajectoryErrors,

@@ -16,7 +16,7 @@ import numpy as np
 
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import ConfigurationError
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import Event, VelocityEvent
 from slam_observer_ros.landmark_map import LandmarkMap

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.evaluation.metrics import ConfigurationError
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,

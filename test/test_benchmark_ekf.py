@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_observer_ros.evaluation.metrics import (
+from slam_observer_ros.evaluation.consistency import (
     average_nees_band,
     normalised_squared_errors,
-    pose_errors,
 )
+from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from strategies import generators, poses
 
-from slam_observer_ros.evaluation import metrics
+from slam_observer_ros.commands.replay_report import Report
+from slam_observer_ros.evaluation import consistency, metrics
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import LandmarkTruth
@@ -100,7 +102,7 @@ def test_configuration_error_is_gauge_free(
 ) -> None:
     truth = random_map(rng)
     points = truth.world_points + rng.normal(0.0, 1.0, (12, 3))
-    here, there = metrics.ConfigurationError(), metrics.ConfigurationError()
+    here, there = ConfigurationError(), ConfigurationError()
     here.add(0, pose, truth.ids, points, true_pose, truth)
     there.add(0, G @ pose, truth.ids, se3.transform(G, points), true_pose, truth)
     assert here.rmse_m is not None
@@ -109,7 +111,7 @@ def test_configuration_error_is_gauge_free(
 
 def test_configuration_error_is_the_rms_over_landmarks_and_then_over_time() -> None:
     truth = LandmarkTruth(np.array([7, 3]), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
-    error = metrics.ConfigurationError()
+    error = ConfigurationError()
     assert error.rmse_m is None
     error.add(5, np.eye(4), np.array([9]), np.zeros((1, 3)), np.eye(4), truth)
     assert error.rmse_m is None
@@ -130,7 +132,7 @@ def random_covariance(rng: np.random.Generator, d: int) -> FloatArray:
 def test_nees_does_not_depend_on_units(rng: np.random.Generator, unit: float) -> None:
     covariance, error = random_covariance(rng, 6), rng.normal(size=6)
     scale = np.array([1.0, 1.0, 1.0, unit, unit, unit])
-    nees, degrees_of_freedom = metrics.normalised_squared_errors(
+    nees, degrees_of_freedom = consistency.normalised_squared_errors(
         scale * error, np.outer(scale, scale) * covariance
     )
     assert nees == pytest.approx(error @ np.linalg.solve(covariance, error), rel=1e-6)
@@ -141,15 +143,15 @@ def test_exactly_known_directions_do_not_count() -> None:
     covariance = np.zeros((6, 6))
     covariance[2:5, 2:5] = random_covariance(np.random.default_rng(0), 3)
     error = np.arange(6.0)
-    nees, degrees_of_freedom = metrics.normalised_squared_errors(error, covariance)
+    nees, degrees_of_freedom = consistency.normalised_squared_errors(error, covariance)
     assert degrees_of_freedom == 3
     assert nees == pytest.approx(error[2:5] @ np.linalg.solve(covariance[2:5, 2:5], error[2:5]))
-    assert metrics.average_nees(error[None], np.zeros((1, 6, 6))) is None
+    assert consistency.average_nees(error[None], np.zeros((1, 6, 6))) is None
 
 
 def test_an_indefinite_covariance_is_refused() -> None:
     with pytest.raises(EvaluationError, match='negative'):
-        metrics.average_nees(np.ones((1, 2)), np.array([[[1.0, 2.0], [2.0, 1.0]]]))
+        consistency.average_nees(np.ones((1, 2)), np.array([[[1.0, 2.0], [2.0, 1.0]]]))
 
 
 @pytest.mark.parametrize(('inflation', 'inside'), [(1.0, True), (0.7, False), (1.4, False)])
@@ -157,15 +159,15 @@ def test_the_band_tells_honest_covariances_from_others(inflation: float, inside:
     rng = np.random.default_rng(5)
     covariance = random_covariance(rng, 6)
     errors = rng.multivariate_normal(np.zeros(6), covariance, size=200)
-    average = metrics.average_nees(errors, np.tile(inflation * covariance, (200, 1, 1)))
-    lower, upper = metrics.average_nees_band(6, runs=200)
+    average = consistency.average_nees(errors, np.tile(inflation * covariance, (200, 1, 1)))
+    lower, upper = consistency.average_nees_band(6, runs=200)
     assert average is not None
     assert (lower < average < upper) is inside
 
 
 def test_the_band_is_that_of_the_chi_square_distribution() -> None:
     # Bar-Shalom's Estimation with Applications to Tracking, 50 runs of 2 degrees of freedom.
-    lower, upper = metrics.average_nees_band(2, runs=50)
+    lower, upper = consistency.average_nees_band(2, runs=50)
     assert (2 * lower, 2 * upper) == pytest.approx((1.5, 2.6), abs=0.02)
 
 
@@ -175,15 +177,15 @@ def test_anchored_nees_ignores_the_worlds_and_starts_at_zero(
 ) -> None:
     estimate, truth = random_pair(rng)
     covariances = np.tile(np.eye(6), (len(STAMPS_NS), 1, 1))
-    here = metrics.anchored_average_nees(estimate, covariances, truth)
-    there = metrics.anchored_average_nees(estimate, covariances, truth.moved(G))
+    here = consistency.anchored_average_nees(estimate, covariances, truth)
+    there = consistency.anchored_average_nees(estimate, covariances, truth.moved(G))
     assert here == pytest.approx(there, rel=1e-6)
-    exact = metrics.anchored_average_nees(truth.moved(G), covariances, truth)
+    exact = consistency.anchored_average_nees(truth.moved(G), covariances, truth)
     assert exact == pytest.approx(0.0, abs=1e-15)
 
 
 def test_a_report_is_one_json_object() -> None:
-    report = metrics.Report(10, 2.0, 0.1, 4, {'not_finite': 1}, ate_rmse_m=0.25)
+    report = Report(10, 2.0, 0.1, 4, {'not_finite': 1}, ate_rmse_m=0.25)
     content = json.loads(report.to_json())
     assert content['dropped'] == {'not_finite': 1}
     assert content['ate_rmse_m'] == 0.25

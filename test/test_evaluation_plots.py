@@ -11,9 +11,11 @@ from matplotlib.image import imread
 import numpy as np
 import pytest
 
-from slam_observer_ros.evaluation import plots
+from slam_observer_ros.evaluation import replay_plots, simulation_plots
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.drawing import BLUE, GREEN, GREY, RED
 from slam_observer_ros.evaluation.errors import EvaluationError
-from slam_observer_ros.evaluation.metrics import ConfigurationError, trajectory_errors
+from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import LandmarkTruth
 from slam_observer_ros.geometry import se3
@@ -48,77 +50,86 @@ def rgb(colour: str) -> int:
 
 def test_lyapunov_function(tmp_path: Path) -> None:
     values = np.append(-0.2 * SECONDS[:-1], -np.inf)
-    path = plots.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, values, slope_per_s=-0.2)
-    assert {rgb(plots.BLUE), rgb(plots.GREY)} <= colours(path)
+    path = simulation_plots.plot_lyapunov(
+        tmp_path / 'lyapunov.png', SECONDS, values, slope_per_s=-0.2
+    )
+    assert {rgb(BLUE), rgb(GREY)} <= colours(path)
 
 
 def test_lyapunov_function_that_is_zero_throughout(tmp_path: Path) -> None:
-    path = plots.plot_lyapunov(tmp_path / 'zero.png', SECONDS, np.full(200, -np.inf), -0.2)
+    path = simulation_plots.plot_lyapunov(
+        tmp_path / 'zero.png', SECONDS, np.full(200, -np.inf), -0.2
+    )
     assert path.stat().st_size > 0
 
 
 def test_configuration(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
     tracks = LANDMARKS + np.exp(-0.3 * SECONDS)[:, None, None]
     tracks[:20, 1] = np.nan
-    path = plots.plot_configuration(tmp_path / 'paths.png', estimate, truth, tracks, LANDMARKS)
-    assert {rgb(plots.BLUE), rgb(plots.RED), rgb(plots.GREEN)} <= colours(path)
+    path = simulation_plots.plot_configuration(
+        tmp_path / 'paths.png', estimate, truth, tracks, LANDMARKS
+    )
+    assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
 
 
 def test_map_with_truth(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
     known = LandmarkTruth(IDS, LANDMARKS)
-    path = plots.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS + 0.2, truth, known)
-    assert {rgb(plots.BLUE), rgb(plots.RED), rgb(plots.GREEN)} <= colours(path)
+    path = replay_plots.plot_map(
+        tmp_path / 'map.png', estimate, IDS, LANDMARKS + 0.2, truth, known
+    )
+    assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
 
 
 def test_map_without_truth(tmp_path: Path, estimate: Trajectory) -> None:
-    path = plots.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS)
-    assert rgb(plots.BLUE) not in colours(path)
-    assert {rgb(plots.RED), rgb(plots.GREEN)} <= colours(path)
+    path = replay_plots.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS)
+    assert rgb(BLUE) not in colours(path)
+    assert {rgb(RED), rgb(GREEN)} <= colours(path)
 
 
 def test_map_of_a_robot_that_saw_and_did_nothing(tmp_path: Path) -> None:
     standing = Trajectory(np.array([0]), np.eye(4)[None])
     empty = np.empty(0, dtype=np.int64), np.empty((0, 3))
-    assert rgb(plots.RED) in colours(plots.plot_map(tmp_path / 'map.png', standing, *empty))
+    assert rgb(RED) in colours(replay_plots.plot_map(tmp_path / 'map.png', standing, *empty))
 
 
 def test_errors(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
     errors = trajectory_errors(estimate, truth)
-    path = plots.plot_errors(tmp_path / 'errors.png', errors)
-    assert rgb(plots.RED) in colours(path)
-    assert rgb(plots.GREEN) not in colours(path)
+    path = replay_plots.plot_errors(tmp_path / 'errors.png', errors)
+    assert rgb(RED) in colours(path)
+    assert rgb(GREEN) not in colours(path)
     configuration = ConfigurationError([0, 10**9], [0.1, 0.2])
     covariances = np.tile(0.01 * np.eye(6), (200, 1, 1))
-    path = plots.plot_errors(tmp_path / 'bands.png', errors, covariances, configuration)
-    assert {rgb(plots.RED), rgb(plots.GREEN)} <= colours(path)
+    path = replay_plots.plot_errors(tmp_path / 'bands.png', errors, covariances, configuration)
+    assert {rgb(RED), rgb(GREEN)} <= colours(path)
 
 
 @pytest.mark.parametrize('dropped', [{}, {'not_finite': 3, 'duplicate': 40}])
 def test_residuals(tmp_path: Path, dropped: dict[str, int]) -> None:
     residuals = np.random.default_rng(0).normal(size=(500, 3))
     stamps_ns = np.arange(500) * 10**8
-    path = plots.plot_residuals(tmp_path / 'residuals.png', stamps_ns, residuals, dropped, 1_000)
-    assert rgb(plots.RED) in colours(path)
-    assert (rgb(plots.BLUE) in colours(path)) is bool(dropped)
+    path = replay_plots.plot_residuals(
+        tmp_path / 'residuals.png', stamps_ns, residuals, dropped, 1_000
+    )
+    assert rgb(RED) in colours(path)
+    assert (rgb(BLUE) in colours(path)) is bool(dropped)
 
 
 def test_residuals_of_a_run_without_any(tmp_path: Path) -> None:
     empty = np.empty(0, dtype=np.int64), np.empty((0, 3))
-    assert plots.plot_residuals(tmp_path / 'none.png', *empty, {}, 0).stat().st_size > 0
+    assert replay_plots.plot_residuals(tmp_path / 'none.png', *empty, {}, 0).stat().st_size > 0
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match='absent'):
-        plots.plot_lyapunov(tmp_path / 'absent' / 'a.png', SECONDS, -SECONDS)
+        simulation_plots.plot_lyapunov(tmp_path / 'absent' / 'a.png', SECONDS, -SECONDS)
 
 
 def test_matplotlibs_settings_and_backend_stay_as_they_were(tmp_path: Path) -> None:
     before = dict(mpl.rcParams)
-    plots.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, -SECONDS)
+    simulation_plots.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, -SECONDS)
     assert dict(mpl.rcParams) == before
-    program = (
-        "import sys, slam_observer_ros.evaluation.plots; print('matplotlib.pyplot' in sys.modules)"
-    )
+    module = 'slam_observer_ros.evaluation.replay_plots'
+    program = f"import sys, {module}; print('matplotlib.pyplot' in sys.modules)"
     result = subprocess.run(
         [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60
     )

@@ -32,7 +32,7 @@ from slam_observer_ros.commands.replay_report import (
     with_hindsight,
 )
 from slam_observer_ros.evaluation.gaps import fill_gaps
-from slam_observer_ros.evaluation.plots import plot_errors, plot_map, plot_residuals
+from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_map, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.map_file import read_map, write_map

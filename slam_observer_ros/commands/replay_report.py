@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+import json
 import logging
 
 from slam_observer_ros.accuracy import Accuracy, measure, measure_hindsight
 from slam_observer_ros.commands.console import print_table
 from slam_observer_ros.estimates import Hindsight
-from slam_observer_ros.evaluation.metrics import Report, TrajectoryErrors
+from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.recording.truth import Truth
@@ -21,6 +22,50 @@ MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a run did and how accurate it was: the object that ``--json`` prints.
+
+    Attributes
+    ----------
+    events : int
+        Events taken in, dropped ones included.
+    duration_s : float
+        Time that the recording spans, seconds.
+    seconds : float
+        Wall time that the run took, seconds.
+    landmarks : int
+        Landmarks in the final map.
+    dropped : dict of str to int
+        Events dropped, by reason.
+    ate_rmse_m, rotation_rmse_rad, heading_rmse_rad : float or None
+        See :class:`.TrajectoryErrors`; None without truth.
+    landmark_rmse_m : float or None
+        See :class:`.LandmarkErrors`; None without truth.
+    configuration_rmse_m : float or None
+        See :class:`.ConfigurationError`; None without truth.
+    anees : float or None
+        Of the pose, per degree of freedom; None without truth or covariance.
+
+    """
+
+    events: int
+    duration_s: float
+    seconds: float
+    landmarks: int
+    dropped: dict[str, int]
+    ate_rmse_m: float | None = None
+    rotation_rmse_rad: float | None = None
+    heading_rmse_rad: float | None = None
+    landmark_rmse_m: float | None = None
+    configuration_rmse_m: float | None = None
+    anees: float | None = None
+
+    def to_json(self) -> str:
+        """Write the report as one JSON object; what was not measured is null."""
+        return json.dumps(asdict(self), allow_nan=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from slam_observer_ros.commands.outputs import (
     filled_directory,
     recording_path,
 )
-from slam_observer_ros.evaluation.plots import plot_configuration, plot_lyapunov
+from slam_observer_ros.evaluation.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.writer import RecordingWriter

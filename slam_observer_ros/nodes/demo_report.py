@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from slam_observer_ros.evaluation.metrics import trajectory_errors
-from slam_observer_ros.evaluation.plots import plot_configuration, plot_lyapunov
+from slam_observer_ros.evaluation.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.nodes.demo_listener import DemoListener
 from slam_observer_ros.simulated_run import fit_slope

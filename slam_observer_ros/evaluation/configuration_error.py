@@ -1,0 +1,86 @@
+"""The error that belongs to the paper's quotient, of the map as the robot sees it."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam_observer_ros.evaluation.metrics import root_mean_square
+from slam_observer_ros.events import is_automatic, LandmarkTruth
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+@dataclass(slots=True)
+class ConfigurationError:
+    """Error on the quotient M_n(3) of the paper: the map as the robot sees it, gauge-free.
+
+    After each observation, the RMS over all landmarks known so far of |P̂⁻¹ p̂_i − P⁻¹ p_i|;
+    over a run, the RMS of that. Where a world frame lies plays no part, so nothing is aligned.
+
+    Attributes
+    ----------
+    stamps_ns : list of int
+        When :meth:`add` found landmarks to compare.
+    values_m : list of float
+        The error at these times, metres.
+
+    """
+
+    stamps_ns: list[int] = field(default_factory=list)
+    values_m: list[float] = field(default_factory=list)
+    _votes: defaultdict[int, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
+
+    def add(
+        self,
+        stamp_ns: int,
+        pose: FloatArray,
+        ids: IntArray,
+        world_points: FloatArray,
+        true_pose: FloatArray,
+        truth: LandmarkTruth,
+    ) -> None:
+        """Take in one configuration, once after each observation.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Time of the observation, nanoseconds.
+        pose : FloatArray
+            (4, 4) estimated pose.
+        ids : IntArray
+            (n,) landmarks known so far; those without truth are passed over. One whose sensor
+            gave no id stands for the true landmark that it was nearest to most often so far, as
+            seen by the robot.
+        world_points : FloatArray
+            (n, 3) their estimated positions in the estimate's world, metres.
+        true_pose : FloatArray
+            (4, 4) true pose at that time.
+        truth : LandmarkTruth
+            True landmark positions at that time.
+
+        """
+        if not len(truth.ids):
+            return
+        seen = se3.transform(se3.inverse(pose), world_points)
+        true_seen = se3.transform(se3.inverse(true_pose), truth.world_points)
+        for row in np.flatnonzero(is_automatic(ids)):
+            nearest = np.argmin(np.linalg.norm(true_seen - seen[row], axis=1))
+            self._votes[int(ids[row])][int(truth.ids[nearest])] += 1
+        true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
+        rows, true_rows = np.nonzero(true_ids[:, None] == truth.ids)
+        if not len(rows):
+            return
+        self.stamps_ns.append(stamp_ns)
+        self.values_m.append(root_mean_square(seen[rows] - true_seen[true_rows]))
+
+    def _true_id(self, landmark_id: int) -> int:
+        votes = self._votes.get(landmark_id)
+        return landmark_id if votes is None else votes.most_common(1)[0][0]
+
+    @property
+    def rmse_m(self) -> float | None:
+        """RMS over the run, metres; None before anything could be compared."""
+        return root_mean_square(np.array(self.values_m)) if self.values_m else None

@@ -1,0 +1,142 @@
+"""Consistency: whether the covariances that are stated match the errors that are made."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.evaluation.metrics import pose_errors
+from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.types import FloatArray, IntArray
+
+_SINGULAR = 1e-12
+"""Eigenvalues of a correlation matrix below this are zero but for rounding."""
+
+
+def normalised_squared_errors(
+    errors: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Compute the NEES εᵀ Σ⁻¹ ε, χ²-distributed where the covariance is honest.
+
+    A direction of no variance is one that is known exactly (roll, pitch and height in planar
+    mode): it is left out, and counts for no degree of freedom.
+
+    Parameters
+    ----------
+    errors : FloatArray
+        (..., d) errors.
+    covariances : FloatArray
+        (..., d, d) their covariances.
+
+    Returns
+    -------
+    nees : FloatArray
+        (...) normalised estimation errors squared.
+    degrees_of_freedom : IntArray
+        (...) number of directions that are not known exactly.
+
+    Raises
+    ------
+    EvaluationError
+        A covariance has a negative eigenvalue.
+
+    """
+    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+    deviations = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    # As correlations, radians and metres are of one size and one threshold serves both.
+    correlations = covariances / (deviations[..., :, None] * deviations[..., None, :])
+    eigenvalues, directions = np.linalg.eigh(correlations)
+    if eigenvalues.min(initial=0.0) < -_SINGULAR:
+        raise EvaluationError('a covariance has a negative eigenvalue')
+    uncertain = eigenvalues > _SINGULAR
+    components = (directions.swapaxes(-1, -2) @ (errors / deviations)[..., None])[..., 0]
+    squares = np.where(uncertain, components**2, 0.0) / np.where(uncertain, eigenvalues, 1.0)
+    return squares.sum(axis=-1), uncertain.sum(axis=-1)
+
+
+def average_nees(errors: FloatArray, covariances: FloatArray) -> float | None:
+    """Compute the ANEES per degree of freedom: 1 where the covariances are honest.
+
+    Parameters
+    ----------
+    errors : FloatArray
+        (..., d) errors of all runs and times.
+    covariances : FloatArray
+        (..., d, d) their covariances.
+
+    Returns
+    -------
+    float or None
+        Sum of the NEES over the sum of the degrees of freedom; above 1 is overconfident, below
+        1 too cautious; None where every component is known exactly.
+
+    """
+    nees, degrees_of_freedom = normalised_squared_errors(errors, covariances)
+    total = int(degrees_of_freedom.sum())
+    return float(nees.sum() / total) if total else None
+
+
+def average_nees_band(
+    degrees_of_freedom: int, runs: int, confidence: float = 0.95
+) -> tuple[float, float]:
+    """Bound the ANEES per degree of freedom of an honest estimator, by the χ² distribution.
+
+    Parameters
+    ----------
+    degrees_of_freedom : int
+        Of one error: 6 for a pose, 3 for a landmark or a planar pose.
+    runs : int
+        Independent runs averaged.
+    confidence : float
+        Probability of lying inside the band.
+
+    Returns
+    -------
+    lower, upper : float
+        The band's limits, each missed with the same probability.
+
+    """
+    total = degrees_of_freedom * runs
+    # chdtri inverts the χ² tail. scipy.stats has it too, but takes a second to import.
+    tail = 0.5 * (1.0 - confidence)
+    return (
+        float(special.chdtri(total, 1.0 - tail) / total),
+        float(special.chdtri(total, tail) / total),
+    )
+
+
+def anchored_average_nees(
+    estimate: Trajectory,
+    covariances: FloatArray,
+    truth: Trajectory,
+    max_gap_ns: int = MAX_GAP_NS,
+) -> float | None:
+    """Compute the pose's ANEES of one run, with the truth moved onto its first estimated pose.
+
+    An estimator declares its first pose certain: that is its gauge. A fit over the whole run
+    would hide errors that its covariance counts.
+
+    Parameters
+    ----------
+    estimate : Trajectory
+        k estimated poses.
+    covariances : FloatArray
+        (k, 6, 6) of world-axes rotation vector and position.
+    truth : Trajectory
+        True poses, at any rate.
+    max_gap_ns : int
+        Longest gap in the truth that is interpolated, nanoseconds.
+
+    Returns
+    -------
+    float or None
+        As :func:`average_nees`; None where the truth covers no pose.
+
+    """
+    paired, true_paired, covered = associate(estimate, truth, max_gap_ns)
+    if len(paired) == 0:
+        return None
+    anchored = true_paired.moved(paired.poses[0] @ se3.inverse(true_paired.poses[0]))
+    return average_nees(pose_errors(paired.poses, anchored.poses), covariances[covered])

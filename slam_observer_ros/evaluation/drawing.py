@@ -1,0 +1,85 @@
+"""How all figures are drawn: their style, and what of it they share.
+
+Figures are drawn without pyplot, so importing these modules or calling them changes neither
+matplotlib's backend nor its settings. Colours are those of Okabe and Ito, told apart by
+colour-blind readers.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+import numpy as np
+
+from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.types import FloatArray, IntArray
+
+BLUE, RED, GREEN, GREY = '#0072B2', '#D55E00', '#009E73', '#7F7F7F'
+
+# The dictionaries are Any: matplotlib's types list the settings of its own version only.
+STYLE: Any = {
+    'figure.constrained_layout.use': True,
+    'savefig.dpi': 150,
+    'font.size': 10,
+    'axes.titlesize': 11,
+    'axes.titleweight': 'bold',
+    'axes.titlelocation': 'left',
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.edgecolor': '#555555',
+    'axes.axisbelow': True,
+    'axes.grid': True,
+    'grid.color': '#DDDDDD',
+    'grid.linewidth': 0.6,
+    'lines.linewidth': 1.4,
+    'lines.solid_joinstyle': 'round',
+    'legend.frameon': False,
+    'legend.fontsize': 9,
+    'agg.path.chunksize': 20_000,
+}
+
+# The true path is wide and pale, so that an estimate that lies on it hides nothing.
+TRUE_PATH: Any = {'color': '#7FB8DA', 'linestyle': '-', 'linewidth': 3.0, 'label': 'true path'}
+TRUE_END: Any = {'color': BLUE, 'marker': '*', 'markersize': 12, 'linestyle': 'none', 'zorder': 4}
+PATH: Any = {'color': RED, 'linestyle': '-.', 'label': 'estimated path'}
+END: Any = {
+    'color': RED, 'marker': 'o', 'markersize': 8, 'markerfacecolor': 'none',
+    'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5,
+}  # fmt: skip
+TRUE_LANDMARKS: Any = {**TRUE_END, 'markersize': 10, 'label': 'true landmarks'}
+TRACKS: Any = {'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2, 'label': 'landmark estimates'}
+LANDMARKS: Any = {**END, 'color': GREEN, 'markersize': 9}
+LEGEND_BELOW: Any = {'loc': 'upper center', 'bbox_to_anchor': (0.5, 0.0), 'ncols': 4}
+LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
+
+_PLANAR_RATIO = 0.01
+"""A scene lower than this part of its width is drawn from above."""
+
+
+def is_flat(points: FloatArray) -> bool:
+    """Return whether points (k, 3) are to be drawn from above."""
+    width, depth, height = np.ptp(points, axis=0)
+    return bool(height <= _PLANAR_RATIO * max(width, depth))
+
+
+def seconds_since(start_ns: int, stamps_ns: IntArray) -> FloatArray:
+    """Return stamps as seconds after the start."""
+    return (stamps_ns - start_ns) / 1e9
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as a PNG file; return its path.
+
+    Raises
+    ------
+    EvaluationError
+        The file can't be written.
+
+    """
+    try:
+        figure.savefig(path, format='png')
+    except OSError as error:
+        raise EvaluationError(f"can't write {path}: {error.strerror}") from error
+    return path
