@@ -130,10 +130,12 @@ class Estimator:
         """
         self._map = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
         self._is_in_map = False
-        if pose is None:
-            self._enter_map()
-        else:
+        if pose is not None:
             self.set_pose(pose, pose_covariance)
+        elif self._slam.is_mapping:
+            self._enter_map()
+        else:  # in a map that does not grow there is nothing to carry into another one
+            self._start(None)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
         """Move the robot as of ``stamp_ns``; the map stays.

@@ -288,6 +288,20 @@ def test_a_map_loaded_while_running_is_merged_with_what_was_mapped(gains):
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.15
 
 
+@pytest.mark.parametrize('mode', MODES)
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_map_may_take_the_place_of_another_one(gains, mode):
+    world = World()
+    estimator = Estimator(world.settings(gains=gains, localization_mode=mode))
+    estimator.load_map(world.map(range(25)))
+    add(estimator, world.drive(0.0, 3.0, count=12))
+    assert estimator.is_localised
+    estimator.load_map(world.map(range(20, 50), sigma_m=0.0))
+    add(estimator, world.drive(3.0, 6.0, count=12))
+    assert estimator.is_localised
+    assert np.linalg.norm(world.error(estimator, 5.9)[3:]) < 0.3
+
+
 def test_counts_of_both_maps_add_up():
     world = World(11)
     estimator = Estimator(world.settings())
