@@ -103,9 +103,9 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     """
     n, axes, observer = len(slam.landmarks), _axes(slam), slam.observer
     k, R = axes.point, observer.reference_pose[:3, :3]
-    joint = slam.gains.joint_covariance(np.arange(n))
-    if slam.landmark_covariances is None or joint is None or n == 0:
+    if not isinstance(slam.gains, RiccatiGains) or n == 0:
         return slam.landmark_covariances
+    joint = slam.gains.joint_covariance(np.arange(n))
     P = joint[len(axes.pose) :, len(axes.pose) :]
     G = axes.output_matrix(observer.y_ref - observer.y_ref.mean(axis=0)).reshape(n * k, -1)
     information = gauge_information(G, P + JITTER_M2 * np.eye(n * k))

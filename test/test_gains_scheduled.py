@@ -53,6 +53,23 @@ def test_work_does_not_depend_on_the_size_of_the_map():
     assert peak_bytes_of_one_cycle(50_000) < 2 * peak_bytes_of_one_cycle(50)
 
 
+def peak_bytes_of_reading_the_map(landmarks):
+    """Most memory that it takes to have a map of n landmarks as it is saved."""
+    estimator = Estimator(Settings(gains='scheduled', reorder_window=0.0, confirmations=1))
+    points = np.random.default_rng(0).normal(scale=20.0, size=(landmarks, 3))
+    estimator.add(ObservationEvent(START_NS, np.arange(landmarks), points))
+    tracemalloc.start()
+    saved = estimator.landmark_map
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(saved.ids) == landmarks
+    return peak
+
+
+def test_a_large_map_can_be_saved():
+    assert peak_bytes_of_reading_the_map(1000) < 1000 * 2000
+
+
 def test_reading_the_map_changes_no_bit_of_it():
     settings = Settings(gains='scheduled', reorder_window=0.0)
     world = drive(settings, 20.0, landmarks=30, seen=3)

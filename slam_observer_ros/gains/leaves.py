@@ -89,6 +89,11 @@ class Leaves:
         """Let the estimate of z be moved by x (q,)."""
         self._x += self._G @ x
 
+    def postponed_shifts(self) -> FloatArray:
+        """Return how far each landmark (n, 3) has yet to be moved, metres."""
+        moved = (self._F @ self._x[self._group][:, :, None]).ravel()
+        return self._axes.full_points(moved) + self._shifts
+
     def now(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return F (m, k, q), N (m, k, k) and how far the landmarks have yet to be moved (m, 3).
 

@@ -156,7 +156,7 @@ class ScheduledGains:
 
     def postponed_shifts(self) -> FloatArray:
         """Return how far each landmark (n, 3) has yet to be moved, metres, reference frame."""
-        return self._leaves.now(np.arange(len(self._leaves)))[2]
+        return self._leaves.postponed_shifts()
 
     def restart(self, observer: Observer) -> None:
         """Do nothing: these gains keep no history."""
