@@ -12,6 +12,9 @@ from slam_observer_ros.velocity_history import HeldVelocities
 RESOLUTION_M = 1e-6
 """Standard deviation that no coordinate of an observed point falls short of, metres."""
 
+RELATIVE_RESOLUTION = 1e-6
+"""The same as a share of the distance, for messages with points in single precision or better."""
+
 LEAST_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
@@ -65,7 +68,11 @@ class NoiseModel:
     def _stated(self, event: ObservationEvent) -> FloatArray:
         """Return the covariances (m, 3, 3) as message or settings have them, m²."""
         if event.covariances is not None:
-            return event.covariances
+            # Else far points that are said to be exact are lost beside an uncertain heading.
+            squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
+            least = RELATIVE_RESOLUTION**2 * squared_m2
+            given: FloatArray = event.covariances + least[:, None, None] * _IDENTITY
+            return given
         s = self._settings
         if s.observation_model == 'cartesian':
             return np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(event.points), 3, 3))

@@ -289,3 +289,20 @@ def test_told_of_a_jump_the_estimator_starts_again_at_once():
     assert len(estimator.landmark_ids) == 0
     assert estimator.stamp_ns is None
     assert estimator.add(velocity(-1e6))
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_far_points_said_to_be_exact_are_taken_after_turning_blindly(gains):
+    estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
+    points = np.random.default_rng(1).uniform(-100.0, 100.0, size=(10, 3))
+    velocity = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])
+    exact = np.zeros((4, 3, 3))
+    for number in range(60):
+        pose = se3.exp(number * velocity)
+        stamp_ns = START_NS + number * 5_000_000_000
+        seen = np.arange(4) + number % 7
+        estimator.add(VelocityEvent(stamp_ns, velocity))
+        body_points = se3.transform(se3.inverse(pose), points[seen])
+        estimator.add(ObservationEvent(stamp_ns, seen, body_points, exact))
+        assert len(estimator.landmark_map.ids) == len(estimator.landmark_ids)
+    np.testing.assert_allclose(estimator.pose, pose, atol=1e-6)
