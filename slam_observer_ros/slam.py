@@ -371,11 +371,12 @@ class Slam:
             return event
         table = self.landmarks
         unseen = np.flatnonzero(table.last_seen_ns < event.stamp_ns)
-        fitting = min(new, limit - len(table) + len(unseen))
+        fitting = min(new, max(limit - len(table) + len(unseen), 0))  # a map may exceed it
         surplus = max(len(table) + fitting - limit, 0)
         order = np.lexsort((table.last_seen_ns[unseen], table.counts[unseen]))
-        self.remove(np.sort(unseen[order[:surplus]]))
-        self.counts['forgotten_landmark'] += surplus
+        forgotten = np.sort(unseen[order[:surplus]])
+        self.remove(forgotten)
+        self.counts['forgotten_landmark'] += len(forgotten)
         self.counts['unmapped_landmark'] += new - fitting
         return _select(event, np.arange(new) < fitting)
 

@@ -302,6 +302,17 @@ def test_a_map_may_take_the_place_of_another_one(gains, mode):
     assert np.linalg.norm(world.error(estimator, 5.9)[3:]) < 0.3
 
 
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_map_larger_than_is_to_be_kept_gives_way_to_what_is_seen(gains):
+    world = World()
+    estimator = Estimator(world.settings(gains=gains, max_landmarks=5))
+    estimator.load_map(world.map(range(12)), world.pose(1.0))
+    add(estimator, [world.see(1.0, range(2, 13))])
+    assert estimator.counts['unmapped_landmark'] == 1
+    assert estimator.counts['forgotten_landmark'] == 2
+    assert_array_equal(estimator.landmark_ids, range(2, 12))
+
+
 def test_counts_of_both_maps_add_up():
     world = World(11)
     estimator = Estimator(world.settings())
