@@ -86,7 +86,11 @@ class Observer:
 
     @property
     def world_points(self) -> FloatArray:
-        """(n, 3) estimated landmarks p̂_i = p_i° + R_P° â_i = P° (y_i° + â_i), metres, world."""
+        """(n, 3) estimated landmarks p̂_i = p_i° + R_P° â_i = P° (y_i° + â_i), metres, world.
+
+        As far as they have been moved: some gains put that off for landmarks out of view, see
+        :attr:`slam_observer_ros.slam.Slam.world_points`.
+        """
         return se3.transform(self.reference_pose, self.y_ref + self.a)
 
     def body_points(self, indices: IntArray) -> FloatArray:

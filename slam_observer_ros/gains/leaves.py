@@ -27,7 +27,9 @@ from slam_observer_ros.geometry import so3
 from slam_observer_ros.types import FloatArray, IntArray
 
 CORE = 0
-"""The group of the landmarks that are in the core: nothing is ever put off for these."""
+"""The group of the landmarks that are in the core. F tells which entries of z they are, and N is
+zero: these never change. Only moves are put off, until the landmark is seen or leaves the core.
+"""
 
 
 class Leaves:
@@ -125,7 +127,7 @@ class Leaves:
         self._sizes[CORE] += len(rows)
         self._group[rows] = CORE
         self._F[rows], self._N[rows], self._shifts[rows] = F, 0.0, 0.0
-        self._x[CORE] *= 1.0 - F.sum(axis=(0, 1))
+        self._x[CORE] *= 1.0 - F.sum(axis=(0, 1))  # no move of their entries is put off by now
 
     def release(self, rows: IntArray) -> None:
         """Let landmarks leave the core; they hang on those entries of z which they were."""

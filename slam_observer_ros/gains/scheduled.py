@@ -37,14 +37,16 @@ from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
-from slam_observer_ros.gains.robust import block_diagonal, huber_weights, mahalanobis
+from slam_observer_ros.gains.robust import (
+    block_diagonal,
+    huber_weights,
+    mahalanobis,
+    REWEIGHTINGS,
+)
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
-
-REWEIGHTINGS = 3
-"""Rounds of reweighted least squares."""
 
 
 class ScheduledGains:
@@ -173,7 +175,7 @@ class ScheduledGains:
         passed = self._distances(innovation, F, N) <= self._settings.rejection_distance
         H = self._output_matrix(innovation.e + innovation.a - innovation.r) - F
         weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
-        for _ in range(REWEIGHTINGS):
+        for _ in range(1 + REWEIGHTINGS):
             noise = R[passed] / weights[passed, None, None]
             gain_k[passed] = np.linalg.inv(N[passed] + noise)
             x = self._core.step(H, gain_k, r)
@@ -227,9 +229,11 @@ class ScheduledGains:
         return full
 
     def _map_variances(self, covariances: FloatArray) -> FloatArray:
+        """Return those (m, k, k) of a map's landmarks, zero if it is taken to be exact."""
         return self._noise(covariances) * (self._settings.localization_mode != 'fixed')
 
     def _noise(self, covariances: FloatArray) -> FloatArray:
+        """Return the part (m, k, k) of covariances (m, 3, 3) on the axes that are estimated."""
         k = self._axes.point
         return covariances[:, :k, :k]
 
