@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator
 import heapq
 from typing import TypeAlias
 
@@ -14,6 +12,9 @@ Key: TypeAlias = tuple[int, bool, bytes]
 
 CONFIRMATIONS = 5
 """How many events in a row must agree before a jump of the clock is believed."""
+
+LEAST_KNOWN = 1024
+"""Events that may be known before those too old to come again are looked for and forgotten."""
 
 
 class EventQueue:
@@ -40,7 +41,7 @@ class EventQueue:
         self._late_limit_ns = late_limit_ns
         self._heap: list[tuple[Key, Event]] = []
         self._known: set[Key] = set()
-        self._given_out: deque[Key] = deque()
+        self._most_known = LEAST_KNOWN
         self._strays = 0
         self.newest_ns: int | None = None
 
@@ -59,24 +60,19 @@ class EventQueue:
             self._insert(event)
         return jumped
 
-    def pop_ready(self) -> Iterator[Event]:
+    def pop_ready(self) -> list[Event]:
         """Give out, in order, the events that have left the window."""
         ready_ns = (self.newest_ns or 0) - self._window_ns
+        ready = []
         while self._heap and self._heap[0][0][0] <= ready_ns:
-            yield self._pop()
-        oldest_ns = ready_ns - self._late_limit_ns
-        while self._given_out and self._given_out[0][0] < oldest_ns:
-            self._known.discard(self._given_out.popleft())
+            ready.append(heapq.heappop(self._heap)[1])
+        return ready
 
-    def pop_all(self) -> Iterator[Event]:
+    def pop_all(self) -> list[Event]:
         """Give out all events that are left, in order."""
-        while self._heap:
-            yield self._pop()
-
-    def _pop(self) -> Event:
-        key, event = heapq.heappop(self._heap)
-        self._given_out.append(key)
-        return event
+        events = [event for _, event in sorted(self._heap)]
+        self._heap.clear()
+        return events
 
     def _insert(self, event: Event) -> None:
         stamp_ns = event.stamp_ns
@@ -90,6 +86,14 @@ class EventQueue:
         heapq.heappush(self._heap, (key, event))
         if self.newest_ns is None or stamp_ns > self.newest_ns:
             self.newest_ns = stamp_ns
+        if len(self._known) > self._most_known:
+            self._forget_old()
+
+    def _forget_old(self) -> None:
+        """Forget events so old that they would be refused as too late; O(1) for each event."""
+        oldest_ns = (self.newest_ns or 0) - self._window_ns - self._late_limit_ns
+        self._known = {key for key in self._known if key[0] >= oldest_ns}
+        self._most_known = max(2 * len(self._known), LEAST_KNOWN)
 
     def _check(self, stamp_ns: int) -> bool:
         """Return whether ``stamp_ns`` confirms a jump; raise if it is the first to claim one."""
