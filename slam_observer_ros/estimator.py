@@ -168,7 +168,6 @@ class Estimator:
         """
         try:
             check_event(event)
-            event = flatten(event) if self.settings.two_d_mode else event
             jumped = self._queue.push(event)
         except InvalidEventError as error:
             self._drop(error)
@@ -270,8 +269,8 @@ class Estimator:
     @property
     def body_velocity(self) -> FloatArray:
         """(6,) velocity (Ω, v) in force at ``stamp_ns``; zero when it has timed out."""
-        event = None if self._stamp_ns is None else self._velocities.latest(self._stamp_ns)
-        return np.zeros(6) if event is None else event.body_velocity
+        velocity = None if self._stamp_ns is None else self._velocities.latest(self._stamp_ns)
+        return np.zeros(6) if velocity is None else velocity
 
     @property
     def velocity_is_stale(self) -> bool:
@@ -347,6 +346,8 @@ class Estimator:
             self._advance(event.stamp_ns)
 
     def _process_observation(self, event: ObservationEvent) -> None:
+        if self.settings.two_d_mode:
+            event = flatten(event)
         self._begin(event.stamp_ns)
         if event.stamp_ns < (self._state_ns or 0):
             event = self._carry_forward(event)
@@ -368,7 +369,9 @@ class Estimator:
             _nanoseconds(self.settings.max_stamp_jump),
             _nanoseconds(self.settings.late_limit),
         )
-        self._velocities = VelocityHistory(_nanoseconds(self.settings.velocity_timeout))
+        self._velocities = VelocityHistory(
+            _nanoseconds(self.settings.velocity_timeout), self.settings.two_d_mode
+        )
         self._state_ns: int | None = None
         self._stamp_ns: int | None = None
 

@@ -108,13 +108,16 @@ def is_automatic(ids: IntArray) -> BoolArray:
     return automatic
 
 
-def flatten(event: Event) -> Event:
-    """Return the event without what leaves the plane z = 0 or turns out of it."""
-    if isinstance(event, VelocityEvent):
-        planar_velocity = event.body_velocity * _PLANAR_VELOCITY
-        return VelocityEvent(event.stamp_ns, planar_velocity, event.covariance)
+def flatten(event: ObservationEvent) -> ObservationEvent:
+    """Return the observation without what leaves the plane z = 0."""
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
     return replace(event, points=event.points * _PLANAR_POINT, velocities=velocities)
+
+
+def flatten_velocities(body_velocities: FloatArray) -> FloatArray:
+    """Return velocities (…, 6) without what leaves the plane z = 0 or turns out of it."""
+    flat: FloatArray = body_velocities * _PLANAR_VELOCITY
+    return flat
 
 
 _PLANAR_VELOCITY = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import flatten_velocities, VelocityEvent
 from slam_observer_ros.types import FloatArray, IntArray
 
 
@@ -41,11 +41,14 @@ class VelocityHistory:
     ----------
     timeout_ns : int
         How long a velocity is held at most, nanoseconds.
+    is_planar : bool
+        Whether what leaves the plane z = 0 or turns out of it does not count.
 
     """
 
-    def __init__(self, timeout_ns: int) -> None:
+    def __init__(self, timeout_ns: int, is_planar: bool = False) -> None:
         self._timeout_ns = timeout_ns
+        self._is_planar = is_planar
         self._stamps_ns: list[int] = []
         self._events: list[VelocityEvent] = []
 
@@ -54,12 +57,12 @@ class VelocityHistory:
         self._stamps_ns.append(event.stamp_ns)
         self._events.append(event)
 
-    def latest(self, stamp_ns: int) -> VelocityEvent | None:
-        """Return the velocity in force at ``stamp_ns``; None if there is none or it timed out."""
+    def latest(self, stamp_ns: int) -> FloatArray | None:
+        """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
         place = bisect_right(self._stamps_ns, stamp_ns) - 1
         if place < 0 or stamp_ns - self._stamps_ns[place] > self._timeout_ns:
             return None
-        return self._events[place]
+        return self._counting(self._events[place].body_velocity)
 
     def count_since(self, stamp_ns: int) -> int:
         """Return how many velocities are newer than ``stamp_ns``."""
@@ -72,11 +75,11 @@ class VelocityHistory:
         events = self._events[max(first, 0) : last]
         if first < 0:
             events.insert(0, VelocityEvent(start_ns - self._timeout_ns, np.zeros(6)))
-        stamps = np.array([*(event.stamp_ns for event in events), end_ns], dtype=np.int64)
+        stamps = np.array([event.stamp_ns for event in events] + [end_ns], dtype=np.int64)
         begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
         stops = np.minimum(np.maximum(stamps[:-1] + self._timeout_ns, begins), ends)
         return HeldVelocities(
-            np.array([event.body_velocity for event in events]).reshape(-1, 6),
+            self._counting(np.array([event.body_velocity for event in events]).reshape(-1, 6)),
             [event.covariance for event in events],
             _seconds(stops - begins),
             _seconds(ends - stops),
@@ -88,6 +91,10 @@ class VelocityHistory:
         if first > len(self._stamps_ns) // 2:
             del self._stamps_ns[:first]
             del self._events[:first]
+
+    def _counting(self, body_velocities: FloatArray) -> FloatArray:
+        """Return what counts of velocities (…, 6): for all of a step at once, which costs less."""
+        return flatten_velocities(body_velocities) if self._is_planar else body_velocities
 
 
 def _seconds(nanoseconds: IntArray) -> FloatArray:

@@ -16,7 +16,7 @@ from slam_observer_ros.evaluation.consistency import (
     normalised_squared_errors,
 )
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import flatten_velocities, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
@@ -48,20 +48,19 @@ def drive(ekf: Any, settings: Settings, noise: float, seed: int = 0) -> FloatArr
     """Feed a run of 6 s to the filter, with ``noise`` times the stated noise; return the pose."""
     rng = np.random.default_rng(seed)
     axes = np.array([1.0, 1.0, 0.0]) if settings.two_d_mode else np.ones(3)
-    velocity = VelocityEvent(0, VELOCITY)
-    velocity = flatten(velocity) if settings.two_d_mode else velocity
+    velocity = flatten_velocities(VELOCITY) if settings.two_d_mode else VELOCITY
     deviation = np.array([*settings.angular_velocity_noise, *settings.linear_velocity_noise])
-    deviation = np.where(velocity.body_velocity == 0.0, 0.0, deviation * RATE_HZ**0.5)
+    deviation = np.where(velocity == 0.0, 0.0, deviation * RATE_HZ**0.5)
     pose = np.eye(4)
     for step in range(60):
         stamp_ns = step * 10**9 // RATE_HZ
         seen = np.arange(3) + step // 10
         points = se3.transform(se3.inverse(pose), LANDMARKS[seen] * axes)
         points = points + noise * settings.point_noise * axes * rng.standard_normal((3, 3))
-        measured = velocity.body_velocity + noise * deviation * rng.standard_normal(6)
+        measured = velocity + noise * deviation * rng.standard_normal(6)
         ekf.add(VelocityEvent(stamp_ns, measured))
         ekf.add(ObservationEvent(stamp_ns, seen, points))
-        last, pose = pose, pose @ se3.exp(velocity.body_velocity / RATE_HZ)
+        last, pose = pose, pose @ se3.exp(velocity / RATE_HZ)
     return last
 
 

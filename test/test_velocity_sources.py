@@ -71,7 +71,7 @@ def test_both_parts_count_if_wheels_and_imu_have_the_same_stamps(is_imu_first):
         history.append(event)
     for number, stamp_ns in enumerate(stamps_ns):
         expected = [0.0, 0.0, -number, number, 0.0, 0.0]
-        assert_array_equal(history.latest(stamp_ns + 1).body_velocity, expected)
+        assert_array_equal(history.latest(stamp_ns + 1), expected)
 
 
 def test_another_clock_is_found_and_corrected_once():
