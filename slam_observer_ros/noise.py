@@ -19,6 +19,7 @@ LEAST_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
 _IDENTITY = np.eye(3)
+_IDENTITY_6 = np.eye(6)
 
 
 class NoiseModel:
@@ -34,9 +35,10 @@ class NoiseModel:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         s = settings
-        self._density = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
+        self._density_squared = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise]) ** 2
         self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
-        self._unknown = np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3)
+        unknown = np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3)
+        self._unknown_squared = unknown**2
 
     def motion(self, held: HeldVelocities) -> FloatArray:
         """Return the covariances (k, 6, 6) of k body-frame motions, rad² and m².
@@ -45,13 +47,12 @@ class NoiseModel:
         proportional to speed, or, where the message has a covariance, independent from one
         message to the next. In a gap the robot may do anything that ``unknown_*_motion`` allows.
         """
-        rates = self._density**2 + (self._scale * held.body_velocities) ** 2
-        variances = rates * held.dt_s[:, None] + self._unknown**2 * held.gap_s[:, None]
-        covariances = variances[:, :, None] * np.eye(6)
+        rates = self._density_squared + (self._scale * held.body_velocities) ** 2
+        in_gaps = self._unknown_squared * held.gap_s[:, None]
+        covariances = (rates * held.dt_s[:, None] + in_gaps)[:, :, None] * _IDENTITY_6
         for i, given in enumerate(held.covariances):
             if given is not None:
-                gap = np.diag(self._unknown**2 * held.gap_s[i])
-                covariances[i] = given * held.dt_s[i] ** 2 + gap
+                covariances[i] = given * held.dt_s[i] ** 2 + np.diag(in_gaps[i])
         return covariances
 
     def observation(self, event: ObservationEvent) -> FloatArray:
@@ -76,25 +77,26 @@ class NoiseModel:
         s = self._settings
         if s.observation_model == 'cartesian':
             return np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(event.points), 3, 3))
-        range_m = np.sqrt(np.einsum('ij,ij->i', event.points, event.points))
+        range_squared = np.einsum('ij,ij->i', event.points, event.points)
         if s.observation_model == 'stereo':
-            along = range_m**2 * s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
-            across = range_m * s.pixel_noise / s.stereo_focal_length
+            parallax = s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
+            along = (range_squared * parallax) ** 2
+            across = range_squared * (s.pixel_noise / s.stereo_focal_length) ** 2
         else:
-            along = np.hypot(s.range_noise, range_m * s.range_scale_noise)
-            across = range_m * s.bearing_noise
-        return _along_and_across(event.points, range_m, along, across)
+            along = s.range_noise**2 + range_squared * s.range_scale_noise**2
+            across = range_squared * s.bearing_noise**2
+        return _along_and_across(event.points, range_squared, along, across)
 
 
 def _along_and_across(
-    points: FloatArray, range_m: FloatArray, along: FloatArray, across: FloatArray
+    points: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
 ) -> FloatArray:
-    """Return covariances (m, 3, 3) with standard deviations along and across the line of sight.
+    """Return covariances (m, 3, 3) with given variances along and across the line of sight.
 
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """
-    across = np.where(range_m > 0.0, across, along)
-    sight: FloatArray = points / np.maximum(range_m, np.finfo(np.float64).tiny)[:, None]
-    outer = sight[:, :, None] * sight[:, None, :]
-    spread = (along**2 - across**2)[:, None, None] * outer
-    return spread + (across**2)[:, None, None] * _IDENTITY
+    across = np.where(range_squared > 0.0, across, along)
+    excess = (along - across) / np.maximum(range_squared, np.finfo(np.float64).tiny)
+    outer = points[:, :, None] * points[:, None, :]
+    spread: FloatArray = excess[:, None, None] * outer
+    return spread + across[:, None, None] * _IDENTITY
