@@ -34,9 +34,9 @@ class Calibration:
         bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
         self._scaled = axes.pose[scale[axes.pose] > 0.0]
         self._biased = axes.pose[bias[axes.pose] > 0.0]
-        self._scale = np.ones(6)
-        self._bias = np.zeros(6)
-        self._calibrated = np.append(self._scaled, self._biased)
+        self._scale_and_bias = np.repeat([1.0, 0.0], 6)
+        self._estimated = np.append(self._scaled, 6 + self._biased)
+        self._calibrated = self._estimated % 6
         self.count = len(self._calibrated)
         errors = np.append(scale[self._scaled], bias[self._biased])
         self.initial_variances = errors**2
@@ -45,11 +45,11 @@ class Calibration:
     @property
     def values(self) -> FloatArray:
         """(c,) estimates: scale factors 1 + s, then biases b."""
-        return np.append(self._scale[self._scaled], self._bias[self._biased])
+        return self._scale_and_bias[self._estimated]
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return (k, 6) velocities (1 + s) ∘ V + b."""
-        return body_velocities * self._scale + self._bias
+        return body_velocities * self._scale_and_bias[:6] + self._scale_and_bias[6:]
 
     def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
         """Return (p, c), how the pose error grows with the errors of s and b over a motion.
@@ -63,6 +63,4 @@ class Calibration:
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
-        split = len(self._scaled)
-        self._scale[self._scaled] += change[:split]
-        self._bias[self._biased] += change[split:]
+        self._scale_and_bias[self._estimated] += change
