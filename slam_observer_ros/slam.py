@@ -312,11 +312,11 @@ class Slam:
         drawn towards the robot. Where it should be is not known of one that is new (row −1), that
         is in doubt, or that was seen so seldom that it may itself be an outlier.
         """
-        sure = rows >= 0
-        sure[sure] = self.landmarks.counts[rows[sure]] >= self.settings.confirmations
-        sure[sure] = ~self._in_doubt(rows[sure])
-        points = event.points.copy()
-        points[sure] = self.observer.body_points(rows[sure])
+        if event.covariances is not None or not len(self.landmarks):
+            return self._noise.observation(event)
+        is_confirmed = self.landmarks.counts[rows] >= self.settings.confirmations
+        is_sure = (rows >= 0) & is_confirmed & ~self._in_doubt(rows)
+        points = np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
         return self._noise.observation(replace(event, points=points))
 
     def _look_back(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
