@@ -45,10 +45,10 @@ def _check_observation(event: ObservationEvent) -> None:
     _check_coordinates('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'{len(event.ids)} ids for {m} landmark points')
-    known = event.ids[event.ids != UNKNOWN_ID]
-    if len(known) and known.min() < 0:
-        raise InvalidEventError('negative_id', f'landmark id {known.min()} is negative')
-    if len(known) > 1 and len(np.unique(known)) != len(known):
+    known = [landmark_id for landmark_id in event.ids.tolist() if landmark_id != UNKNOWN_ID]
+    if known and min(known) < 0:
+        raise InvalidEventError('negative_id', f'landmark id {min(known)} is negative')
+    if len(set(known)) != len(known):
         raise InvalidEventError('repeated_id', 'one observation has the same landmark id twice')
     if event.covariances is not None:
         _check_array('landmark covariances', event.covariances, (m, 3, 3))
