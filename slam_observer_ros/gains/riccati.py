@@ -76,6 +76,7 @@ class RiccatiGains:
         self._first = self._p + self._calibration.count
         self._is_moving = settings.landmark_velocity_error > 0.0
         self._stride = self._axes.point * (2 if self._is_moving else 1)
+        self._first_columns = self._first + np.arange(self._axes.point)
         self._P = initial_covariance(self._axes, self._calibration)
         start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P.copy())
         self._history = History(self._axes, start)
@@ -382,8 +383,7 @@ class RiccatiGains:
 
     def _columns(self, indices: IntArray) -> IntArray:
         """Return the columns of P that belong to landmarks (m,), as (m · point,)."""
-        first = self._first + self._stride * indices[:, None]
-        return (first + np.arange(self._axes.point)).ravel()
+        return (self._first_columns + self._stride * indices[:, None]).ravel()
 
     def _velocity_columns(self, indices: IntArray) -> IntArray:
         """Return those of the landmarks' velocities, none where these are not estimated."""
