@@ -322,11 +322,12 @@ class Slam:
     def _look_back(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them."""
         in_doubt = self._in_doubt(rows) & self.is_mapping
-        if in_doubt.any():
+        some_are = bool(in_doubt.any())
+        if some_are:
             covariances = self._covariances(event, rows)
         seen = Seen(event.stamp_ns, rows, event.points, covariances)
-        self.gains.look_back(self.observer, seen, bool(in_doubt.any()))
-        if in_doubt.any():
+        self.gains.look_back(self.observer, seen, some_are)
+        if some_are:
             self._relocate(_select(event, in_doubt), rows[in_doubt], covariances[in_doubt])
 
     def _in_doubt(self, rows: IntArray) -> BoolArray:
