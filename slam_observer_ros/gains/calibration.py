@@ -24,8 +24,10 @@ class Calibration:
     ----------
     count : int
         c, how many entries of s and b are estimated.
-    initial_variances, drift_variances : FloatArray
-        (c,) variances at the start, and by how much they grow per second.
+    initial_variances : FloatArray
+        (c,) variances at the start.
+    drift_covariance : FloatArray
+        (c, c) by how much their covariance grows per second.
 
     """
 
@@ -34,18 +36,19 @@ class Calibration:
         bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
         self._scaled = axes.pose[scale[axes.pose] > 0.0]
         self._biased = axes.pose[bias[axes.pose] > 0.0]
-        self._scale_and_bias = np.repeat([1.0, 0.0], 6)
+        self._scale_and_bias: FloatArray = np.repeat([1.0, 0.0], 6)
         self._estimated = np.append(self._scaled, 6 + self._biased)
         self._calibrated = self._estimated % 6
         self.count = len(self._calibrated)
         errors = np.append(scale[self._scaled], bias[self._biased])
         self.initial_variances = errors**2
-        self.drift_variances = errors**2 * settings.calibration_drift**2
+        self.drift_covariance = np.diag((errors * settings.calibration_drift) ** 2)
 
     @property
     def values(self) -> FloatArray:
         """(c,) estimates: scale factors 1 + s, then biases b."""
-        return self._scale_and_bias[self._estimated]
+        values: FloatArray = self._scale_and_bias[self._estimated]
+        return values
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return (k, 6) velocities (1 + s) ∘ V + b."""

@@ -42,13 +42,13 @@ def predict(
     c = slice(p, p + calibration.count)
     Ad = se3.adjoint(motion.path[:-1])[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
+    noise: FloatArray = np.sum(Ad @ motion.covariances @ so3.transpose(Ad), axis=0)
     if calibration.count:
         P[:p] += F @ P[c]
-        P[:, :p] += P[:, c] @ F.T
+        P[:p, :p] += P[:p, c] @ F.T
         P[p:, :p] = P[:p, p:].T
-        P[c, c] += np.diag(calibration.drift_variances * np.sum(motion.dt_s))
-    noise: FloatArray = np.sum(Ad @ motion.covariances @ so3.transpose(Ad), axis=0)
-    P[:p, :p] += noise
+        P[c, c] += calibration.drift_covariance * np.sum(motion.dt_s)
+    own = P[:p, :p] + noise
     # No observation takes a skew part away again, so rounding must not add to it.
-    P[:p, :p] = 0.5 * (P[:p, :p] + P[:p, :p].T)
+    P[:p, :p] = 0.5 * (own + own.T)
     return noise, F
