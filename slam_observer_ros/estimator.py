@@ -342,7 +342,8 @@ class Estimator:
         self._velocities.append(event)
         self._begin(event.stamp_ns)
         self._counts['velocity'] += 1
-        if self._velocities.count_since(self._state_ns or 0) >= MAX_PENDING_VELOCITIES:
+        self._pending_velocities += 1
+        if self._pending_velocities >= MAX_PENDING_VELOCITIES:
             self._advance(event.stamp_ns)
 
     def _process_observation(self, event: ObservationEvent) -> None:
@@ -372,6 +373,7 @@ class Estimator:
         self._velocities = VelocityHistory(
             _nanoseconds(self.settings.velocity_timeout), self.settings.two_d_mode
         )
+        self._pending_velocities = 0
         self._state_ns: int | None = None
         self._stamp_ns: int | None = None
 
@@ -435,6 +437,7 @@ class Estimator:
             self._hypotheses.advance(self._velocities.held(start_ns, stamp_ns))
             self._velocities.forget_before(stamp_ns - _nanoseconds(self.settings.late_limit))
         self._state_ns = stamp_ns
+        self._pending_velocities = 0
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -64,10 +64,6 @@ class VelocityHistory:
             return None
         return self._counting(self._events[place].body_velocity)
 
-    def count_since(self, stamp_ns: int) -> int:
-        """Return how many velocities are newer than ``stamp_ns``."""
-        return len(self._stamps_ns) - bisect_right(self._stamps_ns, stamp_ns)
-
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
         first = bisect_right(self._stamps_ns, start_ns) - 1
