@@ -219,7 +219,7 @@ class Observer:
 
 def lyapunov(gain_k: FloatArray | float, r: FloatArray) -> float:
     """Return L = Σ k_i/2 |r_i|² (34) for gains k_i (m,) and residuals ``r`` (m, 3) in metres."""
-    return float(0.5 * np.sum(gain_k * np.sum(r * r, axis=-1)))
+    return float(0.5 * np.vdot(gain_k * r.T, r.T))
 
 
 def lyapunov_rate(gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray) -> float:
