@@ -211,12 +211,13 @@ class RiccatiGains:
         r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
         weights = observation_weights(r, self.foretold(innovation)[1], noise, self._settings)
         passed = weights > 0.0
-        PC, CPC = self._project(innovation.select(passed))
-        S = with_blocks(CPC, noise[passed] / weights[passed, None, None])
+        used = innovation.select(passed)
+        PC, CPC = self._project(used)
+        S = with_blocks(CPC, used.covariances[:, :k, :k] / weights[passed, None, None])
         K = solve(S, PC.T).T
         half = K @ (0.5 * S @ K.T - PC.T)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
-        return self._as_correction(-K @ r[passed].ravel()), weights
+        return self._as_correction(-K @ used.r[:, :k].ravel()), weights
 
     def distances(self, innovation: Innovation) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
