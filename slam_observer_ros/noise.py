@@ -18,6 +18,7 @@ RELATIVE_RESOLUTION = 1e-6
 LEAST_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
+_TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 _IDENTITY_6 = np.eye(6)
 
@@ -35,10 +36,10 @@ class NoiseModel:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         s = settings
-        self._density_squared = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise]) ** 2
-        self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
+        density = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
         unknown = np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3)
-        self._unknown_squared = unknown**2
+        self._density_squared, self._unknown_squared = density**2, unknown**2
+        self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
 
     def motion(self, held: HeldVelocities) -> FloatArray:
         """Return the covariances (k, 6, 6) of k body-frame motions, rad² and m².
@@ -96,7 +97,7 @@ def _along_and_across(
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """
     across = np.where(range_squared > 0.0, across, along)
-    excess = (along - across) / np.maximum(range_squared, np.finfo(np.float64).tiny)
+    excess = (along - across) / np.maximum(range_squared, _TINY)
     outer = points[:, :, None] * points[:, None, :]
     spread: FloatArray = excess[:, None, None] * outer
     return spread + across[:, None, None] * _IDENTITY
