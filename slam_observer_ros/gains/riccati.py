@@ -268,10 +268,9 @@ class RiccatiGains:
         C is (…, j, p), and ``columns`` (…, j) are those of ã in P.
         """
         P, to_pose = self._P[: self._p, : self._p], self._P[columns, : self._p]
-        cross = to_pose @ so3.transpose(C)
         own = self._P[columns[..., :, None], columns[..., None, :]]
-        CPC = C @ P @ so3.transpose(C) - cross - so3.transpose(cross) + own
-        return P @ so3.transpose(C) - so3.transpose(to_pose), CPC
+        PC = P @ so3.transpose(C) - so3.transpose(to_pose)
+        return PC, C @ PC - to_pose @ so3.transpose(C) + own
 
     def settle(self, observer: Observer) -> None:
         """Take the landmarks' estimates for their reference, so that â_i = 0.
