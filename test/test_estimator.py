@@ -71,6 +71,13 @@ def test_first_sight_initialises_a_landmark_from_the_current_pose():
     np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
 
 
+def test_what_leaves_the_plane_does_not_count_in_planar_mode():
+    estimator = run([velocity(0.0), observation(0.5)], two_d_mode=True)
+    np.testing.assert_array_equal(estimator.body_velocity, BODY_VELOCITY * [0, 0, 1, 1, 1, 0])
+    np.testing.assert_array_equal(estimator.pose[2], [0.0, 0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(estimator.world_points[:, 2], np.zeros(5))
+
+
 def test_a_landmark_is_in_the_map_once_it_was_seen_often_enough():
     events = [velocity(0.0), *(observation(0.1 * step, [2]) for step in range(3))]
     assert len(run(events[:3], confirmations=3).landmark_ids) == 0
