@@ -21,15 +21,13 @@ as well; ã_i then grows by ũ_i dt, prediction costs O(n²), and there is no lo
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
-from slam_observer_ros.gains.history import History
+from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import (
@@ -41,21 +39,8 @@ from slam_observer_ros.gains.robust import (
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Prior, Smoother, Solution, Step
+from slam_observer_ros.smoothing import Prior, Solution, Step
 from slam_observer_ros.types import FloatArray, IntArray
-
-logger = logging.getLogger(__name__)
-
-GROWTH = 0.1
-"""Share of the history that is new at least when looking back at all of it; with any less, the
-cost of each observation would grow with the history.
-"""
-
-ITERATIONS = 2
-"""Steps of looking back at most; the next time it goes on from where they led."""
-
-TOLERANCE = 2e-2
-"""Change of pose and map, rad and m, below which one step will do."""
 
 
 class RiccatiGains:
@@ -79,12 +64,11 @@ class RiccatiGains:
         self._first_columns = self._first + np.arange(self._axes.point)
         self._P = initial_covariance(self._axes, self._calibration)
         start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P.copy())
-        self._history = History(self._axes, start)
-        self._observations, self._turn_squared = 0, 0.0
+        self._hindsight = Hindsight(self._axes, settings, start)
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
-        self._settings = settings
+        self._settings = self._hindsight.settings = settings
 
     def calibrated(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (k, 6) with the estimated scale and bias put right."""
@@ -114,7 +98,7 @@ class RiccatiGains:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
         noise, F = predict(self._P, self._axes, self._calibration, motion)
         if self._looks_back:
-            self._history.move(motion.path, noise, F, self._calibration.values)
+            self._hindsight.history.move(motion.path, noise, F, self._calibration.values)
         if self._is_moving:
             everything = np.arange(self._count)
             a, u = self._columns(everything), self._velocity_columns(everything)
@@ -130,7 +114,7 @@ class RiccatiGains:
         self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
     ) -> None:
         """Take landmarks for new ones; what was seen of them before now is forgotten."""
-        self._history.relocate_landmarks(indices)
+        self._hindsight.history.relocate_landmarks(indices)
         self._place(indices, y_ref, covariances)
 
     def _place(self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray) -> None:
@@ -195,7 +179,7 @@ class RiccatiGains:
     def remove_landmarks(self, indices: IntArray) -> None:
         """Delete the rows and columns of the landmarks at ``indices``."""
         columns = np.append(self._columns(indices), self._velocity_columns(indices))
-        self._history.remove_landmarks(indices)
+        self._hindsight.history.remove_landmarks(indices)
         self._P = np.delete(np.delete(self._P, columns, axis=0), columns, axis=1)
 
     def recall(self, observer: Observer, indices: IntArray) -> None:
@@ -289,31 +273,27 @@ class RiccatiGains:
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise all of it anew.
 
-        Covariances that were computed around a poor early estimate stay wrong, so after a long
-        blind stretch a plain filter closes its loop badly. The smoother's marginal becomes the
-        filter's covariance, and its solution the observer's new reference ξ°, with â_i = 0.
+        The smoother's marginal becomes the filter's covariance, and its solution the observer's
+        new reference ξ°, with â_i = 0.
         """
         if not self._looks_back:
             return
-        self._history.see(seen, observer.A, observer.shifts[seen.indices])
-        self._observations += 1
-        least = max(self._settings.hindsight_interval, GROWTH * len(self._history.stamps_ns))
-        rested = self._observations >= least
-        turned_far = self._turn_squared > self._settings.hindsight_turn**2
-        if in_doubt or self._window_is_full or (turned_far and rested):
+        hindsight = self._hindsight
+        hindsight.see(seen, observer.A, observer.shifts[seen.indices])
+        if in_doubt or hindsight.window_is_full or hindsight.is_due:
             self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
-        if self._window_is_full and not in_doubt:
+        if hindsight.window_is_full and not in_doubt:
             self.restart(observer)
 
     def smooth(self, observer: Observer) -> Solution:
         """Return the estimates in hindsight of everything since the history's prior."""
-        return self._smoother().smooth(self._in_hindsight(observer), 50, 1e-6).end
+        return self._hindsight.smooth(self._as_solution(observer))
 
     @property
     def stamps_ns(self) -> list[int]:
         """Stamps of the frames that :meth:`smooth` returns, nanoseconds."""
-        return self._history.stamps_ns
+        return self._hindsight.history.stamps_ns
 
     def restart(self, observer: Observer) -> None:
         """Forget the past: what is known now is all that is known when looking back."""
@@ -322,29 +302,18 @@ class RiccatiGains:
         J[: self._p, : self._p] = se3.adjoint(se3.inverse(observer.A))[np.ix_(pose, pose)]
         points = observer.y_ref + observer.a - observer.shifts
         prior = Prior(observer.A, self._calibration.values, points, J @ self._P @ J.T)
-        self._history = History(self._axes, prior)
-        self._observations, self._turn_squared = 0, 0.0
+        self._hindsight.restart(prior)
 
-    def _smoother(self) -> Smoother:
-        history = self._history
-        return Smoother(self._axes, history.prior, history.frames(), self._settings)
-
-    def _in_hindsight(self, observer: Observer) -> Solution:
+    def _as_solution(self, observer: Observer) -> Solution:
         """Return the estimates as they are, for the smoother to start from."""
         points = observer.y_ref + observer.a - observer.shifts
-        return Solution(np.array(self._history.poses), self._calibration.values, points)
+        poses = np.array(self._hindsight.history.poses)
+        return Solution(poses, self._calibration.values, points)
 
     def _linearise_anew(self, observer: Observer) -> None:
-        smoother = self._smoother()
-        self._observations, self._turn_squared = 0, 0.0
-        try:
-            step = smoother.smooth(self._in_hindsight(observer), ITERATIONS, TOLERANCE)
-            covariance = step.marginal()
-        except np.linalg.LinAlgError:
-            logger.warning('Could not look back: the observations so far leave something open.')
-            return
-        self._rebase(observer, step, covariance)
-        self._history.poses = list(step.end.poses)
+        found = self._hindsight.linearise_anew(self._as_solution(observer))
+        if found is not None:
+            self._rebase(observer, *found)
 
     def _rebase(self, observer: Observer, step: Step, covariance: FloatArray) -> None:
         """Take where all was linearised for the reference; the step from there is a correction.
@@ -365,10 +334,6 @@ class RiccatiGains:
     @property
     def _looks_back(self) -> bool:
         return self._settings.hindsight_interval > 0 and not self._is_moving
-
-    @property
-    def _window_is_full(self) -> bool:
-        return 0 < self._settings.hindsight_window <= len(self._history.stamps_ns)
 
     @property
     def _count(self) -> int:
@@ -395,7 +360,7 @@ class RiccatiGains:
         """Return the group element exp(x); the calibration moves by its own part of x."""
         self._calibration.shift(x[self._p : self._first])
         Delta = self._axes.full_pose(x[: self._p])
-        self._turn_squared += float(Delta[:3] @ Delta[:3])
+        self._hindsight.note_correction(Delta[:3])
         X = slam_group.exp(Delta, self._axes.full_points(x[self._map_columns]))
         if not self._is_moving:
             return Correction(X.A, slice(None), X.a)

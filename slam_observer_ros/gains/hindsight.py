@@ -1,0 +1,111 @@
+"""Looking back: when all that was seen is linearised anew, and what comes of it.
+
+Covariances that were computed around a poor early estimate stay wrong, so after a long blind
+stretch a plain filter closes its loop badly. How much its linearisation can have lost shows in
+how far its corrections have turned the robot.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from slam_observer_ros.axes import Axes
+from slam_observer_ros.gains.base import Seen
+from slam_observer_ros.gains.history import History
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.smoothing import Prior, Smoother, Solution, Step
+from slam_observer_ros.types import FloatArray
+
+logger = logging.getLogger(__name__)
+
+GROWTH = 0.1
+"""Share of the history that is new at least when looking back at all of it; with any less, the
+cost of each observation would grow with the history.
+"""
+
+ITERATIONS = 2
+"""Steps of looking back at most; the next time it goes on from where they led."""
+
+TOLERANCE = 2e-2
+"""Change of pose and map, rad and m, below which one step will do."""
+
+
+class Hindsight:
+    """What was seen since a prior, and whether it is time to look back at it.
+
+    Parameters
+    ----------
+    axes : Axes
+        Which axes are estimated.
+    settings : Settings
+        The settings ``hindsight_*``, and ``huber_threshold``.
+    prior : Prior
+        What was known before.
+
+    Attributes
+    ----------
+    settings : Settings
+        The settings in force.
+    history : History
+        What was seen since the prior.
+
+    """
+
+    def __init__(self, axes: Axes, settings: Settings, prior: Prior) -> None:
+        self.settings = settings
+        self._axes = axes
+        self.restart(prior)
+
+    def restart(self, prior: Prior) -> None:
+        """Forget all but the prior."""
+        self.history = History(self._axes, prior)
+        self._rest()
+
+    def _rest(self) -> None:
+        self._observations, self._turn_squared = 0, 0.0
+
+    @property
+    def window_is_full(self) -> bool:
+        """Whether the history has as many frames as it may have."""
+        return 0 < self.settings.hindsight_window <= len(self.history.stamps_ns)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether corrections have turned far, with enough observations since it last was due."""
+        least = max(self.settings.hindsight_interval, GROWTH * len(self.history.stamps_ns))
+        turned_far = self._turn_squared > self.settings.hindsight_turn**2
+        return turned_far and self._observations >= least
+
+    def note_correction(self, rotation: FloatArray) -> None:
+        """Note a correction that turned the robot by ``rotation`` (3,), rad."""
+        self._turn_squared += float(rotation @ rotation)
+
+    def see(self, seen: Seen, pose: FloatArray, shifts: FloatArray) -> None:
+        """Add a frame to the history; see :meth:`History.see`."""
+        self.history.see(seen, pose, shifts)
+        self._observations += 1
+
+    def linearise_anew(self, start: Solution) -> tuple[Step, FloatArray] | None:
+        """Return the last step from ``start``, and the covariance where all was linearised.
+
+        None, after a warning, if the observations don't determine everything.
+        """
+        self._rest()
+        try:
+            step = self._smoother().smooth(start, ITERATIONS, TOLERANCE)
+            covariance = step.marginal()
+        except np.linalg.LinAlgError:
+            logger.warning('Could not look back: the observations so far leave something open.')
+            return None
+        self.history.poses = list(step.end.poses)
+        return step, covariance
+
+    def smooth(self, start: Solution) -> Solution:
+        """Return the estimates in hindsight, iterated from ``start`` until nothing moves."""
+        return self._smoother().smooth(start, 50, 1e-6).end
+
+    def _smoother(self) -> Smoother:
+        history = self.history
+        return Smoother(self._axes, history.prior, history.frames(), self.settings)
