@@ -48,11 +48,11 @@ def main() -> None:
         )
     chosen = [name for name in worlds.names() if args.only.lower() in name.lower()]
     loops = [] if args.only else list(monte_carlo.LOOPS)
-    runs = QUICK_RUNS if args.quick else RUNS
+    seeds = range(args.seed, args.seed + (QUICK_RUNS if args.quick else RUNS))
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
         tables = run_jobs(pool, list(list_jobs(chosen, QUICK_S if args.quick else None)))
-        consistency = run_monte_carlo(pool, loops, runs)
-    results = report.Results(tables, consistency, runs)
+        consistency = run_monte_carlo(pool, loops, seeds)
+    results = report.Results(tables, consistency, len(seeds))
     sys.stdout.write(report.tables(results))
     if args.json:
         args.json.write_text(json.dumps(report.to_json(results), indent=1) + '\n')
@@ -71,6 +71,9 @@ def parse_arguments() -> argparse.Namespace:
     )
     parser.add_argument(
         '--quick', action='store_true', help='only the first minute and few Monte Carlo runs'
+    )
+    parser.add_argument(
+        '--seed', type=int, default=0, metavar='N', help='seed of the first Monte Carlo run'
     )
     parser.add_argument(
         '--write-docs', action='store_true', help='write docs/benchmark.md and its figure anew'
@@ -104,12 +107,12 @@ def run_jobs(pool: ProcessPoolExecutor, jobs: list[Job]) -> report.Tables:
 
 
 def run_monte_carlo(
-    pool: ProcessPoolExecutor, loops: list[str], runs: int
+    pool: ProcessPoolExecutor, loops: list[str], seeds: range
 ) -> dict[str, dict[str, monte_carlo.Consistency]]:
     """Return loop → estimator → consistency."""
     jobs = [
         SeedJob(loop, estimator, seed)
-        for seed in range(runs)
+        for seed in seeds
         for loop in loops
         for estimator in monte_carlo.ESTIMATORS
     ]
