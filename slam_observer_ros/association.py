@@ -22,8 +22,12 @@ from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
-MARGIN = 40.0
-"""How much more than the cheapest a reading may cost: at odds of e²⁰ it is given up."""
+MARGIN = 35.0
+"""How much more than the cheapest a reading may cost: at odds of e¹⁷ it is given up.
+
+With the default ``rejection_distance`` of 6 a point without a landmark costs 36. With a margin
+above that, each point that clearly is a landmark would be tried without it.
+"""
 
 RESOLUTION = 2.0
 """Two places are one if the sensor can't tell them apart by this many standard deviations."""
