@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 import subprocess
 import sys
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.image import imread
@@ -37,10 +38,14 @@ def estimate(truth: Trajectory) -> Trajectory:
     return Trajectory(truth.stamps_ns, truth.poses @ se3.exp(bias))
 
 
+def pixels_of(path: Path) -> Any:
+    """Return the colours (height, width) of a picture, 0xRRGGBB."""
+    return (imread(path)[..., :3] * 255.0).round().astype(np.int64) @ [1 << 16, 1 << 8, 1]
+
+
 def colours(path: Path) -> set[int]:
     """Colours (0xRRGGBB) that cover a visible part of a picture."""
-    pixels = (imread(path)[..., :3] * 255.0).round().astype(np.int64) @ [1 << 16, 1 << 8, 1]
-    values, counts = np.unique(pixels, return_counts=True)
+    values, counts = np.unique(pixels_of(path), return_counts=True)
     return set(values[counts > 20].tolist())
 
 
@@ -101,6 +106,23 @@ def test_errors(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None
     covariances = np.tile(0.01 * np.eye(6), (200, 1, 1))
     path = replay_plots.plot_errors(tmp_path / 'bands.png', errors, covariances, configuration)
     assert {rgb(RED), rgb(GREEN)} <= colours(path)
+
+
+def test_errors_are_not_joined_across_a_time_without_any(
+    tmp_path: Path, estimate: Trajectory, truth: Trajectory
+) -> None:
+    whole = replay_plots.plot_errors(tmp_path / 'whole.png', trajectory_errors(estimate, truth))
+    ends = np.r_[0:20, 180:200]
+    seen = Trajectory(estimate.stamps_ns[ends], estimate.poses[ends])
+    gap = replay_plots.plot_errors(tmp_path / 'gap.png', trajectory_errors(seen, truth))
+
+    def drawn_in_the_middle(path: Path) -> bool:
+        pixels = pixels_of(path)
+        width = pixels.shape[1]
+        return bool(np.any(pixels[:, width // 2 - 20 : width // 2 + 20] == rgb(RED)))
+
+    assert drawn_in_the_middle(whole)
+    assert not drawn_in_the_middle(gap)
 
 
 @pytest.mark.parametrize('dropped', [{}, {'not_finite': 3, 'duplicate': 40}])

@@ -40,6 +40,9 @@ from slam_observer_ros.types import FloatArray, IntArray
 _MOST_LABELS = 80
 """Maps with more landmarks than this are drawn without ids, which would cover each other."""
 
+_GAP_S = 2.0
+"""Errors further apart than this are not joined: nobody knows what was between them."""
+
 
 @mpl.rc_context(STYLE)
 def plot_map(
@@ -201,7 +204,8 @@ def plot_errors(
     for axes, (name, (column, unit)) in zip(stack, panels.items(), strict=False):
         if deviations is not None:
             _draw_band(axes, times_s, 3.0 * unit * deviations[:, column])
-        axes.plot(times_s, unit * errors.errors[:, column], color=RED, linewidth=1.0)
+        line = _broken_at_gaps(times_s, unit * errors.errors[:, column])
+        axes.plot(*line, color=RED, linewidth=1.0, marker='.', markersize=1.5)
         _centre_on_zero(axes, unit * errors.errors[:, column])
         axes.set_ylabel(name)
         axes.margins(x=0.01)
@@ -217,6 +221,12 @@ def plot_errors(
     stack[-1].set_xlabel('time [s]')
     figure.align_ylabels(stack)
     return save(figure, path)
+
+
+def _broken_at_gaps(times_s: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a line with a break wherever there is nothing to draw for long."""
+    after = np.flatnonzero(np.diff(times_s) > _GAP_S) + 1
+    return np.insert(times_s, after, np.nan), np.insert(errors, after, np.nan)
 
 
 def _deviations(covariances: FloatArray, alignment: FloatArray) -> FloatArray:
