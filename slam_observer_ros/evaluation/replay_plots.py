@@ -43,6 +43,9 @@ _MOST_LABELS = 80
 _GAP_S = 2.0
 """Errors further apart than this are not joined: nobody knows what was between them."""
 
+# With points, so that one error alone between two gaps is seen.
+_LINE: Any = {'linewidth': 0.9, 'marker': '.', 'markersize': 1.0}
+
 
 @mpl.rc_context(STYLE)
 def plot_map(
@@ -204,14 +207,14 @@ def plot_errors(
     for axes, (name, (column, unit)) in zip(stack, panels.items(), strict=False):
         if deviations is not None:
             _draw_band(axes, times_s, 3.0 * unit * deviations[:, column])
-        line = _broken_at_gaps(times_s, unit * errors.errors[:, column])
-        axes.plot(*line, color=RED, linewidth=1.0, marker='.', markersize=1.5)
+        axes.plot(*_broken_at_gaps(times_s, unit * errors.errors[:, column]), color=RED, **_LINE)
         _centre_on_zero(axes, unit * errors.errors[:, column])
         axes.set_ylabel(name)
         axes.margins(x=0.01)
     if configuration is not None:
         times = seconds_since(start_ns, np.array(configuration.stamps_ns, dtype=np.int64))
-        stack[-1].plot(times, configuration.values_m, color=GREEN, linewidth=1.0)
+        values_m = np.array(configuration.values_m)
+        stack[-1].plot(*_broken_at_gaps(times, values_m), color=GREEN, **_LINE)
         stack[-1].set_ylim(bottom=0.0)
         stack[-1].margins(x=0.01)
         stack[-1].set_ylabel('configuration [m]')
