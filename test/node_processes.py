@@ -105,6 +105,8 @@ class Client:
         """Call a service and return its response."""
         client = self.node.create_client(service_class, name)
         self.spin_until(client.service_is_ready, name)
+        # The server may not have heard of its client yet; its response would then be lost.
+        self.spin_for(0.5)
         future = client.call_async(request)
         self.spin_until(future.done, f'response of {name}')
         self.node.destroy_client(client)
