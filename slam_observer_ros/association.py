@@ -15,7 +15,7 @@ import numpy as np
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import block_diagonal, mahalanobis
+from slam_observer_ros.gains.robust import mahalanobis, with_blocks
 from slam_observer_ros.joint_compatibility import columns_of, JointSearch, Pairs
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.observer import Observer
@@ -91,7 +91,7 @@ def find_readings(
     innovation = _as_innovation(observer, rows, points[at], noise[at])
     PC, CPC = gains.foretold(innovation)
     own_noise = innovation.covariances[:, :k, :k]
-    S = CPC + block_diagonal(own_noise)
+    S = with_blocks(CPC, own_noise)
     pairs = Pairs(at, rows, innovation.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
     search = JointSearch(pairs, nearly, gate, 0.0 if nearly.all() else MARGIN)

@@ -174,13 +174,13 @@ class Slam:
         if not isinstance(self.gains, RiccatiGains):
             return [(event, 0.0)]
         self._forget_unsupported(event.stamp_ns)
-        R, ids = self.observer.A[:3, :3], self.landmarks.ids
+        ids = self.landmarks.ids
         found = find_readings(
             self.observer,
             self.gains,
             self._index,
             se3.transform(self.observer.A, event.points),
-            R @ self._noise.observation(event) @ R.T,
+            self._turned(self._noise.observation(event)),
             self.landmarks.indices_of(event.ids),
             self.settings,
         )

@@ -17,6 +17,7 @@ from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Motion
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.leaves import Leaves
+from slam_observer_ros.gains.linear import symmetric
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.types import FloatArray, IntArray
@@ -176,6 +177,4 @@ def _times_inverse(cross: FloatArray, P: FloatArray) -> FloatArray:
 
 def _transformed(P: FloatArray, Phi: FloatArray) -> FloatArray:
     """Return Φ P Φᵀ, symmetric to the bit."""
-    product = Phi @ P @ Phi.T
-    symmetric: FloatArray = 0.5 * (product + product.T)
-    return symmetric
+    return symmetric(Phi @ P @ Phi.T)

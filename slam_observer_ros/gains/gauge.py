@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from slam_observer_ros.gains.linear import symmetric
 from slam_observer_ros.types import FloatArray, IntArray
 
 JITTER_M2 = 1e-12
@@ -61,7 +62,7 @@ def anchor(
     K = _solve(S, PH.T).T
     B = G - K @ J
     after = P - K @ PH.T + B @ np.linalg.solve(information, B.T)
-    return G @ gamma + K @ (r - J @ gamma), 0.5 * (after + after.T)
+    return G @ gamma + K @ (r - J @ gamma), symmetric(after)
 
 
 def _solve(S: FloatArray, right: FloatArray) -> FloatArray:

@@ -93,8 +93,7 @@ class Leaves:
 
     def postponed_shifts(self) -> FloatArray:
         """Return how far each landmark (n, 3) has yet to be moved, metres."""
-        moved = (self._F @ self._x[self._group][:, :, None]).ravel()
-        return self._axes.full_points(moved) + self._shifts
+        return self._followed(self._F, self._group) + self._shifts
 
     def now(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return F (m, k, q), N (m, k, k) and how far the landmarks have yet to be moved (m, 3).
@@ -103,11 +102,15 @@ class Leaves:
         the point has moved. In the core that is seen to when the core moves.
         """
         F, group = self._F[rows], self._group[rows]
-        shifts = self._axes.full_points((F @ self._x[group][:, :, None]).ravel())
+        shifts = self._followed(F, group)
         turns = self._axes.turn_matrix(shifts)
         F[:, :, : len(self._axes.pose)] += turns * (group != CORE)[:, None, None]
         N = self._N[rows] + F @ self._V[group] @ so3.transpose(F)
         return F @ self._G[group], N, shifts + self._shifts[rows]
+
+    def _followed(self, F: FloatArray, group: IntArray) -> FloatArray:
+        """Return F x, how far landmarks of these groups (m,) have to follow the core (m, 3)."""
+        return self._axes.full_points((F @ self._x[group][:, :, None]).ravel())
 
     def update(self, rows: IntArray, F: FloatArray, N: FloatArray) -> None:
         """Take F (m, k, q) and N (m, k, k) for those of landmarks that are where they should be.

@@ -7,6 +7,7 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Motion
 from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.linear import symmetric
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import FloatArray
 
@@ -48,7 +49,6 @@ def predict(
         P[:p, :p] += P[:p, c] @ F.T
         P[p:, :p] = P[:p, p:].T
         P[c, c] += calibration.drift_covariance * np.sum(motion.dt_s)
-    own = P[:p, :p] + noise
     # No observation takes a skew part away again, so rounding must not add to it.
-    P[:p, :p] = 0.5 * (own + own.T)
+    P[:p, :p] = symmetric(P[:p, :p] + noise)
     return noise, F

@@ -37,6 +37,7 @@ from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
+from slam_observer_ros.gains.linear import symmetric
 from slam_observer_ros.gains.robust import (
     block_diagonal,
     huber_weights,
@@ -141,7 +142,7 @@ class ScheduledGains:
         shifts[indices] = x[known].reshape(m, k)
         B, left = regression(P, known, z)
         F[indices] = B.reshape(m, k, q)
-        N[indices] = _symmetric(left.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)])
+        N[indices] = symmetric(left.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)])
         shifts = -self._axes.full_points(shifts.ravel())
         F[:, :, :p] += self._axes.turn_matrix(shifts)
         if self._settings.localization_mode == 'fixed':
@@ -188,7 +189,7 @@ class ScheduledGains:
         shifts = self._axes.full_points((F @ x + N @ pull).ravel())
         F = F + N @ gain_k @ H
         F[:, :, : len(self._axes.pose)] += self._axes.turn_matrix(shifts)
-        N[passed] = _symmetric(N[passed] @ gain_k[passed] @ noise)  # = N − N k N, but positive
+        N[passed] = symmetric(N[passed] @ gain_k[passed] @ noise)  # = N − N k N, but positive
         self._core.shrink(H[passed], gain_k[passed])
         self._leaves.shift(x[:, 0])
         self._leaves.update(rows, F, N)
@@ -245,8 +246,3 @@ class ScheduledGains:
         self._calibration.shift(x[p : p + self._calibration.count])
         D = se3.exp(self._axes.full_pose(x[:p]))
         return Correction(D, rows, shifts + a - se3.rotate(D, a))
-
-
-def _symmetric(P: FloatArray) -> FloatArray:
-    symmetric: FloatArray = 0.5 * (P + so3.transpose(P))
-    return symmetric
