@@ -125,7 +125,7 @@ def shipped_settings(config: str) -> Settings:
 
 
 def without_calibration(settings: Settings) -> Settings:
-    """Return settings that estimate neither scale nor bias of the velocity."""
+    """Return settings that estimate neither scale, bias nor delay of the velocity."""
     zero = (0.0, 0.0, 0.0)
     return replace(
         settings,
@@ -133,6 +133,7 @@ def without_calibration(settings: Settings) -> Settings:
         linear_scale_error=zero,
         angular_bias_error=zero,
         linear_bias_error=zero,
+        velocity_delay_error=0.0,
     )
 
 

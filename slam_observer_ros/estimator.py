@@ -13,6 +13,7 @@ from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.estimates import Hindsight, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
+from slam_observer_ros.gains.calibration import MAX_DELAY_S
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.landmark_map import LandmarkMap
@@ -264,7 +265,7 @@ class Estimator:
         Both along the world's axes, rad² and m². None where the gains know none.
         """
         start_ns, end_ns = self._state_ns or 0, self._stamp_ns or 0
-        return self._slam.pose_covariance(self._velocities.held(start_ns, end_ns))
+        return self._slam.pose_covariance(self._velocities, start_ns, end_ns)
 
     @property
     def body_velocity(self) -> FloatArray:
@@ -412,7 +413,7 @@ class Estimator:
         """Return the body's motion (4, 4), backwards if the end comes first."""
         if end_ns < start_ns:
             return se3.inverse(self._motion(end_ns, start_ns))
-        return self._slam.motion(self._velocities.held(start_ns, end_ns))
+        return self._slam.transition(self._velocities, start_ns, end_ns)
 
     def _carry_forward(self, event: ObservationEvent) -> ObservationEvent:
         """Return what would be seen at the state's stamp: Φ⁻¹ (y + v τ), Φ the motion since."""
@@ -434,8 +435,9 @@ class Estimator:
         """Move the state on to ``stamp_ns`` along the velocities held since."""
         start_ns = stamp_ns if self._state_ns is None else self._state_ns
         if stamp_ns > start_ns:
-            self._hypotheses.advance(self._velocities.held(start_ns, stamp_ns))
-            self._velocities.forget_before(stamp_ns - _nanoseconds(self.settings.late_limit))
+            self._hypotheses.advance(self._velocities, start_ns, stamp_ns)
+            kept_s = self.settings.late_limit + 2.0 * MAX_DELAY_S
+            self._velocities.forget_before(stamp_ns - _nanoseconds(kept_s))
         self._state_ns = stamp_ns
         self._pending_velocities = 0
 

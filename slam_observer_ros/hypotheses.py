@@ -22,7 +22,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray, IntArray
-from slam_observer_ros.velocity_history import HeldVelocities
+from slam_observer_ros.velocity_history import VelocityHistory
 
 
 class Hypotheses:
@@ -57,10 +57,10 @@ class Hypotheses:
         self._states, self._costs = self._states[:1], [0.0]
         return self.best
 
-    def advance(self, held: HeldVelocities) -> None:
-        """Move all states on along ``held``."""
+    def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
+        """Move all states, which are those of ``start_ns``, on to ``end_ns``."""
         for slam in self._states:
-            slam.advance(held)
+            slam.advance(velocities, start_ns, end_ns)
 
     def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the states' instant; return what the best one makes of it.

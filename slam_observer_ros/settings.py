@@ -160,9 +160,17 @@ class Settings:
         unit='m/s',
         minimum=0.0,
     )
+    velocity_delay_error: float = parameter(
+        0.0,
+        'Delay of the motion behind velocities, and of observations, to be estimated: its '
+        'standard deviation',
+        unit='s',
+        minimum=0.0,
+        maximum=1.0,
+    )
     calibration_drift: float = parameter(
         0.0,
-        'How fast estimated scales and biases drift, as a share of their standard deviation',
+        'How fast what is estimated of these drifts, as a share of its standard deviation',
         unit='1/√s',
         minimum=0.0,
     )

@@ -23,7 +23,7 @@ from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.velocity_history import HeldVelocities
+from slam_observer_ros.velocity_history import HeldVelocities, VelocityHistory
 
 logger = logging.getLogger(__name__)
 
@@ -93,13 +93,15 @@ class Slam:
         world: FloatArray = R @ covariances @ R.T
         return world
 
-    def pose_covariance(self, held: HeldVelocities) -> FloatArray | None:
-        """Return the covariance (6, 6) of the pose after ``held``, along the world's axes.
+    def pose_covariance(
+        self, velocities: VelocityHistory, start_ns: int, end_ns: int
+    ) -> FloatArray | None:
+        """Return the covariance (6, 6) that the pose will have at ``end_ns``.
 
-        Of its rotation vector and its position, rad² and m²; the gains know that of ε in
-        Â = exp(ε) A. None where they know none.
+        Of its rotation vector and its position along the world's axes, rad² and m²; the gains
+        know that of ε in Â = exp(ε) A. None where they know none.
         """
-        motion = self._motion(held)
+        motion = self._motion(velocities, start_ns, end_ns)
         covariance = self.gains.pose_covariance_after(motion)
         if covariance is None:
             return None
@@ -135,22 +137,42 @@ class Slam:
         self.settings = settings
         self.gains.change_settings(settings)
 
-    def motion(self, held: HeldVelocities) -> FloatArray:
-        """Return exp(V_1 dt_1) … exp(V_k dt_k) (4, 4), how the body moves along ``held``."""
+    def transition(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> FloatArray:
+        """Return exp(V_1 dt_1) … exp(V_k dt_k) (4, 4), how the body moves between two stamps."""
+        held = self._held(velocities, start_ns, end_ns)
         V = self.gains.calibrated(held.body_velocities)
         return reduce(np.matmul, se3.exp(V * held.dt_s[:, None]), np.eye(4))
 
-    def advance(self, held: HeldVelocities) -> None:
-        """Move the state on along ``held``."""
-        motion = self._motion(held)
+    def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
+        """Move the state, which is that of ``start_ns``, on to ``end_ns``."""
+        motion = self._motion(velocities, start_ns, end_ns)
         self.observer.propagate(motion.path)
-        self.observer.move_landmarks(float(np.sum(held.dt_s + held.gap_s)))
+        self.observer.move_landmarks(float(np.sum(motion.dt_s + motion.gap_s)))
         self.gains.predict(motion)
 
-    def _motion(self, held: HeldVelocities) -> Motion:
+    def _motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
+        held = self._held(velocities, start_ns, end_ns)
         path = self.observer.path(self.gains.calibrated(held.body_velocities), held.dt_s)
         noise = self._noise.motion(held)
-        return Motion(path, held.body_velocities, held.dt_s, held.gap_s, noise)
+        at_ends = self._at_ends(velocities, start_ns, end_ns)
+        return Motion(path, held.body_velocities, held.dt_s, held.gap_s, noise, at_ends)
+
+    def _held(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> HeldVelocities:
+        """Return the velocities that move the robot from one stamp to another."""
+        delay_ns = self.gains.velocity_delay_ns
+        return velocities.held(start_ns - delay_ns, end_ns - delay_ns)
+
+    def _at_ends(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> FloatArray:
+        """Return the mean velocities (2, 6) around both stamps, as far as their delay may reach.
+
+        The velocity at the very stamp would pass its own noise off as a turn to tell time by.
+        """
+        reach_ns = round(self.settings.velocity_delay_error * 1e9)
+        if not reach_ns:
+            return np.zeros((2, 6))
+        at_ns = np.array([start_ns, end_ns]) - self.gains.velocity_delay_ns
+        means = [velocities.mean(t_ns - reach_ns, t_ns + reach_ns) for t_ns in at_ns.tolist()]
+        return np.array(means)
 
     def readings(
         self, event: ObservationEvent, new_ids: IntArray

@@ -81,6 +81,12 @@ class VelocityHistory:
             _seconds(ends - stops),
         )
 
+    def mean(self, start_ns: int, end_ns: int) -> FloatArray:
+        """Return the mean velocity (6,) over an interval; what has timed out counts as zero."""
+        held = self.held(start_ns, end_ns)
+        mean: FloatArray = held.dt_s @ held.body_velocities / ((end_ns - start_ns) * 1e-9)
+        return mean
+
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
         first = bisect_right(self._stamps_ns, stamp_ns) - 1

@@ -24,7 +24,8 @@ class Filter:
         path = self.observer.path(self.gains.calibrated(body_velocities), dt_s)
         self.observer.propagate(path)
         no_gaps = np.zeros(len(dt_s))
-        self.gains.predict(Motion(path, body_velocities, dt_s, no_gaps, covariances))
+        at_ends = np.zeros((2, 6))
+        self.gains.predict(Motion(path, body_velocities, dt_s, no_gaps, covariances, at_ends))
 
     def add(self, points, covariances):
         self.observer.add_landmarks(points)

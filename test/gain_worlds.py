@@ -68,10 +68,12 @@ def drive(
     seen: int = 4,
     scale: FloatArray | float = 1.0,
     bias: FloatArray | float = 0.0,
+    delay_ns: int = 0,
 ) -> World:
     """Drive among landmarks and see the nearest few of them.
 
-    The noise is that of the settings times ``noise``. The sensor reports (V − bias) / scale.
+    The noise is that of the settings times ``noise``. The sensor reports (V − bias) / scale,
+    stamped ``delay_ns`` too early.
     """
     rng = np.random.default_rng(seed)
     planar = settings.two_d_mode
@@ -90,12 +92,13 @@ def drive(
     for k in range(steps + 1):
         stamp_ns = START_NS + k * STEP_NS
         if k < steps:
-            events.append(VelocityEvent(stamp_ns, measured[k]))
+            events.append(VelocityEvent(stamp_ns - delay_ns, measured[k]))
         if k % OBSERVED_EVERY == 0:
             y = se3.transform(se3.inverse(poses[k]), points)
             ids = np.sort(np.argsort(np.linalg.norm(y, axis=1))[:seen])
             event = ObservationEvent(stamp_ns, ids, y[ids])
             events.append(_with_noise(model, event, noise, planar, rng))
+    events.sort(key=lambda event: event.stamp_ns)
     return World(events, poses, points)
 
 

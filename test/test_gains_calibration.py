@@ -1,4 +1,4 @@
-"""Scale and bias of the velocity: found where they are looked for, left alone elsewhere."""
+"""Scale, bias and delay of the velocity: found where looked for, left alone elsewhere."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from strategies import generators
 
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Motion
-from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.calibration import Calibration, MAX_DELAY_S
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings
@@ -22,6 +22,7 @@ EVERYTHING = Settings(
     linear_scale_error=(0.1, 0.1, 0.1),
     angular_bias_error=(0.01, 0.01, 0.01),
     linear_bias_error=(0.1, 0.1, 0.1),
+    velocity_delay_error=0.1,
 )
 
 WHEELS = Settings(
@@ -32,6 +33,8 @@ WHEELS = Settings(
 WHEEL_SCALE = np.array([1.0, 1.0, 0.95, 1.05, 1.0, 1.0])
 
 GYROSCOPE = Settings(angular_bias_error=(0.05, 0.05, 0.05), angular_velocity_noise=(0.01,) * 3)
+DELAY_NS = 150_000_000
+
 GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
 
 
@@ -80,6 +83,49 @@ def test_a_gyroscopes_bias_is_found_within_three_sigma(seed):
     np.testing.assert_array_equal(found[3:], 0.0)
 
 
+@pytest.mark.parametrize('two_d_mode', [False, True])
+@pytest.mark.parametrize('hindsight_interval', [0, 20])
+def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_interval):
+    settings = Settings(
+        two_d_mode=two_d_mode,
+        angular_velocity_noise=(0.005, 0.005, 0.005),
+        velocity_delay_error=0.2,
+        hindsight_interval=hindsight_interval,
+    )
+    normalised_squared = []
+    for seed in range(3):
+        estimator = estimate(drive(settings, 60.0, seed, delay_ns=DELAY_NS), settings)
+        error_s = (estimator._slam.gains.velocity_delay_ns - DELAY_NS) * 1e-9
+        sigma_s = deviations(estimator, 1)[0]
+        normalised_squared.append((error_s / sigma_s) ** 2)
+        assert sigma_s < 0.03
+    assert np.sum(normalised_squared) < chi2.ppf(0.997, len(normalised_squared))
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_a_delay_that_is_made_up_for_does_no_harm(gains):
+    settings = Settings(gains=gains, two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.01))
+    estimating = Settings(**{**vars(settings), 'velocity_delay_error': 0.3})
+
+    def mean_error_m(settings, delay_ns):
+        worlds = [drive(settings, 30.0, seed, seen=2, delay_ns=delay_ns) for seed in range(4)]
+        return np.mean([configuration_error_m(estimate(w, settings), w) for w in worlds])
+
+    in_time = mean_error_m(settings, 0)
+    assert mean_error_m(estimating, 2 * DELAY_NS) < 1.2 * in_time
+    assert mean_error_m(settings, 2 * DELAY_NS) > 1.2 * in_time
+
+
+def test_velocities_that_come_late_need_no_future():
+    calibration = Calibration(Settings(velocity_delay_error=0.1), PLANAR)
+    calibration.shift(np.array([-0.3]))
+    assert calibration.delay_ns == 0
+    calibration.shift(np.array([0.5]))
+    assert calibration.delay_ns == 200_000_000
+    calibration.shift(np.array([5.0]))
+    assert calibration.delay_ns == round(MAX_DELAY_S * 1e9)
+
+
 def test_scheduled_gains_find_them_too():
     settings = with_gains(WHEELS, 'scheduled')
     world = drive(settings, 60.0, scale=WHEEL_SCALE)
@@ -107,9 +153,10 @@ def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
     estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
     V = true_velocities(5, planar=False)
     np.testing.assert_array_equal(estimator._slam.gains.calibrated(V), V)
+    assert estimator._slam.gains.velocity_delay_ns == 0
 
 
-@pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 12), (PLANAR, 6)])
+@pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 13), (PLANAR, 7)])
 def test_only_axes_of_the_motion_are_calibrated(axes, count):
     calibration = Calibration(EVERYTHING, axes)
     assert calibration.count == count
@@ -129,7 +176,9 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
 
     def path(change):
         calibration.shift(change)
-        steps = se3.exp(calibration.apply(V) * dt_s)
+        held_s = np.full(pieces, dt_s)
+        held_s[[0, -1]] += change[-1] * np.array([1.0, -1.0])  # a longer delay: earlier motion
+        steps = se3.exp(calibration.apply(V) * held_s[:, None])
         calibration.shift(-change)
         poses = [start]
         for step in steps:
@@ -137,8 +186,10 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
         return np.array(poses)
 
     nominal = path(np.zeros(calibration.count))
-    motion = Motion(nominal, V, np.full(pieces, dt_s), np.zeros(pieces), np.zeros((pieces, 6, 6)))
-    Ad = se3.adjoint(nominal[:-1])[:, axes.pose]
+    motion = Motion(
+        nominal, V, np.full(pieces, dt_s), np.zeros(pieces), np.zeros((pieces, 6, 6)), V[[0, -1]]
+    )
+    Ad = se3.adjoint(nominal)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
     h = 1e-6
     for column, unit in enumerate(np.eye(calibration.count)):
@@ -160,6 +211,7 @@ def test_drift_lets_the_uncertainty_grow_with_time():
         np.ones(4),
         np.zeros(4),
         np.zeros((4, 6, 6)),
+        np.zeros((2, 6)),
     )
     predict(P, SPATIAL, calibration, still)
     # Four seconds at half the initial standard deviation per √s: σ² (1 + 4 · 0.25).

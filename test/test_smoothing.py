@@ -190,7 +190,8 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
         start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
         history = History(axes, start)
         for a, b in pairwise((0, *cuts, k)):
-            part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], np.zeros(b - a), covariances[a:b])
+            no_gaps, at_ends = np.zeros(b - a), np.zeros((2, 6))
+            part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], no_gaps, covariances[a:b], at_ends)
             P = initial_covariance(axes, calibration)
             history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
         nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))

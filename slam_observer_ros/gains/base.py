@@ -26,6 +26,9 @@ class Motion:
         (k,) seconds after each piece during which no velocity was known.
     covariances : FloatArray
         (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
+    at_ends : FloatArray
+        (2, 6) measured velocities around the start and the end, rad/s and m/s; zero where nobody
+        asks when exactly these were.
 
     """
 
@@ -34,6 +37,7 @@ class Motion:
     dt_s: FloatArray
     gap_s: FloatArray
     covariances: FloatArray
+    at_ends: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +160,10 @@ class GainDesign(Protocol):
 
     def calibrated(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (k, 6) with what is known of their scale and bias put right."""
+
+    @property
+    def velocity_delay_ns(self) -> int:
+        """How much later than its stamp a velocity shows in what is observed, nanoseconds."""
 
     def recall(self, observer: Observer, indices: IntArray) -> None:
         """Move landmarks (m,) that are about to be used, where the design had put that off."""

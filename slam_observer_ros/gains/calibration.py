@@ -1,4 +1,8 @@
-"""Scale and bias of the velocity as part of the state: V_true = (1 + s) ∘ V + b, by axis."""
+"""Calibration of the velocity as part of the state: V_true(t) = (1 + s) ∘ V(t − τ) + b, by axis.
+
+The delay τ is how much later than its stamp a velocity shows in what is observed: a command takes
+a while to be obeyed, and an image a while to be stamped.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,17 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Motion
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.types import FloatArray, IntArray
+
+MAX_DELAY_S = 1.0
+"""Delay that is made up for at most, seconds; for so long velocities are kept."""
+
+DELAY = 12
+"""Place of τ behind six scales and six biases."""
 
 
 class Calibration:
-    """Estimates of the scale s and the bias b, on the axes whose uncertainty is not zero.
+    """Estimates of scale s, bias b and delay τ: of those whose uncertainty is not zero.
 
     Parameters
     ----------
@@ -23,7 +33,7 @@ class Calibration:
     Attributes
     ----------
     count : int
-        c, how many entries of s and b are estimated.
+        c, how many entries of s, b and τ are estimated.
     initial_variances : FloatArray
         (c,) variances at the start.
     drift_covariance : FloatArray
@@ -34,36 +44,47 @@ class Calibration:
     def __init__(self, settings: Settings, axes: Axes) -> None:
         scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
         bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
+        errors = np.concatenate([scale, bias, [settings.velocity_delay_error]])
         self._scaled = axes.pose[scale[axes.pose] > 0.0]
         self._biased = axes.pose[bias[axes.pose] > 0.0]
-        self._scale_and_bias: FloatArray = np.repeat([1.0, 0.0], 6)
-        self._estimated = np.append(self._scaled, 6 + self._biased)
-        self._calibrated = self._estimated % 6
-        self.count = len(self._calibrated)
-        errors = np.append(scale[self._scaled], bias[self._biased])
-        self.initial_variances = errors**2
-        self.drift_covariance = np.diag((errors * settings.calibration_drift) ** 2)
+        self._is_delayed = settings.velocity_delay_error > 0.0
+        self._all: FloatArray = np.repeat([1.0, 0.0], [6, 7])
+        estimated = np.concatenate([self._scaled, 6 + self._biased, [DELAY] * self._is_delayed])
+        self._estimated: IntArray = estimated.astype(np.int64)
+        self.count = len(self._estimated)
+        self.initial_variances = errors[self._estimated] ** 2
+        self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
 
     @property
     def values(self) -> FloatArray:
-        """(c,) estimates: scale factors 1 + s, then biases b."""
-        values: FloatArray = self._scale_and_bias[self._estimated]
+        """(c,) estimates: scale factors 1 + s, then biases b, then the delay τ in seconds."""
+        values: FloatArray = self._all[self._estimated]
         return values
+
+    @property
+    def delay_ns(self) -> int:
+        """Delay τ that is made up for, nanoseconds: a negative one would need the future."""
+        return round(min(max(float(self._all[DELAY]), 0.0), MAX_DELAY_S) * 1e9)
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return (k, 6) velocities (1 + s) ∘ V + b."""
-        return body_velocities * self._scale_and_bias[:6] + self._scale_and_bias[6:]
+        return body_velocities * self._all[:6] + self._all[6:DELAY]
 
     def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
-        """Return (p, c), how the pose error grows with the errors of s and b over a motion.
+        """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
 
-        From ε' = Ad_Â (V ∘ s̃ + b̃); ``Ad`` (k, p, 6) holds the estimated rows of Ad_Â.
+        From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, which lets the motion
+        begin and end earlier by τ̃. ``Ad`` (k + 1, p, 6) holds the estimated rows of Ad_Â.
         """
-        rates = motion.measured_velocities[:, self._calibrated]
+        axes = np.append(self._scaled, self._biased)
+        rates = motion.measured_velocities[:, axes]
         rates[:, len(self._scaled) :] = 1.0
-        F: FloatArray = np.einsum('kij,kj,k->ij', Ad[:, :, self._calibrated], rates, motion.dt_s)
-        return F
+        F: FloatArray = np.einsum('kij,kj,k->ij', Ad[:-1, :, axes], rates, motion.dt_s)
+        if not self._is_delayed:
+            return F
+        first, last = self.apply(motion.at_ends)
+        return np.column_stack([F, Ad[0] @ first - Ad[-1] @ last])
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
-        self._scale_and_bias[self._estimated] += change
+        self._all[self._estimated] += change

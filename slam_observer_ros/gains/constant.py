@@ -94,6 +94,11 @@ class ConstantGains:
         """Return the velocities as they are."""
         return body_velocities
 
+    @property
+    def velocity_delay_ns(self) -> int:
+        """Zero: these gains don't estimate it."""
+        return 0
+
     def recall(self, observer: Observer, indices: IntArray) -> None:
         """Do nothing: these gains put nothing off."""
 

@@ -41,9 +41,10 @@ def predict(
     """
     p = len(axes.pose)
     c = slice(p, p + calibration.count)
-    Ad = se3.adjoint(motion.path[:-1])[:, axes.pose]
+    Ad = se3.adjoint(motion.path)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
-    noise: FloatArray = np.sum(Ad @ motion.covariances @ so3.transpose(Ad), axis=0)
+    turned = Ad[:-1] @ motion.covariances @ so3.transpose(Ad[:-1])
+    noise: FloatArray = np.sum(turned, axis=0)
     if calibration.count:
         P[:p] += F @ P[c]
         P[:p, :p] += P[:p, c] @ F.T

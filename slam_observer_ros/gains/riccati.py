@@ -75,6 +75,11 @@ class RiccatiGains:
         return self._calibration.apply(body_velocities)
 
     @property
+    def velocity_delay_ns(self) -> int:
+        """How much later than its stamp a velocity shows in what is observed, nanoseconds."""
+        return self._calibration.delay_ns
+
+    @property
     def pose_covariance(self) -> FloatArray:
         """(6, 6) covariance of the pose error ε; zero on axes that are not estimated."""
         return self._axes.full_pose_covariance(self._P[: self._p, : self._p])

@@ -78,6 +78,11 @@ class ScheduledGains:
         """Return velocities (k, 6) with the estimated scale and bias put right."""
         return self._calibration.apply(body_velocities)
 
+    @property
+    def velocity_delay_ns(self) -> int:
+        """How much later than its stamp a velocity shows in what is observed, nanoseconds."""
+        return self._calibration.delay_ns
+
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the core's covariance."""
         self._core.predict(motion)
