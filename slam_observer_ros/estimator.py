@@ -254,7 +254,7 @@ class Estimator:
 
     def pose_at(self, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) at any time: the state, moved on by the velocities since."""
-        if self._state_ns is None:
+        if self._state_ns is None or stamp_ns == self._state_ns:
             return self._slam.observer.pose
         return self._slam.observer.pose @ self._motion(self._state_ns, stamp_ns)
 

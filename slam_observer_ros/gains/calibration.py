@@ -47,6 +47,7 @@ class Calibration:
         errors = np.concatenate([scale, bias, [settings.velocity_delay_error]])
         self._scaled = axes.pose[scale[axes.pose] > 0.0]
         self._biased = axes.pose[bias[axes.pose] > 0.0]
+        self._calibrated = np.append(self._scaled, self._biased)
         self._is_delayed = settings.velocity_delay_error > 0.0
         self._all: FloatArray = np.repeat([1.0, 0.0], [6, 7])
         estimated = np.concatenate([self._scaled, 6 + self._biased, [DELAY] * self._is_delayed])
@@ -76,10 +77,9 @@ class Calibration:
         From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, which lets the motion
         begin and end earlier by τ̃. ``Ad`` (k + 1, p, 6) holds the estimated rows of Ad_Â.
         """
-        axes = np.append(self._scaled, self._biased)
-        rates = motion.measured_velocities[:, axes]
+        rates = motion.measured_velocities[:, self._calibrated]
         rates[:, len(self._scaled) :] = 1.0
-        F: FloatArray = np.einsum('kij,kj,k->ij', Ad[:-1, :, axes], rates, motion.dt_s)
+        F: FloatArray = np.einsum('kij,kj,k->ij', Ad[:-1, :, self._calibrated], rates, motion.dt_s)
         if not self._is_delayed:
             return F
         first, last = self.apply(motion.at_ends)
