@@ -64,7 +64,8 @@ OUTPUTS = {
     'lyapunov': 'the Lyapunov value L (34) of the last observation',
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
     'else `map_frame` → `base_frame`',
-    '/diagnostics': 'rates, ages, what was used, what was dropped and why',
+    '/diagnostics': 'rates, ages, what was used, what was dropped and why, '
+    'and how the velocity is calibrated',
 }
 
 SERVICES = {

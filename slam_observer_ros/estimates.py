@@ -34,6 +34,32 @@ class Update:
 
 
 @dataclass(frozen=True, slots=True)
+class CalibrationEstimate:
+    """What was found out about one property of the velocity.
+
+    Attributes
+    ----------
+    name : str
+        Which: ``angular_scale_z``, ``linear_bias_x``, ``velocity_delay`` and so on.
+    value, deviation : float
+        Estimate and its standard deviation; of a scale, the factor that the velocity is
+        multiplied by.
+    unit : str
+        Unit of both; '' for a factor.
+
+    """
+
+    name: str
+    value: float
+    deviation: float
+    unit: str
+
+    def __str__(self) -> str:
+        """Write it with its uncertainty."""
+        return f'{self.value:.3f} ± {self.deviation:.3f} {self.unit}'.rstrip()
+
+
+@dataclass(frozen=True, slots=True)
 class Hindsight:
     """Trajectory and map, each pose estimated from all that was seen before and after.
 

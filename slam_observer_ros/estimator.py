@@ -10,7 +10,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.estimates import Hindsight, Update
+from slam_observer_ros.estimates import CalibrationEstimate, Hindsight, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.calibration import MAX_DELAY_S
@@ -304,6 +304,11 @@ class Estimator:
         """(n, 3) velocities of landmarks that move, known or estimated, m/s, world."""
         observer = self._slam.observer
         return se3.rotate(observer.reference_pose, observer.u[self._slam.confirmed])
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """Scale, bias and delay of the velocity, those that the settings ask for."""
+        return self._slam.gains.calibration
 
     @property
     def last_update(self) -> Update | None:

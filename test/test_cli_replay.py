@@ -16,7 +16,7 @@ from slam_observer_ros.recording.writer import RecordingWriter
 REPORT_KEYS = {
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
     'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
-    'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m',
+    'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',
 }  # fmt: skip
 
 
@@ -101,6 +101,24 @@ class TestReport:
         output = slam_observer.succeed('replay', simulated).output
         for text in ('/twist', '/landmarks', '502 over 5.0 s', '(ATE)', 'not aligned'):
             assert text in output
+
+    def test_the_velocitys_calibration_is_told_with_its_uncertainty(
+        self, slam_observer, simulated
+    ):
+        options = ('--set', 'velocity_delay_error=0.1', '--set', 'angular_bias_error=[0, 0, 0.1]')
+        ended = slam_observer.succeed('replay', simulated, *options, '--json')
+        calibration = ended.json['calibration']
+        assert set(calibration) == {'angular_bias_z', 'velocity_delay'}
+        for part, limit in (('angular_bias_z', 0.1), ('velocity_delay', 0.1)):
+            assert abs(calibration[part]['value']) < 3.0 * calibration[part]['deviation']
+            assert 0.0 < calibration[part]['deviation'] < limit
+        assert calibration['angular_bias_z']['unit'] == 'rad/s'
+        output = slam_observer.succeed('replay', simulated, *options).output
+        assert 'velocity_delay' in output
+        assert '±' in output
+
+    def test_without_an_unknown_calibration_none_is_told(self, slam_observer, simulated):
+        assert slam_observer.succeed('replay', simulated, '--json').json['calibration'] == {}
 
 
 class TestOutputs:

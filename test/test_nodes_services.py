@@ -136,10 +136,13 @@ def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
         ros.spin_until(lambda: ids(maps) == [0, 1, 2, 3], 'it again')
 
 
+DELAYED = ('-p', 'velocity_delay_error:=0.1')
+
+
 def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
     diagnostics = Diagnostics(ros, '/watched')
     with (
-        running('observer_node', tmp_path / 'log', '-r', '__ns:=/watched'),
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/watched', *DELAYED),
         Robot(ros, namespace='/watched') as robot,
     ):
         robot.run(Scenario(velocity_rate=40.0, observation_rate=20.0, duration=3.0))
@@ -150,6 +153,7 @@ def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
         assert values['landmarks known'] == values['known landmarks seen last'] == '4'
         assert float(values['processing time, mean [ms]']) > 0.0
         assert int(values['used: observation']) > 5
+        assert values['calibration: velocity_delay'].endswith(' s')
         now_ns = time.time_ns()
         bad = VelocityEvent(now_ns, np.full(6, np.nan))
         diagnostics.wait(

@@ -128,7 +128,9 @@ def with_hindsight(outcome: Outcome) -> Outcome:
 
 def as_json(outcome: Outcome) -> dict[str, object]:
     """Return the figures as ``--json`` prints them."""
+    calibration = outcome.result.estimator.calibration
     return dataclasses.asdict(outcome.report) | {
+        'calibration': {part.name: asdict(part) for part in calibration},
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
         'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
         'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,
@@ -152,6 +154,7 @@ def print_summary(args: argparse.Namespace, selected: SelectedTopics, outcome: O
         'landmarks': str(report.landmarks),
         'dropped': ', '.join(f'{n} {reason}' for reason, n in report.dropped.items()) or 'none',
     }
+    rows |= {part.name: str(part) for part in outcome.result.estimator.calibration}
     rows |= _accuracy_rows(outcome)
     rows |= {
         name: str(path)

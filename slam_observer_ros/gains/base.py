@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -160,6 +161,10 @@ class GainDesign(Protocol):
 
     def calibrated(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (k, 6) with what is known of their scale and bias put right."""
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """What was found out about the velocity."""
 
     @property
     def velocity_delay_ns(self) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.axes import Axes
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.gains.base import Motion
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -16,8 +17,16 @@ from slam_observer_ros.types import FloatArray, IntArray
 MAX_DELAY_S = 1.0
 """Delay that is made up for at most, seconds; for so long velocities are kept."""
 
-DELAY = 12
-"""Place of τ behind six scales and six biases."""
+NAMES = (
+    *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
+    *(f'{part}_bias_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
+    'velocity_delay',
+)
+"""Names of six scales, six biases and the delay τ."""
+
+DELAY = NAMES.index('velocity_delay')
+
+UNITS = ('',) * 6 + ('rad/s',) * 3 + ('m/s',) * 3 + ('s',)
 
 
 class Calibration:
@@ -61,6 +70,13 @@ class Calibration:
         """(c,) estimates: scale factors 1 + s, then biases b, then the delay τ in seconds."""
         values: FloatArray = self._all[self._estimated]
         return values
+
+    def estimates(self, variances: FloatArray) -> list[CalibrationEstimate]:
+        """Return the estimates with what the gains know of them: ``variances`` (c,)."""
+        return [
+            CalibrationEstimate(NAMES[i], float(self._all[i]), float(np.sqrt(variance)), UNITS[i])
+            for i, variance in zip(self._estimated, variances, strict=True)
+        ]
 
     @property
     def delay_ns(self) -> int:

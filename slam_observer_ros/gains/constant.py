@@ -18,6 +18,7 @@ from functools import partial
 import numpy as np
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, lyapunov, Observer
@@ -93,6 +94,11 @@ class ConstantGains:
     def calibrated(self, body_velocities: FloatArray) -> FloatArray:
         """Return the velocities as they are."""
         return body_velocities
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """Nothing: these gains find out nothing about the velocity."""
+        return []
 
     @property
     def velocity_delay_ns(self) -> int:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
@@ -73,6 +74,11 @@ class RiccatiGains:
     def calibrated(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (k, 6) with the estimated scale and bias put right."""
         return self._calibration.apply(body_velocities)
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """What was found out about the velocity."""
+        return self._calibration.estimates(np.diagonal(self._P)[self._p : self._first])
 
     @property
     def velocity_delay_ns(self) -> int:

@@ -33,6 +33,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.gains.base import Innovation, Motion, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.core import Core, regression
@@ -77,6 +78,14 @@ class ScheduledGains:
     def calibrated(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (k, 6) with the estimated scale and bias put right."""
         return self._calibration.apply(body_velocities)
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """What was found out about the velocity."""
+        p = len(self._axes.pose)
+        return self._calibration.estimates(
+            np.diagonal(self._core.P)[p : p + self._calibration.count]
+        )
 
     @property
     def velocity_delay_ns(self) -> int:

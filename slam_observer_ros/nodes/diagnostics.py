@@ -91,6 +91,7 @@ class Diagnostics:
         values['landmarks known'] = str(len(estimator.landmark_ids))
         values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
         values['processing time, mean [ms]'] = f'{self._intake.take_mean_processing_ms():.3f}'
+        values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
         values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
         return values
 
