@@ -73,8 +73,9 @@ same events and the same noise figures for all: those of `config/wheeled_bearing
 recordings. The simulated worlds are made with the noise that these files state.
 
 - **constant, scheduled, riccati**: this project's gain designs. The wheeled configuration also
-  lets `scheduled` and `riccati` estimate the scale of the odometry, which GTSAM and the EKF don't
-  do here; `riccati, no calibration` has that switched off, for a comparison on equal terms.
+  lets `scheduled` and `riccati` estimate the scale and the delay of the odometry, which GTSAM and
+  the EKF don't do here; `riccati, no calibration` has that switched off, for a comparison on equal
+  terms.
 - **textbook EKF**: world-frame errors and absolute landmarks (`benchmark/ekf_slam.py`), with the
   observer's gate and Huber weights.
 - **iSAM2**: GTSAM, updated and read out in full after each observation; relinearizeSkip 1,
