@@ -441,6 +441,7 @@ class Estimator:
         start_ns = stamp_ns if self._state_ns is None else self._state_ns
         if stamp_ns > start_ns:
             self._hypotheses.advance(self._velocities, start_ns, stamp_ns)
+            # A delay, and beyond it half of what velocities are averaged over to estimate it.
             kept_s = self.settings.late_limit + 2.0 * MAX_DELAY_S
             self._velocities.forget_before(stamp_ns - _nanoseconds(kept_s))
         self._state_ns = stamp_ns

@@ -162,7 +162,7 @@ class Settings:
     )
     velocity_delay_error: float = parameter(
         0.0,
-        'Delay of the motion behind velocities, and of observations, to be estimated: its '
+        'How much later than its stamp a velocity shows in observations, to be estimated: its '
         'standard deviation',
         unit='s',
         minimum=0.0,

@@ -64,6 +64,8 @@ class Slam:
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
         self._noise = NoiseModel(settings)
+        tells_delay = settings.gains != 'constant'
+        self._delay_reach_ns = round(settings.velocity_delay_error * 1e9) * tells_delay
         self._innovation_ns: int | None = None
         self._index = LandmarkIndex()
 
@@ -165,9 +167,11 @@ class Slam:
     def _at_ends(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocities (2, 6) around both stamps, as far as their delay may reach.
 
-        The velocity at the very stamp would pass its own noise off as a turn to tell time by.
+        The velocity at the very stamp would pass its own noise off as a turn to tell time by. In
+        a mean there is less noise; that after the stamp is yet to come, and the latest velocity
+        stands in for it.
         """
-        reach_ns = round(self.settings.velocity_delay_error * 1e9)
+        reach_ns = self._delay_reach_ns
         if not reach_ns:
             return np.zeros((2, 6))
         at_ns = np.array([start_ns, end_ns]) - self.gains.velocity_delay_ns

@@ -82,9 +82,12 @@ class VelocityHistory:
         )
 
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
-        """Return the mean velocity (6,) over an interval; what has timed out counts as zero."""
+        """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
         held = self.held(start_ns, end_ns)
-        mean: FloatArray = held.dt_s @ held.body_velocities / ((end_ns - start_ns) * 1e-9)
+        known_s = np.sum(held.dt_s)
+        if known_s == 0.0:
+            return np.zeros(6)
+        mean: FloatArray = held.dt_s @ held.body_velocities / known_s
         return mean
 
     def forget_before(self, stamp_ns: int) -> None:

@@ -91,7 +91,7 @@ def drive(
     events: list[Event] = []
     for k in range(steps + 1):
         stamp_ns = START_NS + k * STEP_NS
-        if k < steps:
+        if k < steps and stamp_ns - delay_ns <= START_NS + steps * STEP_NS:
             events.append(VelocityEvent(stamp_ns - delay_ns, measured[k]))
         if k % OBSERVED_EVERY == 0:
             y = se3.transform(se3.inverse(poses[k]), points)

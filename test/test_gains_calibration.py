@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from gain_worlds import configuration_error_m, drive, estimate, true_velocities
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,6 +13,8 @@ from scipy.stats import chi2
 from strategies import generators
 
 from slam_observer_ros.axes import PLANAR, SPATIAL
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.gains.base import Motion
 from slam_observer_ros.gains.calibration import Calibration, MAX_DELAY_S
 from slam_observer_ros.gains.prediction import initial_covariance, predict
@@ -32,9 +36,9 @@ WHEELS = Settings(
 )
 WHEEL_SCALE = np.array([1.0, 1.0, 0.95, 1.05, 1.0, 1.0])
 
-GYROSCOPE = Settings(angular_bias_error=(0.05, 0.05, 0.05), angular_velocity_noise=(0.01,) * 3)
 DELAY_NS = 150_000_000
 
+GYROSCOPE = Settings(angular_bias_error=(0.05, 0.05, 0.05), angular_velocity_noise=(0.01,) * 3)
 GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
 
 
@@ -85,7 +89,9 @@ def test_a_gyroscopes_bias_is_found_within_three_sigma(seed):
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
 @pytest.mark.parametrize('hindsight_interval', [0, 20])
-def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_interval):
+@pytest.mark.parametrize('delay_ns', [0, DELAY_NS])
+def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_interval, delay_ns):
+    """Where the velocity changes by far more than its noise."""
     settings = Settings(
         two_d_mode=two_d_mode,
         angular_velocity_noise=(0.005, 0.005, 0.005),
@@ -94,8 +100,8 @@ def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_i
     )
     normalised_squared = []
     for seed in range(3):
-        estimator = estimate(drive(settings, 60.0, seed, delay_ns=DELAY_NS), settings)
-        error_s = (estimator._slam.gains.velocity_delay_ns - DELAY_NS) * 1e-9
+        estimator = estimate(drive(settings, 60.0, seed, delay_ns=delay_ns), settings)
+        error_s = (estimator._slam.gains.velocity_delay_ns - delay_ns) * 1e-9
         sigma_s = deviations(estimator, 1)[0]
         normalised_squared.append((error_s / sigma_s) ** 2)
         assert sigma_s < 0.03
@@ -116,14 +122,40 @@ def test_a_delay_that_is_made_up_for_does_no_harm(gains):
     assert mean_error_m(settings, 2 * DELAY_NS) > 1.2 * in_time
 
 
-def test_velocities_that_come_late_need_no_future():
+def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
+    """As an odometry's that is averaged over the time before its stamp."""
+    settings = Settings(
+        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_error=0.2
+    )
+    left_alone = Settings(**{**vars(settings), 'velocity_delay_error': 0.0})
+    errors_m, errors_left_m = [], []
+    for seed in range(4):
+        world = drive(settings, 60.0, seed, delay_ns=-DELAY_NS)
+        estimator = estimate(world, settings)
+        assert -DELAY_NS < estimator._slam.gains.velocity_delay_ns < -DELAY_NS / 2
+        errors_m.append(configuration_error_m(estimator, world))
+        errors_left_m.append(configuration_error_m(estimate(world, left_alone), world))
+    assert np.mean(errors_m) < np.mean(errors_left_m)
+
+
+def test_a_delay_stays_within_what_is_made_up_for():
     calibration = Calibration(Settings(velocity_delay_error=0.1), PLANAR)
-    calibration.shift(np.array([-0.3]))
-    assert calibration.delay_ns == 0
-    calibration.shift(np.array([0.5]))
-    assert calibration.delay_ns == 200_000_000
-    calibration.shift(np.array([5.0]))
-    assert calibration.delay_ns == round(MAX_DELAY_S * 1e9)
+    for change_s in (-5.0, 10.0):
+        calibration.shift(np.array([change_s]))
+        assert calibration.delay_ns == np.sign(change_s) * round(MAX_DELAY_S * 1e9)
+
+
+def test_at_constant_velocity_nobody_can_tell_the_delay():
+    """Not even at the start, where no velocity is known yet."""
+    settings = Settings(two_d_mode=True, velocity_delay_error=0.2)
+    world = drive(settings, 5.0)
+    velocity = world.events[0].body_velocity
+    estimator = Estimator(settings)
+    for event in world.events:
+        is_velocity = isinstance(event, VelocityEvent)
+        estimator.add(replace(event, body_velocity=velocity) if is_velocity else event)
+    (delay,) = estimator.calibration
+    assert delay.deviation == pytest.approx(0.2, rel=1e-3)
 
 
 def test_scheduled_gains_find_them_too():
@@ -177,7 +209,7 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
     def path(change):
         calibration.shift(change)
         held_s = np.full(pieces, dt_s)
-        held_s[[0, -1]] += change[-1] * np.array([1.0, -1.0])  # a longer delay: earlier motion
+        held_s[[0, -1]] += change[-1] * np.array([1.0, -1.0])  # a longer delay: earlier velocities
         steps = se3.exp(calibration.apply(V) * held_s[:, None])
         calibration.shift(-change)
         poses = [start]

@@ -28,8 +28,8 @@ class Motion:
     covariances : FloatArray
         (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
     at_ends : FloatArray
-        (2, 6) measured velocities around the start and the end, rad/s and m/s; zero where nobody
-        asks when exactly these were.
+        (2, 6) measured velocities around the start and the end, rad/s and m/s; zero where no
+        delay is estimated.
 
     """
 

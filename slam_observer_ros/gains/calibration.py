@@ -15,7 +15,7 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
 MAX_DELAY_S = 1.0
-"""Delay that is made up for at most, seconds; for so long velocities are kept."""
+"""Delay, either way, that is made up for at most; also the most that its error may be set to."""
 
 NAMES = (
     *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
@@ -54,13 +54,11 @@ class Calibration:
         scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
         bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
         errors = np.concatenate([scale, bias, [settings.velocity_delay_error]])
-        self._scaled = axes.pose[scale[axes.pose] > 0.0]
-        self._biased = axes.pose[bias[axes.pose] > 0.0]
-        self._calibrated = np.append(self._scaled, self._biased)
-        self._is_delayed = settings.velocity_delay_error > 0.0
+        possible = np.concatenate([axes.pose, 6 + axes.pose, [DELAY]])
+        self._estimated: IntArray = possible[errors[possible] > 0.0]
+        self._scales = int(np.sum(self._estimated < 6))
+        self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._all: FloatArray = np.repeat([1.0, 0.0], [6, 7])
-        estimated = np.concatenate([self._scaled, 6 + self._biased, [DELAY] * self._is_delayed])
-        self._estimated: IntArray = estimated.astype(np.int64)
         self.count = len(self._estimated)
         self.initial_variances = errors[self._estimated] ** 2
         self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
@@ -80,8 +78,8 @@ class Calibration:
 
     @property
     def delay_ns(self) -> int:
-        """Delay τ that is made up for, nanoseconds: a negative one would need the future."""
-        return round(min(max(float(self._all[DELAY]), 0.0), MAX_DELAY_S) * 1e9)
+        """Delay τ, nanoseconds; where it is negative the latest velocity is held for longer."""
+        return round(float(self._all[DELAY]) * 1e9)
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return (k, 6) velocities (1 + s) ∘ V + b."""
@@ -90,13 +88,14 @@ class Calibration:
     def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
         """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
 
-        From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, which lets the motion
-        begin and end earlier by τ̃. ``Ad`` (k + 1, p, 6) holds the estimated rows of Ad_Â.
+        From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, so that velocities were
+        taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6) holds the
+        estimated rows of Ad_Â.
         """
         rates = motion.measured_velocities[:, self._calibrated]
-        rates[:, len(self._scaled) :] = 1.0
+        rates[:, self._scales :] = 1.0
         F: FloatArray = np.einsum('kij,kj,k->ij', Ad[:-1, :, self._calibrated], rates, motion.dt_s)
-        if not self._is_delayed:
+        if len(self._calibrated) == self.count:
             return F
         first, last = self.apply(motion.at_ends)
         return np.column_stack([F, Ad[0] @ first - Ad[-1] @ last])
@@ -104,3 +103,4 @@ class Calibration:
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
         self._all[self._estimated] += change
+        self._all[DELAY] = np.clip(self._all[DELAY], -MAX_DELAY_S, MAX_DELAY_S)
