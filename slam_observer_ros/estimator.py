@@ -24,6 +24,7 @@ from slam_observer_ros.localisation import (
     start_in_map,
 )
 from slam_observer_ros.observer import lyapunov
+from slam_observer_ros.odometry import transition
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray, IntArray
@@ -308,7 +309,8 @@ class Estimator:
     @property
     def calibration(self) -> list[CalibrationEstimate]:
         """Scale, bias and delay of the velocity, those that the settings ask for."""
-        return self._slam.gains.calibration
+        gains = self._slam.gains
+        return gains.calibration.estimates(gains.calibration_variances)
 
     @property
     def last_update(self) -> Update | None:
@@ -418,7 +420,8 @@ class Estimator:
         """Return the body's motion (4, 4), backwards if the end comes first."""
         if end_ns < start_ns:
             return se3.inverse(self._motion(end_ns, start_ns))
-        return self._slam.transition(self._velocities, start_ns, end_ns)
+        calibration = self._slam.gains.calibration
+        return transition(self._velocities, calibration, start_ns, end_ns)
 
     def _carry_forward(self, event: ObservationEvent) -> ObservationEvent:
         """Return what would be seen at the state's stamp: Φ⁻¹ (y + v τ), Φ the motion since."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from functools import reduce
 import logging
 
 import numpy as np
@@ -13,7 +12,8 @@ from slam_observer_ros.association import find_readings, RESOLUTION
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
-from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis
 from slam_observer_ros.geometry import se3, so3
@@ -21,9 +21,10 @@ from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
+from slam_observer_ros.odometry import motion
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.velocity_history import HeldVelocities, VelocityHistory
+from slam_observer_ros.velocity_history import VelocityHistory
 
 logger = logging.getLogger(__name__)
 
@@ -64,8 +65,6 @@ class Slam:
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
         self._noise = NoiseModel(settings)
-        tells_delay = settings.gains != 'constant'
-        self._delay_reach_ns = round(settings.velocity_delay_error * 1e9) * tells_delay
         self._innovation_ns: int | None = None
         self._index = LandmarkIndex()
 
@@ -103,11 +102,11 @@ class Slam:
         Of its rotation vector and its position along the world's axes, rad² and m²; the gains
         know that of ε in Â = exp(ε) A. None where they know none.
         """
-        motion = self._motion(velocities, start_ns, end_ns)
-        covariance = self.gains.pose_covariance_after(motion)
+        moved = self._motion(velocities, start_ns, end_ns)
+        covariance = self.gains.pose_covariance_after(moved)
         if covariance is None:
             return None
-        turn = self._turn_to_world(motion.path[-1])
+        turn = self._turn_to_world(moved.path[-1])
         world: FloatArray = turn @ covariance @ turn.T
         return world
 
@@ -139,44 +138,16 @@ class Slam:
         self.settings = settings
         self.gains.change_settings(settings)
 
-    def transition(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> FloatArray:
-        """Return exp(V_1 dt_1) … exp(V_k dt_k) (4, 4), how the body moves between two stamps."""
-        held = self._held(velocities, start_ns, end_ns)
-        V = self.gains.calibrated(held.body_velocities)
-        return reduce(np.matmul, se3.exp(V * held.dt_s[:, None]), np.eye(4))
-
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move the state, which is that of ``start_ns``, on to ``end_ns``."""
-        motion = self._motion(velocities, start_ns, end_ns)
-        self.observer.propagate(motion.path)
-        self.observer.move_landmarks(float(np.sum(motion.dt_s + motion.gap_s)))
-        self.gains.predict(motion)
+        moved = self._motion(velocities, start_ns, end_ns)
+        self.observer.propagate(moved.path)
+        self.observer.move_landmarks(float(np.sum(moved.dt_s + moved.gap_s)))
+        self.gains.predict(moved)
 
     def _motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
-        held = self._held(velocities, start_ns, end_ns)
-        path = self.observer.path(self.gains.calibrated(held.body_velocities), held.dt_s)
-        noise = self._noise.motion(held)
-        at_ends = self._at_ends(velocities, start_ns, end_ns)
-        return Motion(path, held.body_velocities, held.dt_s, held.gap_s, noise, at_ends)
-
-    def _held(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> HeldVelocities:
-        """Return the velocities that move the robot from one stamp to another."""
-        delay_ns = self.gains.velocity_delay_ns
-        return velocities.held(start_ns - delay_ns, end_ns - delay_ns)
-
-    def _at_ends(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> FloatArray:
-        """Return the mean velocities (2, 6) around both stamps, as far as their delay may reach.
-
-        The velocity at the very stamp would pass its own noise off as a turn to tell time by. In
-        a mean there is less noise; that after the stamp is yet to come, and the latest velocity
-        stands in for it.
-        """
-        reach_ns = self._delay_reach_ns
-        if not reach_ns:
-            return np.zeros((2, 6))
-        at_ns = np.array([start_ns, end_ns]) - self.gains.velocity_delay_ns
-        means = [velocities.mean(t_ns - reach_ns, t_ns + reach_ns) for t_ns in at_ns.tolist()]
-        return np.array(means)
+        calibration = self.gains.calibration
+        return motion(velocities, calibration, self._noise, self.observer, start_ns, end_ns)
 
     def readings(
         self, event: ObservationEvent, new_ids: IntArray

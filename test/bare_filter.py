@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.base import Innovation, Motion
+from slam_observer_ros.gains.base import Innovation
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
@@ -21,7 +22,7 @@ class Filter:
         self.gains = gains
 
     def move(self, body_velocities, dt_s, covariances):
-        path = self.observer.path(self.gains.calibrated(body_velocities), dt_s)
+        path = self.observer.path(self.gains.calibration.apply(body_velocities), dt_s)
         self.observer.propagate(path)
         no_gaps = np.zeros(len(dt_s))
         at_ends = np.zeros((2, 6))

@@ -109,10 +109,10 @@ class TestReport:
         ended = slam_observer.succeed('replay', simulated, *options, '--json')
         calibration = ended.json['calibration']
         assert set(calibration) == {'angular_bias_z', 'velocity_delay'}
-        for part, limit in (('angular_bias_z', 0.1), ('velocity_delay', 0.1)):
-            assert abs(calibration[part]['value']) < 3.0 * calibration[part]['deviation']
-            assert 0.0 < calibration[part]['deviation'] < limit
-        assert calibration['angular_bias_z']['unit'] == 'rad/s'
+        bias, delay = calibration['angular_bias_z'], calibration['velocity_delay']
+        assert abs(bias['value']) < 3.0 * bias['deviation'] < 0.3
+        assert bias['unit'] == 'rad/s'
+        assert delay['deviation'] == pytest.approx(0.1)  # a circle at constant speed does not tell
         output = slam_observer.succeed('replay', simulated, *options).output
         assert 'velocity_delay' in output
         assert '±' in output

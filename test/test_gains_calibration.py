@@ -15,8 +15,8 @@ from strategies import generators
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.gains.base import Motion
 from slam_observer_ros.gains.calibration import Calibration, MAX_DELAY_S
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings
@@ -44,7 +44,7 @@ GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
 
 def scale_and_bias(estimator):
     """Estimated factors (6,) and biases (6,), as they are applied to a velocity."""
-    calibrated = estimator._slam.gains.calibrated
+    calibrated = estimator._slam.gains.calibration.apply
     bias = calibrated(np.zeros((1, 6)))[0]
     return calibrated(np.ones((1, 6)))[0] - bias, bias
 
@@ -101,7 +101,7 @@ def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_i
     normalised_squared = []
     for seed in range(3):
         estimator = estimate(drive(settings, 60.0, seed, delay_ns=delay_ns), settings)
-        error_s = (estimator._slam.gains.velocity_delay_ns - delay_ns) * 1e-9
+        error_s = (estimator._slam.gains.calibration.delay_ns - delay_ns) * 1e-9
         sigma_s = deviations(estimator, 1)[0]
         normalised_squared.append((error_s / sigma_s) ** 2)
         assert sigma_s < 0.03
@@ -132,7 +132,7 @@ def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
     for seed in range(4):
         world = drive(settings, 60.0, seed, delay_ns=-DELAY_NS)
         estimator = estimate(world, settings)
-        assert -DELAY_NS < estimator._slam.gains.velocity_delay_ns < -DELAY_NS / 2
+        assert -DELAY_NS < estimator._slam.gains.calibration.delay_ns < -DELAY_NS / 2
         errors_m.append(configuration_error_m(estimator, world))
         errors_left_m.append(configuration_error_m(estimate(world, left_alone), world))
     assert np.mean(errors_m) < np.mean(errors_left_m)
@@ -184,8 +184,8 @@ def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
     settings = Settings(gains=gains, two_d_mode=two_d_mode)
     estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
     V = true_velocities(5, planar=False)
-    np.testing.assert_array_equal(estimator._slam.gains.calibrated(V), V)
-    assert estimator._slam.gains.velocity_delay_ns == 0
+    np.testing.assert_array_equal(estimator._slam.gains.calibration.apply(V), V)
+    assert estimator._slam.gains.calibration.delay_ns == 0
 
 
 @pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 13), (PLANAR, 7)])

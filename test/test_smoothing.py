@@ -21,9 +21,10 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.gains.base import Motion, Seen
+from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.history import History
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings

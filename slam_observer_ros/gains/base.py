@@ -5,40 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from slam_observer_ros.estimates import CalibrationEstimate
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """Motion since the last observation, in k pieces of held velocity.
-
-    Attributes
-    ----------
-    path : FloatArray
-        (k + 1, 4, 4) Â before, between and after the pieces.
-    measured_velocities : FloatArray
-        (k, 6) velocities (Ω, v) as measured, rad/s and m/s.
-    dt_s : FloatArray
-        (k,) seconds that each velocity was held.
-    gap_s : FloatArray
-        (k,) seconds after each piece during which no velocity was known.
-    covariances : FloatArray
-        (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
-    at_ends : FloatArray
-        (2, 6) measured velocities around the start and the end, rad/s and m/s; zero where no
-        delay is estimated.
-
-    """
-
-    path: FloatArray
-    measured_velocities: FloatArray
-    dt_s: FloatArray
-    gap_s: FloatArray
-    covariances: FloatArray
-    at_ends: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,16 +130,13 @@ class GainDesign(Protocol):
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
 
-    def calibrated(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (k, 6) with what is known of their scale and bias put right."""
+    @property
+    def calibration(self) -> Calibration:
+        """Scale, bias and delay of the velocity, as far as they are known."""
 
     @property
-    def calibration(self) -> list[CalibrationEstimate]:
-        """What was found out about the velocity."""
-
-    @property
-    def velocity_delay_ns(self) -> int:
-        """How much later than its stamp a velocity shows in what is observed, nanoseconds."""
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of what is estimated of the calibration."""
 
     def recall(self, observer: Observer, indices: IntArray) -> None:
         """Move landmarks (m,) that are about to be used, where the design had put that off."""

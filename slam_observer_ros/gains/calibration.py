@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.gains.base import Motion
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -47,6 +47,8 @@ class Calibration:
         (c,) variances at the start.
     drift_covariance : FloatArray
         (c, c) by how much their covariance grows per second.
+    delay_error_ns : int
+        Standard deviation of τ at the start, nanoseconds; 0 where it is not estimated.
 
     """
 
@@ -60,6 +62,7 @@ class Calibration:
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._all: FloatArray = np.repeat([1.0, 0.0], [6, 7])
         self.count = len(self._estimated)
+        self.delay_error_ns = round(settings.velocity_delay_error * 1e9)
         self.initial_variances = errors[self._estimated] ** 2
         self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
 

@@ -18,8 +18,9 @@ from functools import partial
 import numpy as np
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
-from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, lyapunov, Observer
 from slam_observer_ros.settings import Settings
@@ -40,6 +41,11 @@ class ConstantGains:
         differential equation for dt → 0; 'exponential' turns about the centroid of the e_i,
         where rotation and translation do not compete. In ``two_d_mode`` all turns are about z.
 
+    Attributes
+    ----------
+    calibration : Calibration
+        One that leaves the velocity as it is.
+
     """
 
     pose_covariance = None
@@ -47,6 +53,7 @@ class ConstantGains:
 
     def __init__(self, settings: Settings) -> None:
         self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
+        self.calibration = Calibration(Settings(), self._axes)
         self.change_settings(settings)
 
     def change_settings(self, settings: Settings) -> None:
@@ -91,19 +98,10 @@ class ConstantGains:
     def remove_landmarks(self, indices: IntArray) -> None:
         """Do nothing: constant gains have no state."""
 
-    def calibrated(self, body_velocities: FloatArray) -> FloatArray:
-        """Return the velocities as they are."""
-        return body_velocities
-
     @property
-    def calibration(self) -> list[CalibrationEstimate]:
-        """Nothing: these gains find out nothing about the velocity."""
-        return []
-
-    @property
-    def velocity_delay_ns(self) -> int:
-        """Zero: these gains don't estimate it."""
-        return 0
+    def calibration_variances(self) -> FloatArray:
+        """(0,) since nothing is estimated of the calibration."""
+        return np.empty(0)
 
     def recall(self, observer: Observer, indices: IntArray) -> None:
         """Do nothing: these gains put nothing off."""

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import so3
@@ -30,7 +31,7 @@ class FixedMapGains(RiccatiGains):
 
     def __init__(self, before: RiccatiGains, landmark_covariances: FloatArray) -> None:
         super().__init__(before._settings)
-        self._calibration = before._calibration
+        self.calibration = before.calibration
         self._P = before._P[: self._first, : self._first].copy()
         self._landmark_covariances = landmark_covariances
 
@@ -41,7 +42,7 @@ class FixedMapGains(RiccatiGains):
 
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose's covariance."""
-        predict(self._P, self._axes, self._calibration, motion)
+        predict(self._P, self._axes, self.calibration, motion)
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""

@@ -24,12 +24,12 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
-from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.linear import solve
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import (
     block_diagonal,
@@ -52,38 +52,35 @@ class RiccatiGains:
     settings : Settings
         Noise, calibration, robustness and ``two_d_mode``.
 
+    Attributes
+    ----------
+    calibration : Calibration
+        Scale, bias and delay of the velocity, as far as they are known.
+
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
-        self._calibration = Calibration(settings, self._axes)
+        self.calibration = Calibration(settings, self._axes)
         self._p = len(self._axes.pose)
-        self._first = self._p + self._calibration.count
+        self._first = self._p + self.calibration.count
         self._is_moving = settings.landmark_velocity_error > 0.0
         self._stride = self._axes.point * (2 if self._is_moving else 1)
         self._first_columns = self._first + np.arange(self._axes.point)
-        self._P = initial_covariance(self._axes, self._calibration)
-        start = Prior(np.eye(4), self._calibration.values, np.empty((0, 3)), self._P.copy())
+        self._P = initial_covariance(self._axes, self.calibration)
+        start = Prior(np.eye(4), self.calibration.values, np.empty((0, 3)), self._P.copy())
         self._hindsight = Hindsight(self._axes, settings, start)
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
         self._settings = self._hindsight.settings = settings
 
-    def calibrated(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (k, 6) with the estimated scale and bias put right."""
-        return self._calibration.apply(body_velocities)
-
     @property
-    def calibration(self) -> list[CalibrationEstimate]:
-        """What was found out about the velocity."""
-        return self._calibration.estimates(np.diagonal(self._P)[self._p : self._first])
-
-    @property
-    def velocity_delay_ns(self) -> int:
-        """How much later than its stamp a velocity shows in what is observed, nanoseconds."""
-        return self._calibration.delay_ns
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of what is estimated of the calibration."""
+        variances: FloatArray = np.diagonal(self._P)[self._p : self._first]
+        return variances
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -93,7 +90,7 @@ class RiccatiGains:
     def pose_covariance_after(self, motion: Motion) -> FloatArray:
         """Return what it will be after a motion yet to be predicted (6, 6)."""
         P = self._P[: self._first, : self._first].copy()
-        predict(P, self._axes, self._calibration, motion)
+        predict(P, self._axes, self.calibration, motion)
         return self._axes.full_pose_covariance(P[: self._p, : self._p])
 
     @property
@@ -107,9 +104,9 @@ class RiccatiGains:
 
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
-        noise, F = predict(self._P, self._axes, self._calibration, motion)
+        noise, F = predict(self._P, self._axes, self.calibration, motion)
         if self._looks_back:
-            self._hindsight.history.move(motion.path, noise, F, self._calibration.values)
+            self._hindsight.history.move(motion.path, noise, F, self.calibration.values)
         if self._is_moving:
             everything = np.arange(self._count)
             a, u = self._columns(everything), self._velocity_columns(everything)
@@ -312,14 +309,14 @@ class RiccatiGains:
         pose = self._axes.pose
         J[: self._p, : self._p] = se3.adjoint(se3.inverse(observer.A))[np.ix_(pose, pose)]
         points = observer.y_ref + observer.a - observer.shifts
-        prior = Prior(observer.A, self._calibration.values, points, J @ self._P @ J.T)
+        prior = Prior(observer.A, self.calibration.values, points, J @ self._P @ J.T)
         self._hindsight.restart(prior)
 
     def _as_solution(self, observer: Observer) -> Solution:
         """Return the estimates as they are, for the smoother to start from."""
         points = observer.y_ref + observer.a - observer.shifts
         poses = np.array(self._hindsight.history.poses)
-        return Solution(poses, self._calibration.values, points)
+        return Solution(poses, self.calibration.values, points)
 
     def _linearise_anew(self, observer: Observer) -> None:
         found = self._hindsight.linearise_anew(self._as_solution(observer))
@@ -337,7 +334,7 @@ class RiccatiGains:
         J = np.eye(len(covariance))
         J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(pose, pose)]
         self._P = J @ covariance @ J.T
-        self._calibration.shift(end.calibration - self._calibration.values)
+        self.calibration.shift(end.calibration - self.calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(Correction(D, slice(None), end.points - start.points))
         self.settle(observer)
@@ -369,7 +366,7 @@ class RiccatiGains:
 
     def _as_correction(self, x: FloatArray) -> Correction:
         """Return the group element exp(x); the calibration moves by its own part of x."""
-        self._calibration.shift(x[self._p : self._first])
+        self.calibration.shift(x[self._p : self._first])
         Delta = self._axes.full_pose(x[: self._p])
         self._hindsight.note_correction(Delta[:3])
         X = slam_group.exp(Delta, self._axes.full_points(x[self._map_columns]))

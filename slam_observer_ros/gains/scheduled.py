@@ -33,12 +33,12 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
-from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.gains.base import Innovation, Motion, Seen
+from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.linear import symmetric
+from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.robust import (
     block_diagonal,
     huber_weights,
@@ -59,6 +59,11 @@ class ScheduledGains:
     settings : Settings
         Noise, calibration, robustness and ``two_d_mode``.
 
+    Attributes
+    ----------
+    calibration : Calibration
+        Scale, bias and delay of the velocity, as far as they are known.
+
     """
 
     pose_covariance = None
@@ -67,30 +72,20 @@ class ScheduledGains:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
-        self._calibration = Calibration(settings, self._axes)
-        self._core = Core(self._axes, self._calibration)
+        self.calibration = Calibration(settings, self._axes)
+        self._core = Core(self._axes, self.calibration)
         self._leaves = self._core.leaves
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
         self._settings = settings
 
-    def calibrated(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (k, 6) with the estimated scale and bias put right."""
-        return self._calibration.apply(body_velocities)
-
     @property
-    def calibration(self) -> list[CalibrationEstimate]:
-        """What was found out about the velocity."""
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of what is estimated of the calibration."""
         p = len(self._axes.pose)
-        return self._calibration.estimates(
-            np.diagonal(self._core.P)[p : p + self._calibration.count]
-        )
-
-    @property
-    def velocity_delay_ns(self) -> int:
-        """How much later than its stamp a velocity shows in what is observed, nanoseconds."""
-        return self._calibration.delay_ns
+        variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
+        return variances
 
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the core's covariance."""
@@ -257,6 +252,6 @@ class ScheduledGains:
     ) -> Correction:
         """Return the element that moves the core by x and â_i (m, 3) by ``shifts`` alone."""
         p = len(self._axes.pose)
-        self._calibration.shift(x[p : p + self._calibration.count])
+        self.calibration.shift(x[p : p + self.calibration.count])
         D = se3.exp(self._axes.full_pose(x[:p]))
         return Correction(D, rows, shifts + a - se3.rotate(D, a))

@@ -1,0 +1,37 @@
+"""A motion between two observations, as a gain design is given it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam_observer_ros.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motion since the last observation, in k pieces of held velocity.
+
+    Attributes
+    ----------
+    path : FloatArray
+        (k + 1, 4, 4) Â before, between and after the pieces.
+    measured_velocities : FloatArray
+        (k, 6) velocities (Ω, v) as measured, rad/s and m/s.
+    dt_s : FloatArray
+        (k,) seconds that each velocity was held.
+    gap_s : FloatArray
+        (k,) seconds after each piece during which no velocity was known.
+    covariances : FloatArray
+        (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
+    at_ends : FloatArray
+        (2, 6) measured velocities around the start and the end, rad/s and m/s; zero where no
+        delay is estimated.
+
+    """
+
+    path: FloatArray
+    measured_velocities: FloatArray
+    dt_s: FloatArray
+    gap_s: FloatArray
+    covariances: FloatArray
+    at_ends: FloatArray
