@@ -86,6 +86,25 @@ def test_samples_are_sorted_and_the_last_of_one_stamp_counts() -> None:
     np.testing.assert_array_equal(trajectory.poses, poses[[1, 2]])
 
 
+@pytest.mark.parametrize(
+    ('first_ns', 'last_ns', 'part'),
+    [
+        (0, 0, slice(3, 7)),
+        (-1, 1, slice(2, 8)),
+        (1, -1, slice(3, 7)),
+        (-(10**12), 10**12, slice(10)),
+    ],
+)
+def test_the_part_during_another_one_spans_its_time(
+    first_ns: int, last_ns: int, part: slice
+) -> None:
+    trajectory = random_trajectory(0, 10)
+    stamps_ns = trajectory.stamps_ns[[3, 6]] + np.array([first_ns, last_ns])
+    found = trajectory.during(Trajectory(stamps_ns, trajectory.poses[[3, 6]]))
+    np.testing.assert_array_equal(found.stamps_ns, trajectory.stamps_ns[part])
+    np.testing.assert_array_equal(found.poses, trajectory.poses[part])
+
+
 def test_path_length_is_the_sum_of_steps_in_any_frame() -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, 3] = [[0, 0, 0], [3, 4, 0], [3, 4, 2]]

@@ -89,6 +89,8 @@ def plot_map(
     if truth is not None:
         alignment = trajectory_errors(estimate, truth).alignment
         estimate, world_points = estimate.moved(alignment), se3.transform(alignment, world_points)
+        # Else paths that are long the same seem to end at different places.
+        truth = truth.during(estimate)
     else:
         landmark_truth = None
     layers = _map_layers(estimate, world_points, truth, landmark_truth)

@@ -88,6 +88,13 @@ class Trajectory:
         """Sum of the distances between consecutive positions, metres."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
+    def during(self, other: Trajectory) -> Trajectory:
+        """Return the least part that spans the time of another trajectory, as far as it does."""
+        first = np.searchsorted(self.stamps_ns, other.stamps_ns[0], side='right') - 1
+        last = np.searchsorted(self.stamps_ns, other.stamps_ns[-1])
+        kept = slice(max(first, 0), last + 1)
+        return Trajectory(self.stamps_ns[kept], self.poses[kept])
+
     def moved(self, transform: FloatArray) -> Trajectory:
         """Express the trajectory in another world frame.
 
