@@ -229,8 +229,9 @@ class Settings:
         minimum=0,
     )
     hindsight_turn: float = parameter(
-        0.1,
-        'Riccati gains: root sum square of attitude corrections after which to look back',
+        0.2,
+        'Riccati gains: root sum square of attitude corrections after which to look back; a tenth '
+        'of the interval will do after a single one of this size',
         unit='rad',
         minimum=0.0,
     )

@@ -23,6 +23,7 @@ from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
@@ -281,6 +282,28 @@ def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode):
         rtol=0.05,
         atol=0.02 * np.abs(plain.pose_covariance).max(),
     )
+
+
+@pytest.mark.parametrize(
+    ('turns_rad', 'due_after'),
+    [
+        ([0.0] * 40, None),
+        ([0.15] + [0.0] * 39, None),  # not far
+        ([0.15, 0.15] + [0.0] * 38, 20),  # far enough together
+        ([0.25] + [0.0] * 39, 2),  # all that follows would be linearised in the wrong place
+    ],
+)
+def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
+    settings = Settings(hindsight_interval=20, hindsight_turn=0.2)
+    prior = Prior(np.eye(4), np.empty(0), np.empty((0, 3)), np.eye(6))
+    hindsight = Hindsight(SPATIAL, settings, prior)
+    nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    due = []
+    for turn_rad in turns_rad:
+        hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))
+        hindsight.see(nothing, np.eye(4), np.empty((0, 3)))
+        due.append(hindsight.is_due)
+    assert (due.index(True) + 1 if any(due) else None) == due_after
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])

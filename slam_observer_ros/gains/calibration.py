@@ -91,9 +91,9 @@ class Calibration:
     def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
         """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
 
-        From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, so that velocities were
-        taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6) holds the
-        estimated rows of Ad_Â.
+        From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, so that velocities
+        were taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6) holds
+        the estimated rows of Ad_Â.
         """
         rates = motion.measured_velocities[:, self._calibrated]
         rates[:, self._scales :] = 1.0

@@ -8,6 +8,7 @@ how far its corrections have turned the robot.
 from __future__ import annotations
 
 import logging
+import math
 
 import numpy as np
 
@@ -23,6 +24,11 @@ logger = logging.getLogger(__name__)
 GROWTH = 0.1
 """Share of the history that is new at least when looking back at all of it; with any less, the
 cost of each observation would grow with the history.
+"""
+
+HURRY = 0.1
+"""Share of the observations otherwise waited for that will do after a single large correction:
+what is linearised before the next time of looking back is linearised in the wrong place.
 """
 
 ITERATIONS = 2
@@ -64,7 +70,7 @@ class Hindsight:
         self._rest()
 
     def _rest(self) -> None:
-        self._observations, self._turn_squared = 0, 0.0
+        self._observations, self._turn_squared, self._largest_turn = 0, 0.0, 0.0
 
     @property
     def window_is_full(self) -> bool:
@@ -74,13 +80,18 @@ class Hindsight:
     @property
     def is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
-        least = max(self.settings.hindsight_interval, GROWTH * len(self.history.stamps_ns))
-        turned_far = self._turn_squared > self.settings.hindsight_turn**2
+        settings = self.settings
+        least = max(settings.hindsight_interval, GROWTH * len(self.history.stamps_ns))
+        if 0.0 < settings.hindsight_turn < self._largest_turn:
+            least *= HURRY
+        turned_far = self._turn_squared > settings.hindsight_turn**2
         return turned_far and self._observations >= least
 
     def note_correction(self, rotation: FloatArray) -> None:
         """Note a correction that turned the robot by ``rotation`` (3,), rad."""
-        self._turn_squared += float(rotation @ rotation)
+        turn_squared = float(rotation @ rotation)
+        self._turn_squared += turn_squared
+        self._largest_turn = max(self._largest_turn, math.sqrt(turn_squared))
 
     def see(self, seen: Seen, pose: FloatArray, shifts: FloatArray) -> None:
         """Add a frame to the history; see :meth:`History.see`."""
