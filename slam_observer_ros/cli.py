@@ -68,11 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Default: those that the program was started with.
 
     """
-    logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
-    # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
-    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(EXIT_SIGNAL + number))
-    args = make_parser().parse_args(arguments)
     try:
+        logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
+        # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
+        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(EXIT_SIGNAL + number))
+        args = make_parser().parse_args(arguments)
         args.run(args)
         sys.stdout.flush()
     except (SlamObserverError, OSError) as error:
