@@ -13,7 +13,6 @@ from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.estimates import CalibrationEstimate, Hindsight, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
-from slam_observer_ros.gains.calibration import MAX_DELAY_S
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.landmark_map import LandmarkMap
@@ -25,7 +24,7 @@ from slam_observer_ros.localisation import (
 )
 from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.odometry import transition
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.settings import MAX_DELAY_S, Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.validation import check_event

@@ -9,6 +9,10 @@ from slam_observer_ros.parameters import parameter
 Vector3 = tuple[float, float, float]
 
 
+MAX_DELAY_S = 1.0
+"""Delay of velocities, either way, that is made up for at most."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """Settings of the estimator; each field is a parameter."""
@@ -166,7 +170,7 @@ class Settings:
         'standard deviation',
         unit='s',
         minimum=0.0,
-        maximum=1.0,
+        maximum=MAX_DELAY_S,
     )
     calibration_drift: float = parameter(
         0.0,

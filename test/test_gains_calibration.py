@@ -15,11 +15,11 @@ from strategies import generators
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.gains.calibration import Calibration, MAX_DELAY_S
+from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.settings import MAX_DELAY_S, Settings
 
 EVERYTHING = Settings(
     angular_scale_error=(0.1, 0.1, 0.1),

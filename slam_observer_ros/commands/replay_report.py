@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-import dataclasses
-from dataclasses import asdict, dataclass
-import json
+from dataclasses import asdict, dataclass, replace
 import logging
 
 from slam_observer_ros.accuracy import Accuracy, measure, measure_hindsight
@@ -26,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a run did and how accurate it was: the object that ``--json`` prints.
+    """What a run did and how accurate it was; None is what was not measured.
 
     Attributes
     ----------
@@ -35,7 +33,7 @@ class Report:
     duration_s : float
         Time that the recording spans, seconds.
     seconds : float
-        Wall time that the run took, seconds.
+        CPU time that the estimator took, see :class:`.Replay`.
     landmarks : int
         Landmarks in the final map.
     dropped : dict of str to int
@@ -62,10 +60,6 @@ class Report:
     landmark_rmse_m: float | None = None
     configuration_rmse_m: float | None = None
     anees: float | None = None
-
-    def to_json(self) -> str:
-        """Write the report as one JSON object; what was not measured is null."""
-        return json.dumps(asdict(self), allow_nan=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +93,7 @@ def outcome_of(
         anees=accuracy.anees,
     )
     if accuracy.pose_errors is not None:
-        report = dataclasses.replace(
+        report = replace(
             report,
             ate_rmse_m=accuracy.pose_errors.ate_rmse_m,
             rotation_rmse_rad=accuracy.pose_errors.rotation_rmse_rad,
@@ -118,7 +112,7 @@ def with_hindsight(outcome: Outcome) -> Outcome:
             len(hindsight.stamps_ns),
         )
     errors, landmark_rmse_m = measure_hindsight(hindsight, outcome.truth)
-    return dataclasses.replace(
+    return replace(
         outcome,
         hindsight=hindsight,
         smoothed_errors=errors,
@@ -129,7 +123,7 @@ def with_hindsight(outcome: Outcome) -> Outcome:
 def as_json(outcome: Outcome) -> dict[str, object]:
     """Return the figures as ``--json`` prints them."""
     calibration = outcome.result.estimator.calibration
-    return dataclasses.asdict(outcome.report) | {
+    return asdict(outcome.report) | {
         'calibration': {part.name: asdict(part) for part in calibration},
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
         'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from slam_observer_ros.evaluation.errors import EvaluationError
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import FloatArray
 
 BLUE, RED, GREEN, GREY = '#0072B2', '#D55E00', '#009E73', '#7F7F7F'
 
@@ -62,11 +62,6 @@ def is_flat(points: FloatArray) -> bool:
     """Return whether points (k, 3) are to be drawn from above."""
     width, depth, height = np.ptp(points, axis=0)
     return bool(height <= _PLANAR_RATIO * max(width, depth))
-
-
-def seconds_since(start_ns: int, stamps_ns: IntArray) -> FloatArray:
-    """Return stamps as seconds after the start."""
-    return (stamps_ns - start_ns) / 1e9
 
 
 def save(figure: Figure, path: Path) -> Path:

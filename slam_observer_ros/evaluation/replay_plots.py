@@ -25,7 +25,6 @@ from slam_observer_ros.evaluation.drawing import (
     PATH,
     RED,
     save,
-    seconds_since,
     STYLE,
     TRUE_END,
     TRUE_LANDMARKS,
@@ -202,7 +201,7 @@ def plot_errors(
     deviations = None if covariances is None else _deviations(covariances, errors.alignment)
 
     start_ns = int(errors.estimate.stamps_ns[0])
-    times_s = seconds_since(start_ns, errors.estimate.stamps_ns)
+    times_s = _seconds_since(start_ns, errors.estimate.stamps_ns)
     rows = len(panels) + (configuration is not None)
     figure = Figure(figsize=(7.5, 0.6 + 1.7 * rows))
     stack = figure.subplots(rows, 1, sharex=True)
@@ -214,7 +213,7 @@ def plot_errors(
         axes.set_ylabel(name)
         axes.margins(x=0.01)
     if configuration is not None:
-        times = seconds_since(start_ns, np.array(configuration.stamps_ns, dtype=np.int64))
+        times = _seconds_since(start_ns, np.array(configuration.stamps_ns, dtype=np.int64))
         values_m = np.array(configuration.values_m)
         stack[-1].plot(*_broken_at_gaps(times, values_m), color=GREEN, **_LINE)
         stack[-1].set_ylim(bottom=0.0)
@@ -308,7 +307,7 @@ def _draw_residuals(axes: Axes, stamps_ns: IntArray, lengths_m: FloatArray) -> N
     positive = lengths_m > 0.0
     if not positive.any():
         return
-    times_s = seconds_since(int(stamps_ns.min()), stamps_ns)[positive]
+    times_s = _seconds_since(int(stamps_ns.min()), stamps_ns)[positive]
     lengths_m = lengths_m[positive]
     axes.plot(times_s, lengths_m, '.', color=BLUE, markersize=2.5, alpha=0.35)
     median = float(np.median(lengths_m))
@@ -331,3 +330,7 @@ def _draw_dropped(axes: Axes, dropped: Mapping[str, int], events: int) -> None:
     axes.set_title('Dropped events')
     axes.set_xlabel(f'{sum(dropped.values())} of {events} events')
     axes.xaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
+
+
+def _seconds_since(start_ns: int, stamps_ns: IntArray) -> FloatArray:
+    return (stamps_ns - start_ns) / 1e9

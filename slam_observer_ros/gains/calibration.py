@@ -11,11 +11,8 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.gains.motion import Motion
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.settings import MAX_DELAY_S, Settings
 from slam_observer_ros.types import FloatArray, IntArray
-
-MAX_DELAY_S = 1.0
-"""Delay, either way, that is made up for at most; also the most that its error may be set to."""
 
 NAMES = (
     *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
