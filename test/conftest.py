@@ -22,13 +22,15 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 SESSION_VARIABLE = 'SLAM_OBSERVER_TEST_SESSION'
 # The ports of higher domain ids overlap those that Linux hands out to clients.
 DOMAIN_IDS = range(1, 102)
+SHARED_MEMORY = Path('/dev/shm')
+DDS_FILES = '*fastrtps_*'
 SCRATCH = Path(tempfile.mkdtemp(prefix='slam_observer_test_'))
 atexit.register(shutil.rmtree, SCRATCH)
 
 # Set at import, so that child processes and fixtures of any scope see them.
 os.environ[SESSION_VARIABLE] = str(os.getpid())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-# Fast DDS over UDP alone leaves nothing in /dev/shm, whatever else runs on this machine.
+# UDP alone, where rmw_fastrtps leaves the choice: with LOCALHOST it adds shared memory itself.
 os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['ROS_LOG_DIR'] = str(SCRATCH)
@@ -79,12 +81,36 @@ def reserve(reservation: socket.socket, domain_id: int) -> bool:
 
 @pytest.fixture(scope='session', autouse=True)
 def nothing_is_left_behind() -> Iterator[None]:
-    """Fail when a process outlives the tests, and end it."""
+    """Fail when a process outlives the tests, and end it; clear away what killed nodes leave."""
+    before = set(SHARED_MEMORY.glob(DDS_FILES))
     yield
     processes = processes_of_these_tests()
     for process_id in processes:
         os.kill(process_id, signal.SIGKILL)
+    used = segments_in_use()
+    for left in set(SHARED_MEMORY.glob(DDS_FILES)) - before:
+        # Another user's processes can't be looked into.
+        if segment_of(left.name) not in used and left.stat().st_uid == os.getuid():
+            left.unlink(missing_ok=True)
     assert not processes, f'processes left running: {list(processes.values())}'
+
+
+def segments_in_use() -> set[str]:
+    """Return the names of the segments of shared memory that any process has mapped."""
+    used = set()
+    for maps in Path('/proc').glob('[0-9]*/maps'):
+        try:
+            lines = maps.read_text().splitlines()
+        except (ProcessLookupError, FileNotFoundError, PermissionError):
+            continue  # it has ended meanwhile, or is another user's
+        names = (Path(line.split()[-1]).name for line in lines if str(SHARED_MEMORY) in line)
+        used |= {segment_of(name) for name in names}
+    return used
+
+
+def segment_of(name: str) -> str:
+    """Return the name of the segment that a file is, or is the lock or the semaphore of."""
+    return name.removeprefix('sem.').removesuffix('_mutex').removesuffix('_el')
 
 
 def processes_of_these_tests() -> dict[int, str]:
