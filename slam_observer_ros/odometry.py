@@ -31,16 +31,24 @@ def motion(
     observer: Observer,
     start_ns: int,
     end_ns: int,
+    at_start: FloatArray | None,
 ) -> Motion:
-    """Return how the observer's Â moves on from ``start_ns``, the stamp that it belongs to."""
+    """Return how the observer's Â moves on from ``start_ns``, the stamp that it belongs to.
+
+    ``at_start`` (6,) is the mean velocity around that stamp which the motion before this one
+    ended with, or None if there was none. As each motion begins like the last one ended, what the
+    delay's error does to all of them depends on their two ends alone.
+    """
     held = _held(velocities, calibration, start_ns, end_ns)
+    if at_start is None:
+        at_start = _around(velocities, calibration, start_ns)
     return Motion(
         path=observer.path(calibration.apply(held.body_velocities), held.dt_s),
         measured_velocities=held.body_velocities,
         dt_s=held.dt_s,
         gap_s=held.gap_s,
         covariances=noise.motion(held),
-        at_ends=_at_ends(velocities, calibration, start_ns, end_ns),
+        at_ends=np.array([at_start, _around(velocities, calibration, end_ns)]),
     )
 
 
@@ -51,16 +59,14 @@ def _held(
     return velocities.held(start_ns - delay_ns, end_ns - delay_ns)
 
 
-def _at_ends(
-    velocities: VelocityHistory, calibration: Calibration, start_ns: int, end_ns: int
-) -> FloatArray:
-    """Return the mean velocities (2, 6) around both stamps, as far as their delay may reach.
+def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int) -> FloatArray:
+    """Return the mean velocity (6,) around a stamp, as far as its delay may reach.
 
     The velocity at the very stamp would pass its own noise off as a turn to tell time by. In a
     mean there is less noise. What is yet to come of it, the latest velocity stands in for.
     """
     reach_ns = calibration.delay_error_ns
     if not reach_ns:
-        return np.zeros((2, 6))
-    at_ns = (start_ns - calibration.delay_ns, end_ns - calibration.delay_ns)
-    return np.array([velocities.mean(t_ns - reach_ns, t_ns + reach_ns) for t_ns in at_ns])
+        return np.zeros(6)
+    centre_ns = stamp_ns - calibration.delay_ns
+    return velocities.mean(centre_ns - reach_ns, centre_ns + reach_ns)

@@ -66,6 +66,7 @@ class Slam:
         self.counts: Counter[str] = Counter()
         self._noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
+        self._end_velocity: FloatArray | None = None
         self._index = LandmarkIndex()
 
     @property
@@ -130,7 +131,7 @@ class Slam:
 
     def restart_time(self) -> None:
         """Go on from here at any other time; what was seen before can't be looked back at."""
-        self._innovation_ns = None
+        self._innovation_ns = self._end_velocity = None
         self.gains.restart(self.observer)
 
     def change_settings(self, settings: Settings) -> None:
@@ -142,12 +143,20 @@ class Slam:
         """Move the state, which is that of ``start_ns``, on to ``end_ns``."""
         moved = self._motion(velocities, start_ns, end_ns)
         self.observer.propagate(moved.path)
-        self.observer.move_landmarks(float(np.sum(moved.dt_s + moved.gap_s)))
+        self.observer.move_landmarks(float((moved.dt_s + moved.gap_s).sum()))
         self.gains.predict(moved)
+        self._end_velocity = moved.at_ends[1]
 
     def _motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
-        calibration = self.gains.calibration
-        return motion(velocities, calibration, self._noise, self.observer, start_ns, end_ns)
+        return motion(
+            velocities,
+            self.gains.calibration,
+            self._noise,
+            self.observer,
+            start_ns,
+            end_ns,
+            self._end_velocity,
+        )
 
     def readings(
         self, event: ObservationEvent, new_ids: IntArray

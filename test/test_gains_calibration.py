@@ -14,7 +14,7 @@ from strategies import generators
 
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
@@ -156,6 +156,26 @@ def test_at_constant_velocity_nobody_can_tell_the_delay():
         estimator.add(replace(event, body_velocity=velocity) if is_velocity else event)
     (delay,) = estimator.calibration
     assert delay.deviation == pytest.approx(0.2, rel=1e-3)
+
+
+def test_a_robot_at_rest_again_is_where_its_velocities_say_whatever_their_delay():
+    """As each motion begins with the velocity that the one before it ended with."""
+    settings = Settings(
+        angular_velocity_noise=(0.0, 0.0, 0.0),
+        linear_velocity_noise=(0.0, 0.0, 0.0),
+        velocity_delay_error=0.2,
+        reorder_window=0.0,
+    )
+    rng = np.random.default_rng(0)
+    estimator = Estimator(settings)
+    for step in range(60):
+        moves = 10 <= step < 50
+        velocity = rng.normal(size=6) if moves else np.zeros(6)
+        estimator.add(VelocityEvent(step * DELAY_NS, velocity))
+        estimator.add(ObservationEvent(step * DELAY_NS, np.arange(0), np.empty((0, 3))))
+        deviation = np.sqrt(np.max(np.diagonal(estimator.pose_covariance)))
+        assert deviation > 0.01 or not 12 <= step < 48
+    assert deviation < 1e-6
 
 
 def test_scheduled_gains_find_them_too():
