@@ -16,18 +16,14 @@ from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
-from slam_observer_ros.joint_compatibility import columns_of, JointSearch, Pairs
+from slam_observer_ros.joint_compatibility import columns_of, huber_loss, JointSearch, Pairs
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
 MARGIN = 35.0
-"""How much more than the cheapest a reading may cost: at odds of e¹⁷ it is given up.
-
-With the default ``rejection_distance`` of 6 a point without a landmark costs 36. With a margin
-above that, each point that clearly is a landmark would be tried without it.
-"""
+"""How much more than the cheapest a reading may cost: at odds of e¹⁷ it is given up."""
 
 RESOLUTION = 2.0
 """Two places are one if the sensor can't tell them apart by this many standard deviations."""
@@ -95,7 +91,7 @@ def find_readings(
     pairs = Pairs(at, rows, innovation.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
     search = JointSearch(pairs, nearly, gate, 0.0 if nearly.all() else MARGIN)
-    lonely_cost = (m - len(np.unique(at))) * gate**2
+    lonely_cost = (m - len(np.unique(at))) * float(huber_loss(gate))
     J, R = axes.output_matrix(points), noise[:, :k, :k]
     readings: list[Reading] = []
     moves: list[FloatArray] = []

@@ -2,13 +2,16 @@
 
 Where two readings of an observation put the robot at different places, both are followed, each
 with a state of its own, until later observations have made one much more likely than the other
-(D. B. Reid, *An algorithm for tracking multiple targets*, 1979). Nearly always there is one.
+(D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the robot
+at one place but take what it sees there for different landmarks, as their maps differ. Nearly
+always there is one.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from copy import deepcopy
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,6 +26,16 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.velocity_history import VelocityHistory
+
+
+@dataclass(frozen=True, slots=True)
+class _Followed:
+    """A state after an observation, what it took that for, and what it returned."""
+
+    cost: float
+    slam: Slam
+    reading: ObservationEvent
+    seen: tuple[IntArray, FloatArray]
 
 
 class Hypotheses:
@@ -72,18 +85,18 @@ class Hypotheses:
         readings = self._readings(event)
         least = readings[0][0]
         uses = Counter(number for _, number, _ in readings)
-        followed: list[tuple[float, Slam, tuple[IntArray, FloatArray]]] = []
+        followed: list[_Followed] = []
         for cost, number, reading in readings:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
             seen = slam.observe(reading)
-            if not any(slam.is_where(other, event) for _, other, _ in followed):
-                followed.append((cost - least, slam, seen))
+            if not any(_are_one(slam, reading, other) for other in followed):
+                followed.append(_Followed(cost - least, slam, reading, seen))
             if len(followed) == self._limit:
                 break
-        self._costs = [cost for cost, _, _ in followed]
-        self._states = [slam for _, slam, _ in followed]
-        return followed[0][2]
+        self._costs = [one.cost for one in followed]
+        self._states = [one.slam for one in followed]
+        return followed[0].seen
 
     def _readings(self, event: ObservationEvent) -> list[tuple[float, int, ObservationEvent]]:
         """Return what each state may take an observation for: cost, number of the state, reading.
@@ -101,3 +114,9 @@ class Hypotheses:
         ]
         readings.sort(key=lambda reading: reading[:2])
         return [reading for reading in readings if reading[0] <= readings[0][0] + MARGIN]
+
+
+def _are_one(slam: Slam, reading: ObservationEvent, other: _Followed) -> bool:
+    """Return whether a state has the robot, and what it sees, where another one has them."""
+    same_ids = np.array_equal(reading.ids, other.reading.ids)
+    return same_ids and slam.is_where(other.slam, reading)

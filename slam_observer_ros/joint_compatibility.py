@@ -1,14 +1,16 @@
-"""Which points are which landmarks, judged together: branch and bound on joint compatibility.
+"""Which points are which landmarks, judged together: a beam search on joint compatibility.
 
 After Neira and Tardós, *Data association in stochastic mapping using the joint compatibility
 test*, 2001. All points of an observation share the error of the pose, so pairs that each pass a
 gate alone may contradict each other, and a pair that is sure tells which of the others are right.
 A pairing takes each point for one landmark, or for none that is known. It costs
 
-    Σ over its pairs  d² + ln(|S| / |R|)    and    gate² for each point without a landmark,
+    Σ over its pairs  ρ(d) + ln(|S| / |R|)    and    ρ(gate) for each point without a landmark,
 
-with the joint residual's Mahalanobis distance d, its covariance S and the sensor's R: the less the
-state foretells where a landmark is seen, the less it says that something is seen there.
+where a pair's d is the Mahalanobis distance of its residual as the pairs before it foretell it,
+S its covariance and R the sensor's: the less the state foretells where a landmark is seen, the
+less it says that something is seen there. ρ is Huber's loss: where wheels slip a true pair may be
+at 6 σ, and by d² it would outweigh much that speaks for it.
 """
 
 from __future__ import annotations
@@ -17,10 +19,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
-MAX_NODES = 1000
-"""Partial pairings that are looked at, the most likely first, before the search ends."""
+MAX_PARTIAL = 16
+"""Pairings of the points so far, the cheapest, that are gone on with at the next point.
+
+A search in depth would spend its time below the first pair, and never see that it is wrong.
+"""
+
+HEAVY_TAIL = 2.0
+"""Standard deviations from which on the cost of a pair grows in proportion to its distance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +73,18 @@ class Pairing:
     chosen: list[int]
 
 
+@dataclass(frozen=True, slots=True)
+class _Partial:
+    """A pairing of some points: L is the inverse Cholesky factor of S, z = L r."""
+
+    cost: float
+    chosen: list[int]
+    L: FloatArray
+    z: FloatArray
+
+
 class JointSearch:
-    """All pairings that cost little more than the cheapest.
+    """The pairings that cost little more than the cheapest.
 
     Parameters
     ----------
@@ -83,61 +102,59 @@ class JointSearch:
     def __init__(self, pairs: Pairs, certain: BoolArray, gate: float, margin: float) -> None:
         self._pairs = pairs
         self._certain = certain
-        self._unpaired_cost = gate**2
+        self._unpaired_cost = float(huber_loss(gate))
         self._margin = margin
         points, counts = np.unique(pairs.points, return_counts=True)
         # Points with the fewest options first: they are the surest, and the others follow them.
         order = points[np.argsort(counts, kind='stable')]
         self._options = [np.flatnonzero(pairs.points == point) for point in order]
         self._noise_log_dets = np.linalg.slogdet(pairs.noise)[1]
-        self._nodes = 0
-        self._least = np.inf
-        self._found: list[Pairing] = []
 
     def pairings(self) -> list[Pairing]:
         """Return the pairings, the cheapest first; what no pair belongs to is left out of it."""
-        self._visit([], np.empty((0, 0)), np.empty(0), 0.0)
-        worst = self._least + self._margin
-        return sorted(
-            (pairing for pairing in self._found if pairing.cost <= worst),
-            key=lambda pairing: pairing.cost,
-        )
+        partial = [_Partial(0.0, [], np.empty((0, 0)), np.empty(0))]
+        for options in self._options:
+            longer = [more for one in partial for more in self._continued(one, options)]
+            longer.sort(key=lambda one: one.cost)
+            worst = longer[0].cost + self._margin
+            partial = [one for one in longer[:MAX_PARTIAL] if one.cost <= worst]
+        return [Pairing(one.cost, one.chosen) for one in partial]
 
-    def _visit(
-        self, chosen: list[int], L: FloatArray, z: FloatArray, cost: float, level: int = 0
-    ) -> None:
-        """Go on from the pairs ``chosen``: L is the inverse Cholesky factor of S, z = L r."""
-        self._nodes += 1
-        if cost > self._least + self._margin or (self._found and self._nodes > MAX_NODES):
-            return
-        if level == len(self._options):
-            self._least = min(self._least, cost)
-            self._found.append(Pairing(cost, chosen))
-            return
-        taken = self._pairs.landmarks[chosen]
-        branches = []
-        for pair in self._options[level]:
-            if self._pairs.landmarks[pair] not in taken:
-                grown, whitened, rise = self._grow(chosen, L, z, int(pair))
-                branches.append((cost + rise, [*chosen, int(pair)], grown, whitened))
-        if not branches or not self._certain[self._options[level]].all():
-            branches.append((cost + self._unpaired_cost, chosen, L, z))
-        for next_cost, pairs, grown, whitened in sorted(branches, key=lambda branch: branch[0]):
-            self._visit(pairs, grown, whitened, next_cost, level + 1)
+    def _continued(self, one: _Partial, options: IntArray) -> list[_Partial]:
+        """Return a pairing with each of the pairs ``options``, all of one point, and without."""
+        taken = self._pairs.landmarks[one.chosen]
+        free = options[~(self._pairs.landmarks[options][:, None] == taken).any(axis=1)]
+        longer = self._with_each(one, free) if len(free) else []
+        if not longer or not self._certain[options].all():
+            longer.append(_Partial(one.cost + self._unpaired_cost, one.chosen, one.L, one.z))
+        return longer
 
-    def _grow(
-        self, chosen: list[int], L: FloatArray, z: FloatArray, pair: int
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """Return L, z and the rise in cost with one more pair."""
-        S, r, k = self._pairs.covariances, self._pairs.residuals, self._pairs.residuals.shape[1]
-        own, n = slice(k * pair, k * pair + k), len(z)
-        W = L @ S[columns_of(chosen, k), own]
-        corner = np.linalg.inv(np.linalg.cholesky(S[own, own] - W.T @ W))
-        tail = corner @ (r[pair] - W.T @ z)
-        grown = np.zeros((n + k, n + k))
-        grown[:n, :n], grown[n:, :n], grown[n:, n:] = L, -corner @ W.T @ L, corner
-        log_det = -2.0 * np.sum(np.log(np.diag(corner))) - self._noise_log_dets[pair]
-        return grown, np.append(z, tail), float(tail @ tail + log_det)
+    def _with_each(self, one: _Partial, free: IntArray) -> list[_Partial]:
+        """Return a pairing with one more of the pairs ``free`` (o,), for each of them."""
+        S, r = self._pairs.covariances, self._pairs.residuals
+        n, k = len(one.z), r.shape[1]
+        own = k * free[:, None] + np.arange(k)
+        W = one.L @ S[columns_of(one.chosen, k)[:, None], own[:, None, :]]  # (o, n, k)
+        left = S[own[:, :, None], own[:, None, :]] - so3.transpose(W) @ W
+        corners = np.linalg.inv(np.linalg.cholesky(left))
+        tails = (corners @ (r[free] - one.z @ W)[:, :, None])[:, :, 0]
+        log_dets = np.log(np.diagonal(corners, axis1=1, axis2=2)).sum(axis=1)
+        rises = huber_loss(np.sqrt((tails * tails).sum(axis=1))) - 2.0 * log_dets
+        costs = one.cost + rises - self._noise_log_dets[free]
+        L = np.zeros((len(free), n + k, n + k))
+        L[:, :n, :n], L[:, n:, n:] = one.L, corners
+        L[:, n:, :n] = -corners @ so3.transpose(W) @ one.L
+        return [
+            _Partial(float(costs[i]), [*one.chosen, int(pair)], L[i], np.append(one.z, tails[i]))
+            for i, pair in enumerate(free)
+        ]
+
+
+def huber_loss(distances: FloatArray | float) -> FloatArray:
+    """Return ρ(d): d² near zero, and from ``HEAVY_TAIL`` on a line."""
+    near = np.minimum(distances, HEAVY_TAIL)
+    loss: FloatArray = near * (2.0 * distances - near)
+    return loss
 
 
 def columns_of(pairs: list[int], k: int) -> IntArray:
