@@ -143,13 +143,15 @@ def run_online(estimator: OnlineEstimator, events: Iterable[Event]) -> Run:
     """Feed events to an estimator and note its estimate after each observation."""
     snapshots = []
     cpu_s = 0.0
+    start_s = time.process_time()
     for event in events:
-        start_s = time.process_time()
         estimator.add(event)
-        cpu_s += time.process_time() - start_s
         if isinstance(event, ObservationEvent):
+            cpu_s += time.process_time() - start_s
             ids, points = estimator.landmark_ids.copy(), estimator.world_points.copy()
             snapshots.append(Snapshot(event.stamp_ns, estimator.pose.copy(), ids, points))
+            # Not at each event: looking at the clock costs a quarter of what a velocity does.
+            start_s = time.process_time()
     return Run(snapshots, cpu_s)
 
 

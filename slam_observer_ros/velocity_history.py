@@ -84,7 +84,7 @@ class VelocityHistory:
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
         held = self.held(start_ns, end_ns)
-        known_s = np.sum(held.dt_s)
+        known_s = held.dt_s.sum()
         if known_s == 0.0:
             return np.zeros(6)
         mean: FloatArray = held.dt_s @ held.body_velocities / known_s

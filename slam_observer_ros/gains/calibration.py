@@ -103,4 +103,4 @@ class Calibration:
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
         self._all[self._estimated] += change
-        self._all[DELAY] = np.clip(self._all[DELAY], -MAX_DELAY_S, MAX_DELAY_S)
+        self._all[DELAY] = min(max(self._all[DELAY], -MAX_DELAY_S), MAX_DELAY_S)

@@ -44,12 +44,12 @@ def predict(
     Ad = se3.adjoint(motion.path)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
     turned = Ad[:-1] @ motion.covariances @ so3.transpose(Ad[:-1])
-    noise: FloatArray = np.sum(turned, axis=0)
+    noise: FloatArray = turned.sum(axis=0)
     if calibration.count:
         P[:p] += F @ P[c]
         P[:p, :p] += P[:p, c] @ F.T
         P[p:, :p] = P[:p, p:].T
-        P[c, c] += calibration.drift_covariance * np.sum(motion.dt_s)
+        P[c, c] += calibration.drift_covariance * motion.dt_s.sum()
     # No observation takes a skew part away again, so rounding must not add to it.
     P[:p, :p] = symmetric(P[:p, :p] + noise)
     return noise, F

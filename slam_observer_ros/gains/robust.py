@@ -17,6 +17,10 @@ def observation_weights(
 ) -> FloatArray:
     """Return the weight (m,) of each observation, zero where the gate rejects it.
 
+    What passes has Huber's weight of what is left of its residual after the correction, R S⁻¹ r.
+    That is judged by the sensor's noise R, as in an M-estimator, and not by S: where the state is
+    uncertain a large residual says nothing against the observation.
+
     Parameters
     ----------
     r : FloatArray
@@ -29,13 +33,23 @@ def observation_weights(
         ``rejection_distance`` and ``huber_threshold``.
 
     """
-    passed = distances(r, predicted, noise) <= settings.rejection_distance
-    if passed.all():
-        return _reweighted(r, predicted, noise, settings.huber_threshold)
-    weights, used = np.zeros(len(r)), np.flatnonzero(np.repeat(passed, r.shape[1]))
-    weights[passed] = _reweighted(
-        r[passed], predicted[used][:, used], noise[passed], settings.huber_threshold
-    )
+    gate, weights = settings.rejection_distance, np.ones(len(r))
+    pull = _pull(r, predicted, noise)
+    # No residual is further out than all of them together are.
+    if np.vdot(r, pull) > gate**2:
+        passed = distances(r, predicted, noise) <= gate
+        if not passed.all():
+            used = np.flatnonzero(np.repeat(passed, r.shape[1]))
+            weights[~passed] = 0.0
+            weights[passed] = observation_weights(
+                r[passed], predicted[used][:, used], noise[passed], settings
+            )
+            return weights
+    for _ in range(REWEIGHTINGS):
+        weights = huber_weights(pull, noise, weights, settings.huber_threshold)
+        if weights.min(initial=1.0) == 1.0:
+            break
+        pull = _pull(r, predicted, noise / weights[:, None, None])
     return weights
 
 
@@ -94,19 +108,6 @@ def _diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
     return blocks
 
 
-def _reweighted(
-    r: FloatArray, predicted: FloatArray, noise: FloatArray, threshold: float
-) -> FloatArray:
-    """Return Huber's weights (m,) of what is left of the residuals after the correction.
-
-    The residual left, R S⁻¹ r, is judged by the sensor's noise R, as in an M-estimator, and not
-    by S: where the state is uncertain a large residual says nothing against the observation.
-    """
-    weights = np.ones(len(r))
-    for _ in range(REWEIGHTINGS):
-        S = with_blocks(predicted, noise / weights[:, None, None])
-        pull = solve(S, r.ravel()).reshape(r.shape)
-        weights = huber_weights(pull, noise, weights, threshold)
-        if weights.min(initial=1.0) == 1.0:
-            break
-    return weights
+def _pull(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return S⁻¹ r (m, k)."""
+    return solve(with_blocks(predicted, noise), r.ravel()).reshape(r.shape)
