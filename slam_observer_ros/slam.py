@@ -339,6 +339,8 @@ class Slam:
     def _in_doubt(self, rows: IntArray) -> BoolArray:
         """Return which of the landmarks seen (m,) have been rejected too often to be trusted."""
         counts, rejections = self.landmarks.counts[rows], self.landmarks.rejections[rows]
+        if not rejections.any():  # as nearly always
+            return np.zeros(len(rows), dtype=np.bool_)
         needed = np.where(
             counts < self.settings.confirmations,
             1,

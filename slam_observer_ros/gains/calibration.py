@@ -94,11 +94,13 @@ class Calibration:
         """
         rates = motion.measured_velocities[:, self._calibrated]
         rates[:, self._scales :] = 1.0
-        F: FloatArray = np.einsum('kij,kj,k->ij', Ad[:-1, :, self._calibrated], rates, motion.dt_s)
-        if len(self._calibrated) == self.count:
-            return F
-        first, last = self.apply(motion.at_ends)
-        return np.column_stack([F, Ad[0] @ first - Ad[-1] @ last])
+        of_rates = Ad[:-1, :, self._calibrated] * (rates * motion.dt_s[:, None])[:, None, :]
+        F = np.empty((Ad.shape[1], self.count))
+        F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
+        if len(self._calibrated) < self.count:
+            first, last = self.apply(motion.at_ends)
+            F[:, -1] = Ad[0] @ first - Ad[-1] @ last
+        return F
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
