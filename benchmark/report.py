@@ -62,7 +62,8 @@ METRICS: dict[str, tuple[str, int]] = {
 """Title and decimals of each table."""
 
 OUTLIERS_TITLE = 'Growth of the configuration error with 5 % gross outliers and 1 % swapped ids'
-NO_IDS_TITLE = 'Configuration error with and without ids, m'
+NO_IDS_TITLE = 'Configuration error and CPU time with and without ids'
+NO_IDS_COLUMNS = ('with, m', 'without, m', 'with, s', 'without, s')
 
 INTRODUCTION = """\
 # Accuracy, consistency and cost, compared
@@ -125,7 +126,7 @@ def tables(results: Results) -> str:
         sections.append(_table(title, _cells(clean, metric, decimals), estimators.COLUMNS))
     sections.append(_table(OUTLIERS_TITLE, _growth(results.tables), OUTLIER_COLUMNS))
     if results.tables[NO_IDS]:
-        sections.append(_table(NO_IDS_TITLE, _without_ids(results.tables), ('with', 'without')))
+        sections.append(_table(NO_IDS_TITLE, _without_ids(results.tables), NO_IDS_COLUMNS))
     for loop, columns in results.consistency.items():
         title = f'ANEES of {results.runs} runs: {loop}'
         sections.append(_table(title, _consistency(columns), ('inside', 'pose', 'landmarks')))
@@ -237,13 +238,13 @@ def _growth(tables: Tables) -> dict[str, dict[str, str]]:
 
 
 def _without_ids(tables: Tables) -> dict[str, dict[str, str]]:
-    return {
-        world: {
-            'with': _number(tables[CLEAN][world]['riccati'].configuration_rmse_m, 3),
-            'without': _number(columns['riccati'].configuration_rmse_m, 3),
-        }
-        for world, columns in tables[NO_IDS].items()
-    }
+    rows = {}
+    for world, columns in tables[NO_IDS].items():
+        both = tables[CLEAN][world]['riccati'], columns['riccati']
+        errors = [_number(scores.configuration_rmse_m, 3) for scores in both]
+        times = [_number(scores.cpu_s, 2) for scores in both]
+        rows[world] = dict(zip(NO_IDS_COLUMNS, errors + times, strict=True))
+    return rows
 
 
 def _consistency(columns: dict[str, Consistency]) -> dict[str, dict[str, str]]:
