@@ -73,6 +73,16 @@ def test_the_gate_rejects_the_one_observation_that_is_far_off(rng, outlier, k):
     assert np.all(np.delete(weights, outlier) > 0.0)
 
 
+@given(generators(), st.floats(0.1, 20.0), st.sampled_from([2, 3]))
+def test_each_observation_is_gated_by_its_own_distance(rng, scale, k):
+    """However far out the others are, with which it is correlated."""
+    r, predicted, noise = random_problem(rng, k=k)
+    own = np.einsum('ijik->ijk', predicted.reshape(len(r), k, len(r), k)) + noise
+    distances = np.sqrt(scale**2 * np.einsum('ij,ijk,ik->i', r, np.linalg.inv(own), r))
+    weights = observation_weights(scale * r, predicted, noise, Settings(rejection_distance=6.0))
+    np.testing.assert_array_equal(weights == 0.0, distances > 6.0)
+
+
 @designs
 @modes
 def test_gross_outliers_do_not_throw_the_pose(gains, two_d_mode):
