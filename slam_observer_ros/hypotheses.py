@@ -3,8 +3,8 @@
 Where two readings of an observation put the robot at different places, both are followed, each
 with a state of its own, until later observations have made one much more likely than the other
 (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the robot
-at one place but take what it sees there for different landmarks, as their maps differ. Nearly
-always there is one.
+at one place but take what it sees there for different landmarks, as their maps differ. Where
+landmarks are well apart there is nearly always one.
 """
 
 from __future__ import annotations
@@ -117,6 +117,6 @@ class Hypotheses:
 
 
 def _are_one(slam: Slam, reading: ObservationEvent, other: _Followed) -> bool:
-    """Return whether a state has the robot, and what it sees, where another one has them."""
+    """Return whether a state has the robot and the landmarks seen where another one has them."""
     same_ids = np.array_equal(reading.ids, other.reading.ids)
     return same_ids and slam.is_where(other.slam, reading)

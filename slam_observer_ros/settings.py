@@ -223,7 +223,7 @@ class Settings:
     )
     max_hypotheses: int = parameter(
         8,
-        'Points without id: most places of the robot that are followed until one is clear',
+        'Points without id: most states that are followed until it is clear which one is right',
         minimum=1,
     )
     hindsight_interval: int = parameter(
