@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import logging
 
-from slam_observer_ros.estimates import Hindsight
+from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import (
@@ -63,8 +63,8 @@ def measure(result: Replay, truth: Truth) -> Accuracy:
     )
 
 
-def measure_hindsight(
-    hindsight: Hindsight, truth: Truth
+def measure_smoothed(
+    smoothed: Smoothed, truth: Truth
 ) -> tuple[TrajectoryErrors | None, float | None]:
     """Compare what was smoothed with the truth.
 
@@ -77,14 +77,14 @@ def measure_hindsight(
 
     """
     return (
-        _pose_errors(trajectory_of(hindsight), Trajectory(truth.stamps_ns, truth.poses)),
-        _landmark_rmse_m(hindsight.ids, hindsight.world_points, truth),
+        _pose_errors(trajectory_of(smoothed), Trajectory(truth.stamps_ns, truth.poses)),
+        _landmark_rmse_m(smoothed.ids, smoothed.world_points, truth),
     )
 
 
-def trajectory_of(hindsight: Hindsight) -> Trajectory:
-    """Return the poses of a hindsight as a trajectory."""
-    return Trajectory.from_samples(hindsight.stamps_ns.tolist(), list(hindsight.poses))
+def trajectory_of(smoothed: Smoothed) -> Trajectory:
+    """Return the smoothed poses as a trajectory."""
+    return Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
 
 
 def _pose_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:

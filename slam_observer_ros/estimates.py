@@ -60,7 +60,7 @@ class CalibrationEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Hindsight:
+class Smoothed:
     """Trajectory and map, each pose estimated from all that was seen before and after.
 
     Attributes

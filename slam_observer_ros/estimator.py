@@ -10,7 +10,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.estimates import CalibrationEstimate, Hindsight, Update
+from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
@@ -185,7 +185,7 @@ class Estimator:
         for ready in self._queue.pop_all():
             self._process(ready)
 
-    def smooth(self) -> Hindsight:
+    def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; the state is not changed.
 
         They cover the observations since the history began: all of them with the setting
@@ -198,7 +198,7 @@ class Estimator:
 
         """
         stamps_ns, poses, world_points = self._slam.smooth()
-        return Hindsight(stamps_ns, poses, world_points[self._slam.confirmed], self.landmark_ids)
+        return Smoothed(stamps_ns, poses, world_points[self._slam.confirmed], self.landmark_ids)
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""

@@ -29,7 +29,7 @@ from slam_observer_ros.commands.replay_report import (
     Outcome,
     outcome_of,
     print_summary,
-    with_hindsight,
+    with_smoothed,
 )
 from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_map, plot_residuals
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> None:
         result = replay(events, settings, truth, landmark_map)
         outcome = outcome_of(recording, selected, result, truth)
     if args.smooth:
-        outcome = with_hindsight(outcome)
+        outcome = with_smoothed(outcome)
     _write_files(args, outcome, landmark_map.frame_id if landmark_map else inputs.map_frame)
     if args.json:
         print_json(as_json(outcome))
@@ -112,13 +112,13 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _write_files(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> None:
-    estimator, hindsight = outcome.result.estimator, outcome.hindsight
+    estimator, smoothed = outcome.result.estimator, outcome.smoothed
     landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=map_frame)
     trajectory = outcome.result.trajectory
-    if hindsight is not None:
+    if smoothed is not None:
         # The covariances stay: what the filter knows of the map in the end is hindsight, too.
-        landmark_map = dataclasses.replace(landmark_map, world_points=hindsight.world_points)
-        trajectory = trajectory_of(hindsight)
+        landmark_map = dataclasses.replace(landmark_map, world_points=smoothed.world_points)
+        trajectory = trajectory_of(smoothed)
     if args.tum is not None:
         write_tum(trajectory, args.tum)
     if args.map is not None:
@@ -134,7 +134,7 @@ def _draw(
     result, truth = outcome.result, outcome.truth
     plot_map(
         directory / 'map.png',
-        trajectory if outcome.hindsight is None else fill_gaps(trajectory, result.dead_reckoning),
+        trajectory if outcome.smoothed is None else fill_gaps(trajectory, result.dead_reckoning),
         landmark_map.ids,
         landmark_map.world_points,
         Trajectory(truth.stamps_ns, truth.poses) if outcome.accuracy.pose_errors else None,

@@ -7,9 +7,9 @@ from collections import Counter
 from dataclasses import asdict, dataclass, replace
 import logging
 
-from slam_observer_ros.accuracy import Accuracy, measure, measure_hindsight
+from slam_observer_ros.accuracy import Accuracy, measure, measure_smoothed
 from slam_observer_ros.commands.console import print_table
-from slam_observer_ros.estimates import Hindsight
+from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -70,7 +70,7 @@ class Outcome:
     truth: Truth
     accuracy: Accuracy
     report: Report
-    hindsight: Hindsight | None = None
+    smoothed: Smoothed | None = None
     smoothed_errors: TrajectoryErrors | None = None
     smoothed_landmark_rmse_m: float | None = None
 
@@ -102,19 +102,19 @@ def outcome_of(
     return Outcome(result, truth, accuracy, report)
 
 
-def with_hindsight(outcome: Outcome) -> Outcome:
+def with_smoothed(outcome: Outcome) -> Outcome:
     """Add what the whole recording tells in hindsight."""
     estimator = outcome.result.estimator
-    hindsight = estimator.smooth()
-    if len(hindsight.stamps_ns) < estimator.counts['observation']:
+    smoothed = estimator.smooth()
+    if len(smoothed.stamps_ns) < estimator.counts['observation']:
         logger.warning(
             'Only the last %d observations are smoothed; --set hindsight_window=0 for all.',
-            len(hindsight.stamps_ns),
+            len(smoothed.stamps_ns),
         )
-    errors, landmark_rmse_m = measure_hindsight(hindsight, outcome.truth)
+    errors, landmark_rmse_m = measure_smoothed(smoothed, outcome.truth)
     return replace(
         outcome,
-        hindsight=hindsight,
+        smoothed=smoothed,
         smoothed_errors=errors,
         smoothed_landmark_rmse_m=landmark_rmse_m,
     )
