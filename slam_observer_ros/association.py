@@ -16,7 +16,7 @@ from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
-from slam_observer_ros.joint_compatibility import columns_of, huber_loss, JointSearch, Pairs
+from slam_observer_ros.joint_compatibility import columns_of, JointSearch, Pairs
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
@@ -91,7 +91,7 @@ def find_readings(
     pairs = Pairs(at, rows, innovation.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
     search = JointSearch(pairs, nearly, gate, 0.0 if nearly.all() else MARGIN)
-    lonely_cost = (m - len(np.unique(at))) * float(huber_loss(gate))
+    lonely_cost = (m - len(np.unique(at))) * search.unpaired_cost
     J, R = axes.output_matrix(points), noise[:, :k, :k]
     readings: list[Reading] = []
     moves: list[FloatArray] = []

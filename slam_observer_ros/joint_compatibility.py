@@ -74,11 +74,9 @@ class Pairing:
 
 
 @dataclass(frozen=True, slots=True)
-class _Partial:
+class _Partial(Pairing):
     """A pairing of some points: L is the inverse Cholesky factor of S, z = L r."""
 
-    cost: float
-    chosen: list[int]
     L: FloatArray
     z: FloatArray
 
@@ -97,12 +95,17 @@ class JointSearch:
     margin : float
         How much more than the cheapest a pairing may cost.
 
+    Attributes
+    ----------
+    unpaired_cost : float
+        What each point costs that is taken for no known landmark.
+
     """
 
     def __init__(self, pairs: Pairs, certain: BoolArray, gate: float, margin: float) -> None:
         self._pairs = pairs
         self._certain = certain
-        self._unpaired_cost = float(huber_loss(gate))
+        self.unpaired_cost = float(huber_loss(gate))
         self._margin = margin
         points, counts = np.unique(pairs.points, return_counts=True)
         # Points with the fewest options first: they are the surest, and the others follow them.
@@ -118,7 +121,7 @@ class JointSearch:
             longer.sort(key=lambda one: one.cost)
             worst = longer[0].cost + self._margin
             partial = [one for one in longer[:MAX_PARTIAL] if one.cost <= worst]
-        return [Pairing(one.cost, one.chosen) for one in partial]
+        return list(partial)
 
     def _continued(self, one: _Partial, options: IntArray) -> list[_Partial]:
         """Return a pairing with each of the pairs ``options``, all of one point, and without."""
@@ -126,7 +129,7 @@ class JointSearch:
         free = options[~(self._pairs.landmarks[options][:, None] == taken).any(axis=1)]
         longer = self._with_each(one, free) if len(free) else []
         if not longer or not self._certain[options].all():
-            longer.append(_Partial(one.cost + self._unpaired_cost, one.chosen, one.L, one.z))
+            longer.append(_Partial(one.cost + self.unpaired_cost, one.chosen, one.L, one.z))
         return longer
 
     def _with_each(self, one: _Partial, free: IntArray) -> list[_Partial]:

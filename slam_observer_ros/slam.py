@@ -66,6 +66,7 @@ class Slam:
         self.counts: Counter[str] = Counter()
         self._noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
+        # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self._index = LandmarkIndex()
 

@@ -255,11 +255,15 @@ def test_where_few_pairings_are_possible_the_search_finds_the_cheapest(seed, poi
         if len({at[i] for i in chosen}) == len({rows[i] for i in chosen}) == count
     ]
     pairs = Pairs(at, rows, r, S, noise)
-    found = JointSearch(pairs, np.zeros(q, dtype=bool), gate, np.inf).pairings()
+    certain = np.zeros(q, dtype=bool)
+    found = JointSearch(pairs, certain, gate, np.inf).pairings()
     least = min(cost(chosen) for chosen in possible)
     assert found[0].cost == pytest.approx(least)
     assert found[0].cost == pytest.approx(cost(found[0].chosen))
     assert len(found) == min(len(possible), MAX_PARTIAL)
+    costs = [pairing.cost for pairing in JointSearch(pairs, certain, gate, 10.0).pairings()]
+    assert costs == sorted(costs)
+    assert costs[-1] <= costs[0] + 10.0
 
 
 @pytest.mark.parametrize('seed', range(30))

@@ -45,11 +45,12 @@ def observation_weights(
                 r[passed], predicted[used][:, used], noise[passed], settings
             )
             return weights
-    for _ in range(REWEIGHTINGS):
-        weights = huber_weights(pull, noise, weights, settings.huber_threshold)
+    weights = huber_weights(pull, noise, weights, settings.huber_threshold)
+    for _ in range(REWEIGHTINGS - 1):
         if weights.min(initial=1.0) == 1.0:
             break
         pull = _pull(r, predicted, noise / weights[:, None, None])
+        weights = huber_weights(pull, noise, weights, settings.huber_threshold)
     return weights
 
 
