@@ -91,6 +91,7 @@ def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:
             yield Job(report.CLEAN, name, column, first_s)
         for column in report.OUTLIER_COLUMNS:
             yield Job(report.OUTLIERS, name, column, first_s)
+        yield Job(report.LEFT_OUT, name, 'riccati', first_s)
 
 
 def run_jobs(pool: ProcessPoolExecutor, jobs: list[Job]) -> report.Tables:

@@ -63,6 +63,8 @@ def run_job(job: Job) -> dict[str, Scores]:
         return {job.column: _score_without_ids(world)}
     if job.variant == report.OUTLIERS:
         world = outliers.with_outliers(world, OUTLIER_SEED)
+    if job.variant == report.LEFT_OUT:
+        world = outliers.without_outliers(world, OUTLIER_SEED)
     try:
         runs = _run(job.column, world)
     except IndeterminateError as error:

@@ -1,4 +1,4 @@
-"""Worse data: outliers added to observations, ids taken from them."""
+"""Worse data: outliers added to observations, points or ids taken from them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from worlds import World
 
-from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import Event, ObservationEvent, select, UNKNOWN_ID
 from slam_observer_ros.types import FloatArray, IntArray
 
 GROSS_SHARE = 0.05
@@ -30,6 +30,16 @@ def with_outliers(world: World, seed: int) -> World:
             event = replace(event, points=points, ids=_swapped(event.ids, sorted(seen), rng))
         events.append(event)
     return replace(world, events=events)
+
+
+def without_outliers(world: World, seed: int) -> World:
+    """Leave out the very points that :func:`with_outliers` makes outliers of.
+
+    No estimator can be expected to do better with outliers than without these points.
+    """
+    worse = with_outliers(world, seed)
+    pairs = zip(world.events, worse.events, strict=True)
+    return replace(world, events=[_untouched(event, other) for event, other in pairs])
 
 
 def without_ids(world: World) -> World:
@@ -55,6 +65,13 @@ def _swapped(ids: IntArray, seen: list[int], rng: np.random.Generator) -> IntArr
         ids[ids == other] = ids[i]  # no id may occur twice in one observation
         ids[i] = other
     return ids
+
+
+def _untouched(event: Event, other: Event) -> Event:
+    """Return what the two have in common."""
+    if not isinstance(event, ObservationEvent) or not isinstance(other, ObservationEvent):
+        return event
+    return select(event, (event.ids == other.ids) & (event.points == other.points).all(axis=1))
 
 
 def _anonymous(event: Event) -> Event:

@@ -108,6 +108,19 @@ def is_automatic(ids: IntArray) -> BoolArray:
     return automatic
 
 
+def select(event: ObservationEvent, mask: BoolArray) -> ObservationEvent:
+    """Return the part of an observation that ``mask`` (m,) picks."""
+    if mask.all():
+        return event
+    return replace(
+        event,
+        ids=event.ids[mask],
+        points=event.points[mask],
+        covariances=None if event.covariances is None else event.covariances[mask],
+        velocities=None if event.velocities is None else event.velocities[mask],
+    )
+
+
 def flatten(event: ObservationEvent) -> ObservationEvent:
     """Return the observation without what leaves the plane z = 0."""
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT

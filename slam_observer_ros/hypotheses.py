@@ -1,10 +1,10 @@
-"""What may be: states that take points without an id for different landmarks.
+"""What may be: states that read what was seen differently (:mod:`slam_observer_ros.readings`).
 
 Where two readings of an observation put the robot at different places, both are followed, each
 with a state of its own, until later observations have made one much more likely than the other
 (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the robot
 at one place but take what it sees there for different landmarks, as their maps differ. Where
-landmarks are well apart there is nearly always one.
+landmarks have ids or are well apart there is nearly always one.
 """
 
 from __future__ import annotations
@@ -16,12 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.association import MARGIN
-from slam_observer_ros.events import (
-    FIRST_AUTOMATIC_ID,
-    is_automatic,
-    ObservationEvent,
-    UNKNOWN_ID,
-)
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID, is_automatic, ObservationEvent
+from slam_observer_ros.readings import are_one, is_plain, readings
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray, IntArray
@@ -80,16 +76,17 @@ class Hypotheses:
 
         Ids and residuals are those of :meth:`slam_observer_ros.slam.Slam.observe`.
         """
-        if len(self._states) == 1 and not (event.ids == UNKNOWN_ID).any():
+        if len(self._states) == 1 and is_plain(self.best, event):
             return self.best.observe(event)
-        readings = self._readings(event)
-        least = readings[0][0]
-        uses = Counter(number for _, number, _ in readings)
+        possible = self._possible(event)
+        least = possible[0][0]
+        uses = Counter(number for _, number, _ in possible)
         followed: list[_Followed] = []
-        for cost, number, reading in readings:
+        for cost, number, reading in possible:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
             seen = slam.observe(reading)
+            slam.counts['rejected_landmark'] += len(event.ids) - len(reading.ids)
             if not any(_are_one(slam, reading, other) for other in followed):
                 followed.append(_Followed(cost - least, slam, reading, seen))
             if len(followed) == self._limit:
@@ -98,25 +95,26 @@ class Hypotheses:
         self._states = [one.slam for one in followed]
         return followed[0].seen
 
-    def _readings(self, event: ObservationEvent) -> list[tuple[float, int, ObservationEvent]]:
+    def _possible(self, event: ObservationEvent) -> list[tuple[float, int, ObservationEvent]]:
         """Return what each state may take an observation for: cost, number of the state, reading.
 
         A point has the same id in all of them that take it for a new landmark.
         """
         for slam in self._states:
+            slam.forget_unsupported(event.stamp_ns)
             given = slam.landmarks.ids[is_automatic(slam.landmarks.ids)]  # of a loaded map, too
             self._next_id = max(self._next_id, int(np.max(given, initial=0)) + 1)
         new_ids = self._next_id + np.arange(len(event.ids))
-        readings = [
+        possible = [
             (cost + rise, number, reading)
             for number, (slam, cost) in enumerate(zip(self._states, self._costs, strict=True))
-            for reading, rise in slam.readings(event, new_ids)
+            for reading, rise in readings(slam, event, new_ids)
         ]
-        readings.sort(key=lambda reading: reading[:2])
-        return [reading for reading in readings if reading[0] <= readings[0][0] + MARGIN]
+        possible.sort(key=lambda reading: reading[:2])
+        return [reading for reading in possible if reading[0] <= possible[0][0] + MARGIN]
 
 
 def _are_one(slam: Slam, reading: ObservationEvent, other: _Followed) -> bool:
     """Return whether a state has the robot and the landmarks seen where another one has them."""
     same_ids = np.array_equal(reading.ids, other.reading.ids)
-    return same_ids and slam.is_where(other.slam, reading)
+    return same_ids and are_one(slam, other.slam, reading)

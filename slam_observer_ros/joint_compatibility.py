@@ -153,6 +153,14 @@ class JointSearch:
         ]
 
 
+def joint_cost(r: FloatArray, covariance: FloatArray, noise: FloatArray) -> float:
+    """Return what a pairing costs, of residuals r (m, k) with S (m k, m k) and R (m, k, k)."""
+    L = np.linalg.cholesky(covariance)
+    z = np.linalg.solve(L, r.ravel()).reshape(r.shape)
+    log_det = 2.0 * np.log(np.diagonal(L)).sum() - np.linalg.slogdet(noise)[1].sum()
+    return float(huber_loss(np.sqrt((z * z).sum(axis=1))).sum() + log_det)
+
+
 def huber_loss(distances: FloatArray | float) -> FloatArray:
     """Return ρ(d): d² near zero, and from ``HEAVY_TAIL`` on a line."""
     near = np.minimum(distances, HEAVY_TAIL)

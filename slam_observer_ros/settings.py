@@ -207,7 +207,8 @@ class Settings:
     )
     max_rejections: int = parameter(
         5,
-        'Rejections in a row, all at one place, after which a landmark is taken to have moved',
+        'Rejections in a row, all at one place, after which a landmark is taken to have moved; '
+        'one more than it was seen, if that is fewer',
         minimum=1,
     )
     max_landmarks: int = parameter(
@@ -223,7 +224,8 @@ class Settings:
     )
     max_hypotheses: int = parameter(
         8,
-        'Points without id: most states that are followed until it is clear which one is right',
+        'Points without id, or with one that may be wrong: most states that are followed until it '
+        'is clear which one is right',
         minimum=1,
     )
     hindsight_interval: int = parameter(

@@ -8,14 +8,12 @@ import logging
 
 import numpy as np
 
-from slam_observer_ros.association import find_readings, RESOLUTION
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import is_automatic, ObservationEvent, select, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import mahalanobis
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.landmark_table import LandmarkTable
@@ -52,6 +50,10 @@ class Slam:
         Ids and counts of the n known landmarks.
     is_mapping : bool
         Whether landmarks are added, and taken to have moved if they are rejected too often.
+    noise : NoiseModel
+        Noise of velocities and observations.
+    index : LandmarkIndex
+        For landmarks near a point.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
 
@@ -64,11 +66,11 @@ class Slam:
         self.landmarks = LandmarkTable()
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
-        self._noise = NoiseModel(settings)
+        self.noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
-        self._index = LandmarkIndex()
+        self.index = LandmarkIndex()
 
     @property
     def confirmed(self) -> IntArray:
@@ -152,58 +154,12 @@ class Slam:
         return motion(
             velocities,
             self.gains.calibration,
-            self._noise,
+            self.noise,
             self.observer,
             start_ns,
             end_ns,
             self._end_velocity,
         )
-
-    def readings(
-        self, event: ObservationEvent, new_ids: IntArray
-    ) -> list[tuple[ObservationEvent, float]]:
-        """Return what an observation may mean where it has no ids, the most likely first.
-
-        Parameters
-        ----------
-        event : ObservationEvent
-            The observation, of m points.
-        new_ids : IntArray
-            (m,) ids of points that are taken for landmarks not seen before.
-
-        Returns
-        -------
-        list of tuple
-            The observation with all ids filled in, and what it costs: −2 ln of its likelihood. As
-            it came and 0 if the gains know no joint covariance to judge it by.
-
-        """
-        if not isinstance(self.gains, RiccatiGains):
-            return [(event, 0.0)]
-        self._forget_unsupported(event.stamp_ns)
-        ids = self.landmarks.ids
-        found = find_readings(
-            self.observer,
-            self.gains,
-            self._index,
-            se3.transform(self.observer.A, event.points),
-            self._turned(self._noise.observation(event)),
-            self.landmarks.indices_of(event.ids),
-            self.settings,
-        )
-        events = []
-        for reading in found:
-            named = np.where(reading.rows < 0, new_ids, np.append(ids, UNKNOWN_ID)[reading.rows])
-            named = np.where(event.ids == UNKNOWN_ID, named, event.ids)
-            events.append((replace(event, ids=named), reading.cost))
-        return events
-
-    def is_where(self, other: Slam, event: ObservationEvent) -> bool:
-        """Return whether the robot is where ``other`` has it, as far as the points seen tell."""
-        here, there = self.observer.pose, other.observer.pose
-        shifts = se3.transform(here, event.points) - se3.transform(there, event.points)
-        noise = here[:3, :3] @ self._noise.observation(event) @ here[:3, :3].T
-        return len(shifts) > 0 and bool(np.max(mahalanobis(shifts, noise)) <= RESOLUTION)
 
     def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the state's instant.
@@ -219,20 +175,20 @@ class Slam:
         identified = event.ids != UNKNOWN_ID
         if not identified.all():
             self.counts['unknown_id'] += int(np.sum(~identified))
-            event = _select(event, identified)
+            event = select(event, identified)
         rows = self.landmarks.indices_of(event.ids)
         known = rows >= 0
         if not self.is_mapping:
             self.counts['unmapped_landmark'] += int(np.sum(~known))
-            event, rows, known = _select(event, known), rows[known], known[known]
+            event, rows, known = select(event, known), rows[known], known[known]
         self.gains.recall(self.observer, rows[known])
         ids, covariances = event.ids[known], self._covariances(event, rows)
-        residuals = self._innovate(_select(event, known), rows[known], covariances[known])
+        residuals = self._innovate(select(event, known), rows[known], covariances[known])
         if not known.all():
-            self._initialise(_select(event, ~known), covariances[~known])
+            self._initialise(select(event, ~known), covariances[~known])
             rows = self.landmarks.indices_of(event.ids)
             kept = rows >= 0
-            event, rows, covariances = _select(event, kept), rows[kept], covariances[kept]
+            event, rows, covariances = select(event, kept), rows[kept], covariances[kept]
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows, event.velocities)
         self._look_back(event, rows, covariances)
@@ -265,6 +221,37 @@ class Slam:
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
 
+    def forget_unsupported(self, stamp_ns: int) -> None:
+        """Forget landmarks without an id that were seen too seldom, and not lately."""
+        table = self.landmarks
+        unseen_s = (stamp_ns - table.last_seen_ns) * 1e-9
+        unsupported = is_automatic(table.ids) & (table.counts < self.settings.confirmations)
+        forgotten = np.flatnonzero(unsupported & (unseen_s > self.settings.support_timeout))
+        if len(forgotten):
+            self.remove(forgotten)
+            self.counts['unsupported_landmark'] += len(forgotten)
+
+    def innovation(
+        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
+    ) -> Innovation:
+        """Return what the landmarks ``rows`` (m,), seen with ``covariances`` (m, 3, 3), tell."""
+        e, r = self.observer.errors(rows, event.points)
+        since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
+        return Innovation(
+            rows,
+            e,
+            r,
+            self.observer.a[rows],
+            self.turned(covariances),
+            (event.stamp_ns - since_ns) * 1e-9,
+        )
+
+    def turned(self, covariances: FloatArray) -> FloatArray:
+        """Return covariances (m, 3, 3) from the body frame in the reference frame."""
+        R = self.observer.A[:3, :3]
+        turned: FloatArray = R @ covariances @ R.T
+        return turned
+
     def _turn_to_world(self, A: FloatArray) -> FloatArray:
         """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
         J = np.eye(6)
@@ -277,7 +264,7 @@ class Slam:
         """Correct the state by m known landmarks; return their residuals (m, 3)."""
         if not len(rows):
             return np.empty((0, 3))
-        innovation = self._innovation(event, rows, covariances)
+        innovation = self.innovation(event, rows, covariances)
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
@@ -291,26 +278,6 @@ class Slam:
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return innovation.r
 
-    def _innovation(
-        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
-    ) -> Innovation:
-        e, r = self.observer.errors(rows, event.points)
-        since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
-        return Innovation(
-            rows,
-            e,
-            r,
-            self.observer.a[rows],
-            self._turned(covariances),
-            (event.stamp_ns - since_ns) * 1e-9,
-        )
-
-    def _turned(self, covariances: FloatArray) -> FloatArray:
-        """Return covariances (m, 3, 3) from the body frame in the reference frame."""
-        R = self.observer.A[:3, :3]
-        turned: FloatArray = R @ covariances @ R.T
-        return turned
-
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return the covariances (m, 3, 3) of observed points, body frame, m².
 
@@ -320,11 +287,11 @@ class Slam:
         is in doubt, or that was seen so seldom that it may itself be an outlier.
         """
         if event.covariances is not None or not len(self.landmarks):
-            return self._noise.observation(event)
+            return self.noise.observation(event)
         is_confirmed = self.landmarks.counts[rows] >= self.settings.confirmations
         is_sure = (rows >= 0) & is_confirmed & ~self._in_doubt(rows)
         points = np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
-        return self._noise.observation(replace(event, points=points))
+        return self.noise.observation(replace(event, points=points))
 
     def _look_back(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them."""
@@ -335,24 +302,23 @@ class Slam:
         seen = Seen(event.stamp_ns, rows, event.points, covariances)
         self.gains.look_back(self.observer, seen, some_are)
         if some_are:
-            self._relocate(_select(event, in_doubt), rows[in_doubt], covariances[in_doubt])
+            self._relocate(select(event, in_doubt), rows[in_doubt], covariances[in_doubt])
 
     def _in_doubt(self, rows: IntArray) -> BoolArray:
-        """Return which of the landmarks seen (m,) have been rejected too often to be trusted."""
+        """Return which of the landmarks seen (m,) have been rejected too often to be trusted.
+
+        That is more often than they were seen: until then they may be outliers themselves.
+        """
         counts, rejections = self.landmarks.counts[rows], self.landmarks.rejections[rows]
         if not rejections.any():  # as nearly always
             return np.zeros(len(rows), dtype=np.bool_)
-        needed = np.where(
-            counts < self.settings.confirmations,
-            1,
-            np.minimum(counts, self.settings.max_rejections),
-        )
+        needed = np.minimum(counts + 1, self.settings.max_rejections)
         in_doubt: BoolArray = rejections >= needed
         return in_doubt
 
     def _relocate(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Start landmarks anew that are still far from where they were expected."""
-        innovation = self._innovation(event, rows, covariances)
+        innovation = self.innovation(event, rows, covariances)
         far = self.gains.distances(innovation) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():
@@ -363,16 +329,6 @@ class Slam:
             y_ref = self.observer.y_ref[rows[far]]
             self.gains.relocate_landmarks(rows[far], y_ref, innovation.covariances[far])
             self.landmarks.restart(rows[far])
-
-    def _forget_unsupported(self, stamp_ns: int) -> None:
-        """Forget landmarks without an id that were seen too seldom, and not lately."""
-        table = self.landmarks
-        unseen_s = (stamp_ns - table.last_seen_ns) * 1e-9
-        unsupported = is_automatic(table.ids) & (table.counts < self.settings.confirmations)
-        forgotten = np.flatnonzero(unsupported & (unseen_s > self.settings.support_timeout))
-        if len(forgotten):
-            self.remove(forgotten)
-            self.counts['unsupported_landmark'] += len(forgotten)
 
     def _make_room(self, event: ObservationEvent) -> ObservationEvent:
         """Forget landmarks out of view, least often seen first; return the new ones that fit."""
@@ -388,7 +344,7 @@ class Slam:
         self.remove(forgotten)
         self.counts['forgotten_landmark'] += len(forgotten)
         self.counts['unmapped_landmark'] += new - fitting
-        return _select(event, np.arange(new) < fitting)
+        return select(event, np.arange(new) < fitting)
 
     def _initialise(self, event: ObservationEvent, covariances: FloatArray) -> None:
         """Add landmarks where they were seen."""
@@ -397,20 +353,7 @@ class Slam:
         if not m:
             return
         self.observer.add_landmarks(event.points)
-        self.gains.add_landmarks(self.observer.y_ref[-m:], self._turned(covariances[:m]))
+        self.gains.add_landmarks(self.observer.y_ref[-m:], self.turned(covariances[:m]))
         self.landmarks.add(event.ids, event.stamp_ns)
         if self._innovation_ns is None:
             self._innovation_ns = event.stamp_ns
-
-
-def _select(event: ObservationEvent, mask: BoolArray) -> ObservationEvent:
-    """Return the part of an observation that ``mask`` (m,) picks."""
-    if mask.all():
-        return event
-    return replace(
-        event,
-        ids=event.ids[mask],
-        points=event.points[mask],
-        covariances=None if event.covariances is None else event.covariances[mask],
-        velocities=None if event.velocities is None else event.velocities[mask],
-    )

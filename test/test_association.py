@@ -29,6 +29,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.joint_compatibility import (
     columns_of,
     huber_loss,
+    joint_cost,
     JointSearch,
     MAX_PARTIAL,
     Pairs,
@@ -260,6 +261,11 @@ def test_where_few_pairings_are_possible_the_search_finds_the_cheapest(seed, poi
     least = min(cost(chosen) for chosen in possible)
     assert found[0].cost == pytest.approx(least)
     assert found[0].cost == pytest.approx(cost(found[0].chosen))
+    best = found[0].chosen
+    columns = columns_of(best, k)
+    unpaired_cost = (len(np.unique(at)) - len(best)) * huber_loss(gate)
+    paired_cost = joint_cost(r[best], S[np.ix_(columns, columns)], noise[best])
+    assert paired_cost + unpaired_cost == pytest.approx(least)
     assert len(found) == min(len(possible), MAX_PARTIAL)
     costs = [pairing.cost for pairing in JointSearch(pairs, certain, gate, 10.0).pairings()]
     assert costs == sorted(costs)

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from strategies import generators
 
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.robust import (
     block_diagonal,
     huber_weights,
     mahalanobis,
     observation_weights,
+    suspects,
 )
 from slam_observer_ros.settings import Settings
 
@@ -83,6 +86,58 @@ def test_each_observation_is_gated_by_its_own_distance(rng, scale, k):
     np.testing.assert_array_equal(weights == 0.0, distances > 6.0)
 
 
+@given(generators(), st.floats(0.0, 1e3), st.floats(0.0, 300.0), st.sampled_from([2, 3]))
+def test_suspect_is_what_passes_only_since_the_state_is_uncertain(rng, spread, scale, k):
+    """By what is left of each residual once all others that pass are believed."""
+    r, predicted, noise = random_problem(rng, k=k)
+    r, predicted = scale * r, spread * predicted
+    S = predicted + block_diagonal(noise)
+    own = np.einsum('ijik->ijk', S.reshape(len(r), k, len(r), k))
+    passed = np.flatnonzero(mahalanobis(r, own) <= 6.0)
+    expected = np.zeros(len(r), dtype=bool)
+    for i in passed:
+        one = k * i + np.arange(k)
+        others = (k * passed[passed != i][:, None] + np.arange(k)).ravel()
+        foretold = S[np.ix_(one, others)] @ np.linalg.solve(
+            S[np.ix_(others, others)], r.ravel()[others]
+        )
+        left = (r[i] - foretold)[None]
+        expected[i] = mahalanobis(left, noise[[i]])[0] > 3.0 * 6.0
+    found = suspects(r, predicted, noise, Settings(rejection_distance=6.0))
+    np.testing.assert_array_equal(found, expected)
+
+
+@modes
+def test_a_wrong_id_after_a_blind_stretch_does_not_throw_the_pose(two_d_mode):
+    """Seen once, it looks like a loop closed; where the robot really is, others tell later."""
+    settings = Settings(two_d_mode=two_d_mode, unknown_linear_motion=1.0)
+    posts = np.array([[2.0, 1.0, 0.0], [2.0, -1.0, 0.0], [6.0, 3.0, 0.0], [6.0, -4.0, 0.0]])
+
+    def last_errors_m(max_hypotheses):
+        """Look ten times; go 4 m in 8 s without odometry; look 31 times, at the end all around."""
+        estimator, errors_m = Estimator(replace(settings, max_hypotheses=max_hypotheses)), []
+        for step in range(41):
+            stamp_ns = (100 + step) * 100_000_000 + (step >= 10) * 8_000_000_000
+            ahead_m = np.array([4.0 * (step >= 10), 0.0, 0.0])
+            named = {2: 0} if step == 10 else {0: 0, 1: 1} if step < 10 else {2: 2, 3: 3}
+            named |= {0: 0, 1: 1} if step > 30 else {}
+            event = ObservationEvent(
+                stamp_ns, np.array([*named.values()]), posts[[*named]] - ahead_m
+            )
+            assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+            assert estimator.add(event)
+            estimator.flush()
+            errors_m.append(np.linalg.norm(estimator.pose[:3, 3] - ahead_m))
+        assert errors_m[10] > 1.0  # an id is believed until something speaks against it
+        return errors_m[-5:], estimator.counts
+
+    errors_m, counts = last_errors_m(max_hypotheses=8)
+    assert max(errors_m) < 0.2
+    assert counts['rejected_landmark'] == 1
+    assert counts['moved_landmark'] == 0
+    assert min(last_errors_m(max_hypotheses=1)[0]) > 1.0
+
+
 @designs
 @modes
 def test_gross_outliers_do_not_throw_the_pose(gains, two_d_mode):
@@ -127,20 +182,35 @@ def test_an_outlier_at_first_sight_does_not_survive(gains, two_d_mode):
 
 
 @designs
-def test_an_unconfirmed_landmark_gives_way_to_the_first_contradiction(gains):
-    """Seen twice at a wrong place and three times at the right one, then out of view."""
+def test_a_landmark_gives_way_once_it_was_contradicted_more_often_than_seen(gains):
+    """Seen twice at a wrong place and five times at the right one, then out of view."""
     settings = Settings(gains=gains, confirmations=3)
     world = drive(settings, 5.0, landmarks=5, seen=5)
 
     def throw(index, event):
         is_off = (event.ids == 2) & (index < 2)
-        kept = (event.ids != 2) | (index < 5)
+        kept = (event.ids != 2) | (index < 7)
         points = event.points + is_off[:, None] * body_shift(world, event, [8.0, -8.0, 0.0])
         return replace(event, ids=event.ids[kept], points=points[kept])
 
     estimator = estimate(world.with_observations(throw), settings)
     row = list(estimator.landmark_ids).index(2)
+    assert estimator.landmark_counts[row] == 3
     assert np.linalg.norm(estimator.world_points[row] - world.world_points[2]) < 1.0
+
+
+@designs
+def test_a_landmark_seen_twice_outlives_an_outlier(gains):
+    settings = Settings(gains=gains, confirmations=3)
+    world = drive(settings, 5.0, landmarks=5, seen=5)
+
+    def throw(index, event):
+        is_off = (event.ids == 2) & (index == 2)
+        return replace(event, points=event.points + is_off[:, None] * [8.0, -8.0, 0.0])
+
+    estimator = estimate(world.with_observations(throw), settings)
+    row = list(estimator.landmark_ids).index(2)
+    assert estimator.landmark_counts[row] == len(world.observations()) - 1
 
 
 @designs

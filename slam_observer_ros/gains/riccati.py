@@ -32,16 +32,18 @@ from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import (
+    are_far,
     block_diagonal,
     mahalanobis,
     observation_weights,
+    suspects,
     with_blocks,
 )
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Prior, Solution, Step
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
 class RiccatiGains:
@@ -217,6 +219,15 @@ class RiccatiGains:
         columns = self._columns(innovation.indices).reshape(-1, k)
         _, CPC = self._output_covariances(self._chord_output(innovation), columns)
         return mahalanobis(innovation.r[:, :k], CPC + innovation.covariances[:, :k, :k])
+
+    def suspects(self, innovation: Innovation) -> BoolArray:
+        """Return which observations (m,) only pass the gate since the state is so uncertain."""
+        k = self._axes.point
+        r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
+        far = are_far(r, noise, self._settings)
+        if far.any():
+            far &= suspects(r, self.foretold(innovation)[1], noise, self._settings)
+        return far
 
     def foretold(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Return what the state foretells of m residuals, as it is to judge them by.

@@ -1,4 +1,7 @@
-"""How far an observation is trusted: a Mahalanobis gate, then Huber's weight on what passes."""
+"""How far an observation is trusted: a Mahalanobis gate, then Huber's weight on what passes.
+
+Where the state is uncertain the gate is wide, and outliers pass it: see :func:`suspects`.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,15 @@ import numpy as np
 
 from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.types import BoolArray, FloatArray
 
 REWEIGHTINGS = 2
 """Rounds of reweighted least squares; the weights hardly change after the second."""
+
+SUSPICION = 3.0
+"""How many times the gate an observation must be off, by the sensor's noise alone, to be suspect.
+One that is off by less can't throw the pose far.
+"""
 
 
 def observation_weights(
@@ -52,6 +60,30 @@ def observation_weights(
         pull = _pull(r, predicted, noise / weights[:, None, None])
         weights = huber_weights(pull, noise, weights, settings.huber_threshold)
     return weights
+
+
+def are_far(r: FloatArray, noise: FloatArray, settings: Settings) -> BoolArray:
+    """Return which residuals (m,) are too large for a state that was known; see SUSPICION."""
+    return mahalanobis(r, noise) > SUSPICION * settings.rejection_distance
+
+
+def suspects(
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
+) -> BoolArray:
+    """Return which observations (m,) only pass the gate since the state is so uncertain.
+
+    They are far off even if all others are true, which leave ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i of r_i.
+    Parameters as above.
+    """
+    passed, k = distances(r, predicted, noise) <= settings.rejection_distance, r.shape[1]
+    used = np.flatnonzero(np.repeat(passed, k))
+    S = with_blocks(predicted[used][:, used], noise[passed])
+    information: FloatArray = np.linalg.inv(S).astype(np.float64)
+    pull = (information @ r[passed].ravel()).reshape(-1, k, 1)
+    left = np.asarray(np.linalg.solve(_diagonal_blocks(information, k), pull)[:, :, 0])
+    found = np.zeros(len(r), dtype=np.bool_)
+    found[passed] = are_far(left, noise[passed], settings)
+    return found
 
 
 def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
