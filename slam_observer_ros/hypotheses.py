@@ -76,8 +76,10 @@ class Hypotheses:
 
         Ids and residuals are those of :meth:`slam_observer_ros.slam.Slam.observe`.
         """
-        if len(self._states) == 1 and is_plain(self.best, event):
-            return self.best.observe(event)
+        if len(self._states) == 1:
+            sighting = self.best.look(event)
+            if is_plain(self.best, event, sighting):
+                return self.best.observe(event, sighting)
         possible = self._possible(event)
         least = possible[0][0]
         uses = Counter(number for _, number, _ in possible)

@@ -18,16 +18,16 @@ from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import distances, mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.joint_compatibility import huber_loss, joint_cost
-from slam_observer_ros.slam import Slam
-from slam_observer_ros.types import BoolArray, IntArray
+from slam_observer_ros.slam import Sighting, Slam
+from slam_observer_ros.types import IntArray
 
 
-def is_plain(slam: Slam, event: ObservationEvent) -> bool:
+def is_plain(slam: Slam, event: ObservationEvent, sighting: Sighting) -> bool:
     """Return whether there is but one reading of an observation: as it came."""
     if not isinstance(slam.gains, RiccatiGains):
         return True
     has_ids = not (event.ids == UNKNOWN_ID).any()
-    return has_ids and not _suspects(slam, slam.gains, event).any()
+    return has_ids and not slam.gains.suspects(sighting.innovation).any()
 
 
 def readings(
@@ -56,12 +56,15 @@ def readings(
         return [(event, 0.0)]
     if (event.ids == UNKNOWN_ID).any():
         return _named(slam, slam.gains, event, new_ids)
-    trusting = _cost(slam, slam.gains, event)
+    sighting = slam.look(event)
+    trusting = _cost(slam, slam.gains, event, sighting.innovation)
     found = [(event, trusting)]
-    for suspect in np.flatnonzero(_suspects(slam, slam.gains, event)):
-        others = select(event, np.arange(len(event.ids)) != suspect)
-        cost = _cost(slam, slam.gains, others) + huber_loss(slam.settings.rejection_distance)
-        found.append((others, max(float(cost), trusting)))
+    suspects = slam.gains.suspects(sighting.innovation)
+    for row in sighting.innovation.indices[suspects]:
+        others = select(event, event.ids != slam.landmarks.ids[row])
+        cost = _cost(slam, slam.gains, others, slam.look(others).innovation)
+        cost += float(huber_loss(slam.settings.rejection_distance))
+        found.append((others, max(cost, trusting)))
     return found
 
 
@@ -95,19 +98,11 @@ def _named(
     return events
 
 
-def _suspects(slam: Slam, gains: RiccatiGains, event: ObservationEvent) -> BoolArray:
-    """Return which points (m,) pass the gate only since the state is so uncertain."""
-    found = slam.landmarks.indices_of(event.ids) >= 0
-    if found.any():
-        found[found] = gains.suspects(_innovation(slam, select(event, found)))
-    return found
-
-
-def _cost(slam: Slam, gains: RiccatiGains, event: ObservationEvent) -> float:
+def _cost(
+    slam: Slam, gains: RiccatiGains, event: ObservationEvent, innovation: Innovation
+) -> float:
     """Return what it costs to take points for the landmarks whose ids they have."""
     gate, k = slam.settings.rejection_distance, 2 if slam.settings.two_d_mode else 3
-    known = select(event, slam.landmarks.indices_of(event.ids) >= 0)
-    innovation = _innovation(slam, known)
     r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
     predicted = gains.foretold(innovation)[1]
     passed = distances(r, predicted, noise) <= gate
@@ -115,8 +110,3 @@ def _cost(slam: Slam, gains: RiccatiGains, event: ObservationEvent) -> float:
     S = with_blocks(predicted[used][:, used], noise[passed])
     unpaired = len(event.ids) - np.sum(passed)
     return joint_cost(r[passed], S, noise[passed]) + float(unpaired * huber_loss(gate))
-
-
-def _innovation(slam: Slam, event: ObservationEvent) -> Innovation:
-    rows = slam.landmarks.indices_of(event.ids)
-    return slam.innovation(event, rows, slam.noise.observation(event))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import logging
 
 import numpy as np
@@ -28,6 +28,29 @@ logger = logging.getLogger(__name__)
 
 SAME_PLACE = 4.0
 """Rejections within this many standard deviations of each other are at one place."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What an observation tells a state.
+
+    Attributes
+    ----------
+    event : ObservationEvent
+        The observation, of those of its m points that have an id and may be used.
+    rows : IntArray
+        (m,) row of the landmark that each of them is, −1 where it is new.
+    covariances : FloatArray
+        (m, 3, 3) their covariances, body frame, m².
+    innovation : Innovation
+        Of those that are not new.
+
+    """
+
+    event: ObservationEvent
+    rows: IntArray
+    covariances: FloatArray
+    innovation: Innovation
 
 
 class Slam:
@@ -161,8 +184,29 @@ class Slam:
             self._end_velocity,
         )
 
-    def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
+    def look(self, event: ObservationEvent) -> Sighting:
+        """Return what an observation made at the state's instant tells, before it is used."""
+        event = select(event, event.ids != UNKNOWN_ID)
+        rows = self.landmarks.indices_of(event.ids)
+        if not self.is_mapping:
+            event, rows = select(event, rows >= 0), rows[rows >= 0]
+        known = rows >= 0
+        self.gains.recall(self.observer, rows[known])
+        covariances = self._covariances(event, rows)
+        innovation = self._innovation(select(event, known), rows[known], covariances[known])
+        return Sighting(event, rows, covariances, innovation)
+
+    def observe(
+        self, event: ObservationEvent, sighting: Sighting | None = None
+    ) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the state's instant.
+
+        Parameters
+        ----------
+        event : ObservationEvent
+            The observation.
+        sighting : Sighting, optional
+            What :meth:`look` has returned for it, if it was asked before.
 
         Returns
         -------
@@ -172,18 +216,14 @@ class Slam:
             (m, 3) their residuals before the correction, metres, reference frame.
 
         """
-        identified = event.ids != UNKNOWN_ID
-        if not identified.all():
-            self.counts['unknown_id'] += int(np.sum(~identified))
-            event = select(event, identified)
-        rows = self.landmarks.indices_of(event.ids)
+        sighting = self.look(event) if sighting is None else sighting
+        unknown = int(np.sum(event.ids == UNKNOWN_ID))
+        self.counts['unknown_id'] += unknown
+        self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
+        event, rows, covariances = sighting.event, sighting.rows, sighting.covariances
         known = rows >= 0
-        if not self.is_mapping:
-            self.counts['unmapped_landmark'] += int(np.sum(~known))
-            event, rows, known = select(event, known), rows[known], known[known]
-        self.gains.recall(self.observer, rows[known])
-        ids, covariances = event.ids[known], self._covariances(event, rows)
-        residuals = self._innovate(select(event, known), rows[known], covariances[known])
+        ids = event.ids[known]
+        self._innovate(select(event, known), sighting.innovation)
         if not known.all():
             self._initialise(select(event, ~known), covariances[~known])
             rows = self.landmarks.indices_of(event.ids)
@@ -192,7 +232,7 @@ class Slam:
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows, event.velocities)
         self._look_back(event, rows, covariances)
-        return ids, residuals
+        return ids, sighting.innovation.r
 
     def smooth(self) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return stamps (s,), poses (s, 4, 4) and points (n, 3), all in the world, in hindsight.
@@ -231,7 +271,36 @@ class Slam:
             self.remove(forgotten)
             self.counts['unsupported_landmark'] += len(forgotten)
 
-    def innovation(
+    def turned(self, covariances: FloatArray) -> FloatArray:
+        """Return covariances (m, 3, 3) from the body frame in the reference frame."""
+        R = self.observer.A[:3, :3]
+        turned: FloatArray = R @ covariances @ R.T
+        return turned
+
+    def _turn_to_world(self, A: FloatArray) -> FloatArray:
+        """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
+        J = np.eye(6)
+        J[3:, :3] = -so3.hat(A[:3, 3])
+        return np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
+
+    def _innovate(self, event: ObservationEvent, innovation: Innovation) -> None:
+        """Correct the state by m known landmarks, those of ``event``."""
+        rows = innovation.indices
+        if not len(rows):
+            return
+        correction, weights = self.gains.correct(innovation)
+        self.observer.correct(correction)
+        self.gains.settle(self.observer)
+        self._innovation_ns = event.stamp_ns
+        rejected = weights == 0.0
+        self.landmarks.see(rows[~rejected], event.stamp_ns)
+        if rejected.any():
+            spread_m = np.sqrt(np.trace(innovation.covariances[rejected], axis1=1, axis2=2))
+            places = se3.transform(self.observer.pose, event.points[rejected])
+            self.landmarks.reject(rows[rejected], places, SAME_PLACE * spread_m)
+            self.counts['rejected_landmark'] += int(np.sum(rejected))
+
+    def _innovation(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
     ) -> Innovation:
         """Return what the landmarks ``rows`` (m,), seen with ``covariances`` (m, 3, 3), tell."""
@@ -245,38 +314,6 @@ class Slam:
             self.turned(covariances),
             (event.stamp_ns - since_ns) * 1e-9,
         )
-
-    def turned(self, covariances: FloatArray) -> FloatArray:
-        """Return covariances (m, 3, 3) from the body frame in the reference frame."""
-        R = self.observer.A[:3, :3]
-        turned: FloatArray = R @ covariances @ R.T
-        return turned
-
-    def _turn_to_world(self, A: FloatArray) -> FloatArray:
-        """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
-        J = np.eye(6)
-        J[3:, :3] = -so3.hat(A[:3, 3])
-        return np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
-
-    def _innovate(
-        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
-    ) -> FloatArray:
-        """Correct the state by m known landmarks; return their residuals (m, 3)."""
-        if not len(rows):
-            return np.empty((0, 3))
-        innovation = self.innovation(event, rows, covariances)
-        correction, weights = self.gains.correct(innovation)
-        self.observer.correct(correction)
-        self.gains.settle(self.observer)
-        self._innovation_ns = event.stamp_ns
-        rejected = weights == 0.0
-        self.landmarks.see(rows[~rejected], event.stamp_ns)
-        if rejected.any():
-            spread_m = np.sqrt(np.trace(innovation.covariances[rejected], axis1=1, axis2=2))
-            places = se3.transform(self.observer.pose, event.points[rejected])
-            self.landmarks.reject(rows[rejected], places, SAME_PLACE * spread_m)
-            self.counts['rejected_landmark'] += int(np.sum(rejected))
-        return innovation.r
 
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return the covariances (m, 3, 3) of observed points, body frame, m².
@@ -318,7 +355,7 @@ class Slam:
 
     def _relocate(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Start landmarks anew that are still far from where they were expected."""
-        innovation = self.innovation(event, rows, covariances)
+        innovation = self._innovation(event, rows, covariances)
         far = self.gains.distances(innovation) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():
