@@ -16,7 +16,7 @@ from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
-from slam_observer_ros.joint_compatibility import columns_of, JointSearch, Pairs
+from slam_observer_ros.joint_compatibility import columns_of, huber_loss, JointSearch, Pairs
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
@@ -57,6 +57,7 @@ def find_readings(
     noise: FloatArray,
     known_rows: IntArray,
     settings: Settings,
+    budget: float,
 ) -> list[Reading]:
     """Return all readings of an observation that put the robot at different places.
 
@@ -74,6 +75,8 @@ def find_readings(
         (m,) row of the landmark that the sensor says it is, −1 where it gives no id.
     settings : Settings
         ``rejection_distance`` is how far a point may be from its landmark, in σ.
+    budget : float
+        What a reading may cost at most.
 
     Returns
     -------
@@ -90,16 +93,15 @@ def find_readings(
     S = with_blocks(CPC, own_noise)
     pairs = Pairs(at, rows, innovation.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
-    search = JointSearch(pairs, nearly, gate, 0.0 if nearly.all() else MARGIN)
-    lonely_cost = (m - len(np.unique(at))) * search.unpaired_cost
-    J, R = axes.output_matrix(points), noise[:, :k, :k]
+    lonely_cost = float((m - len(np.unique(at))) * huber_loss(gate))
+    margin = 0.0 if nearly.all() else MARGIN
+    search = JointSearch(pairs, nearly, gate, margin, budget - lonely_cost)
+    J = np.linalg.inv(np.linalg.cholesky(noise[:, :k, :k])) @ axes.output_matrix(points)
     readings: list[Reading] = []
     moves: list[FloatArray] = []
     for pairing in search.pairings():
-        columns = columns_of(pairing.chosen, k)
-        r = pairs.residuals[pairing.chosen].ravel()
-        move = J @ (PC[:, columns] @ np.linalg.solve(S[np.ix_(columns, columns)], r))
-        if all(np.max(mahalanobis(move - other, R)) > RESOLUTION for other in moves):
+        move = J @ PC[:, columns_of(pairing.chosen, k)] @ (pairing.L.T @ pairing.z)  # in σ
+        if all(_largest(move - other) > RESOLUTION for other in moves):
             found = np.full(m, -1)
             found[at[pairing.chosen]] = rows[pairing.chosen]
             readings.append(Reading(found, pairing.cost + lonely_cost))
@@ -138,6 +140,11 @@ def _as_innovation(
     a = observer.a[rows]
     e = points - a
     return Innovation(rows, e, e - observer.y_ref[rows], a, noise, 0.0)
+
+
+def _largest(vectors: FloatArray) -> float:
+    """Return the largest norm of vectors (m, k)."""
+    return float(np.sqrt((vectors * vectors).sum(axis=1).max()))
 
 
 def _spread_m(covariances: FloatArray) -> FloatArray:

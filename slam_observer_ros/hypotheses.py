@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from copy import deepcopy
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -107,13 +108,14 @@ class Hypotheses:
             given = slam.landmarks.ids[is_automatic(slam.landmarks.ids)]  # of a loaded map, too
             self._next_id = max(self._next_id, int(np.max(given, initial=0)) + 1)
         new_ids = self._next_id + np.arange(len(event.ids))
-        possible = [
-            (cost + rise, number, reading)
-            for number, (slam, cost) in enumerate(zip(self._states, self._costs, strict=True))
-            for reading, rise in readings(slam, event, new_ids)
-        ]
+        possible: list[tuple[float, int, ObservationEvent]] = []
+        worst = math.inf
+        for number, (slam, cost) in enumerate(zip(self._states, self._costs, strict=True)):
+            for reading, rise in readings(slam, event, new_ids, worst - cost):
+                possible.append((cost + rise, number, reading))
+                worst = min(worst, cost + rise + MARGIN)
         possible.sort(key=lambda reading: reading[:2])
-        return [reading for reading in possible if reading[0] <= possible[0][0] + MARGIN]
+        return [reading for reading in possible if reading[0] <= worst]
 
 
 def _are_one(slam: Slam, reading: ObservationEvent, other: _Followed) -> bool:

@@ -15,7 +15,8 @@ at 6 σ, and by d² it would outweigh much that speaks for it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -56,7 +57,7 @@ class Pairs:
     noise: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Pairing:
     """Some of the pairs, none with a point or landmark of another.
 
@@ -65,20 +66,53 @@ class Pairing:
     cost : float
         What it costs; see the module's text.
     chosen : list of int
-        Which pairs.
+        Which q pairs.
+    L : FloatArray
+        (q k, q k) inverse Cholesky factor of their S, 1/m.
+    z : FloatArray
+        (q k,) L r, their residuals in standard deviations.
 
     """
 
     cost: float
     chosen: list[int]
-
-
-@dataclass(frozen=True, slots=True)
-class _Partial(Pairing):
-    """A pairing of some points: L is the inverse Cholesky factor of S, z = L r."""
-
     L: FloatArray
     z: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Extensions:
+    """Pairings of one size, each with any of the o pairs of one more point, and without any.
+
+    Attributes
+    ----------
+    pairings : list of Pairing
+        The b pairings.
+    options : IntArray
+        (o,) the pairs.
+    costs : FloatArray
+        (b, o + 1) what it costs then, the last without any; infinite where it can't be.
+    rows, tails : FloatArray
+        (b, o, k, q k + k) and (b, o, k) what is appended to L and z.
+
+    """
+
+    pairings: list[Pairing]
+    options: IntArray
+    costs: FloatArray
+    rows: FloatArray
+    tails: FloatArray
+
+    def extended(self, i: int, j: int) -> Pairing:
+        """Return pairing i with pair j, or without any."""
+        one, cost = self.pairings[i], float(self.costs[i, j])
+        if j == len(self.options):
+            return replace(one, cost=cost)
+        n = len(one.z)
+        L = np.zeros((self.rows.shape[3],) * 2)
+        L[:n, :n], L[n:] = one.L, self.rows[i, j]
+        chosen = [*one.chosen, int(self.options[j])]
+        return Pairing(cost, chosen, L, np.append(one.z, self.tails[i, j]))
 
 
 class JointSearch:
@@ -92,8 +126,8 @@ class JointSearch:
         (q,) pairs whose point is of a known landmark in any case, if not of this then of another.
     gate : float
         Mahalanobis distance at which a point is as likely to be of no known landmark.
-    margin : float
-        How much more than the cheapest a pairing may cost.
+    margin, budget : float
+        How much more than the cheapest a pairing may cost, and how much at all.
 
     Attributes
     ----------
@@ -102,11 +136,18 @@ class JointSearch:
 
     """
 
-    def __init__(self, pairs: Pairs, certain: BoolArray, gate: float, margin: float) -> None:
+    def __init__(
+        self,
+        pairs: Pairs,
+        certain: BoolArray,
+        gate: float,
+        margin: float,
+        budget: float = math.inf,
+    ) -> None:
         self._pairs = pairs
         self._certain = certain
         self.unpaired_cost = float(huber_loss(gate))
-        self._margin = margin
+        self._margin, self._budget = margin, budget
         points, counts = np.unique(pairs.points, return_counts=True)
         # Points with the fewest options first: they are the surest, and the others follow them.
         order = points[np.argsort(counts, kind='stable')]
@@ -115,42 +156,55 @@ class JointSearch:
 
     def pairings(self) -> list[Pairing]:
         """Return the pairings, the cheapest first; what no pair belongs to is left out of it."""
-        partial = [_Partial(0.0, [], np.empty((0, 0)), np.empty(0))]
+        partial = [Pairing(0.0, [], np.empty((0, 0)), np.empty(0))]
         for options in self._options:
-            longer = [more for one in partial for more in self._continued(one, options)]
-            longer.sort(key=lambda one: one.cost)
-            worst = longer[0].cost + self._margin
-            partial = [one for one in longer[:MAX_PARTIAL] if one.cost <= worst]
-        return list(partial)
+            sizes = {len(one.chosen): one for one in partial}
+            partial = self._cheapest(
+                [
+                    self._extensions([one for one in partial if len(one.chosen) == size], options)
+                    for size in sizes
+                ]
+            )
+        return partial
 
-    def _continued(self, one: _Partial, options: IntArray) -> list[_Partial]:
-        """Return a pairing with each of the pairs ``options``, all of one point, and without."""
-        taken = self._pairs.landmarks[one.chosen]
-        free = options[~(self._pairs.landmarks[options][:, None] == taken).any(axis=1)]
-        longer = self._with_each(one, free) if len(free) else []
-        if not longer or not self._certain[options].all():
-            longer.append(_Partial(one.cost + self.unpaired_cost, one.chosen, one.L, one.z))
-        return longer
+    def _cheapest(self, extensions: list[_Extensions]) -> list[Pairing]:
+        """Return the cheapest pairings, if they don't cost too much.
 
-    def _with_each(self, one: _Partial, free: IntArray) -> list[_Partial]:
-        """Return a pairing with one more of the pairs ``free`` (o,), for each of them."""
-        S, r = self._pairs.covariances, self._pairs.residuals
-        n, k = len(one.z), r.shape[1]
-        own = k * free[:, None] + np.arange(k)
-        W = one.L @ S[columns_of(one.chosen, k)[:, None], own[:, None, :]]  # (o, n, k)
+        No point makes a pairing cheaper, so one that costs too much can be given up at once.
+        """
+        places = [(some, *place) for some in extensions for place in np.ndindex(some.costs.shape)]
+        costs = np.concatenate([[np.inf], *(some.costs.ravel() for some in extensions)])[1:]
+        order = np.argsort(costs, kind='stable')[:MAX_PARTIAL]
+        worst = min(self._budget, costs.min(initial=np.inf) + self._margin)
+        kept = order[np.isfinite(costs[order]) & (costs[order] <= worst)]
+        return [some.extended(i, j) for some, i, j in (places[place] for place in kept)]
+
+    def _extensions(self, pairings: list[Pairing], options: IntArray) -> _Extensions:
+        """Return how pairings (b,) of one size may go on with the pairs ``options`` (o,)."""
+        S, r, k = self._pairs.covariances, self._pairs.residuals, self._pairs.residuals.shape[1]
+        L, z = np.array([one.L for one in pairings]), np.array([one.z for one in pairings])
+        columns = np.array([columns_of(one.chosen, k) for one in pairings])
+        own = k * options[:, None] + np.arange(k)
+        W = L[:, None] @ S[columns[:, None, :, None], own[:, None, :]]  # (b, o, q k, k)
         left = S[own[:, :, None], own[:, None, :]] - so3.transpose(W) @ W
         corners = np.linalg.inv(np.linalg.cholesky(left))
-        tails = (corners @ (r[free] - one.z @ W)[:, :, None])[:, :, 0]
-        log_dets = np.log(np.diagonal(corners, axis1=1, axis2=2)).sum(axis=1)
-        rises = huber_loss(np.sqrt((tails * tails).sum(axis=1))) - 2.0 * log_dets
-        costs = one.cost + rises - self._noise_log_dets[free]
-        L = np.zeros((len(free), n + k, n + k))
-        L[:, :n, :n], L[:, n:, n:] = one.L, corners
-        L[:, n:, :n] = -corners @ so3.transpose(W) @ one.L
-        return [
-            _Partial(float(costs[i]), [*one.chosen, int(pair)], L[i], np.append(one.z, tails[i]))
-            for i, pair in enumerate(free)
-        ]
+        ahead = r[options] - (z[:, None, None] @ W)[:, :, 0]
+        tails = (corners @ ahead[..., None])[..., 0]
+        log_dets = np.log(np.diagonal(corners, axis1=2, axis2=3)).sum(axis=2)
+        rises = huber_loss(np.sqrt((tails * tails).sum(axis=2))) - 2.0 * log_dets
+        rises[self._are_taken(pairings, options)] = np.inf
+        rises -= self._noise_log_dets[options]
+        is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
+        without = np.where(is_certain, np.inf, self.unpaired_cost)
+        costs = np.array([[one.cost] for one in pairings]) + np.column_stack([rises, without])
+        rows = np.concatenate([-corners @ so3.transpose(W) @ L[:, None], corners], axis=3)
+        return _Extensions(pairings, options, costs, rows, tails)
+
+    def _are_taken(self, pairings: list[Pairing], options: IntArray) -> BoolArray:
+        """Return (b, o) whether the landmark of a pair is already that of another point."""
+        taken = np.array([self._pairs.landmarks[one.chosen] for one in pairings])
+        same = self._pairs.landmarks[options][:, None] == taken[:, None]
+        return np.asarray(same.any(axis=2))
 
 
 def joint_cost(r: FloatArray, covariance: FloatArray, noise: FloatArray) -> float:

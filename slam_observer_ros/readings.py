@@ -31,7 +31,7 @@ def is_plain(slam: Slam, event: ObservationEvent, sighting: Sighting) -> bool:
 
 
 def readings(
-    slam: Slam, event: ObservationEvent, new_ids: IntArray
+    slam: Slam, event: ObservationEvent, new_ids: IntArray, budget: float
 ) -> list[tuple[ObservationEvent, float]]:
     """Return what an observation may mean.
 
@@ -43,6 +43,8 @@ def readings(
         The observation, of m points.
     new_ids : IntArray
         (m,) ids of points that are taken for landmarks not seen before.
+    budget : float
+        Cost beyond which readings need not be returned.
 
     Returns
     -------
@@ -55,7 +57,7 @@ def readings(
     if not isinstance(slam.gains, RiccatiGains):
         return [(event, 0.0)]
     if (event.ids == UNKNOWN_ID).any():
-        return _named(slam, slam.gains, event, new_ids)
+        return _named(slam, slam.gains, event, new_ids, budget)
     sighting = slam.look(event)
     trusting = _cost(slam, slam.gains, event, sighting.innovation)
     found = [(event, trusting)]
@@ -77,7 +79,7 @@ def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:
 
 
 def _named(
-    slam: Slam, gains: RiccatiGains, event: ObservationEvent, new_ids: IntArray
+    slam: Slam, gains: RiccatiGains, event: ObservationEvent, new_ids: IntArray, budget: float
 ) -> list[tuple[ObservationEvent, float]]:
     """Return the readings of points some of which have no id, the most likely first."""
     ids = slam.landmarks.ids
@@ -89,6 +91,7 @@ def _named(
         slam.turned(slam.noise.observation(event)),
         slam.landmarks.indices_of(event.ids),
         slam.settings,
+        budget,
     )
     events = []
     for reading in found:
