@@ -1,8 +1,8 @@
 """Which landmarks the points of an observation are, where the sensor gave no ids.
 
-A *reading* takes each such point for a landmark, or for a new one. What matters about it is where
-it puts the robot: among readings that agree on that, within what the sensor can tell, the most
-likely one is taken. Readings that don't agree are all returned, for later observations to decide
+An *assignment* takes each such point for a landmark, or for a new one. What matters about it is
+where it puts the robot: among those that agree on that, within what the sensor can tell, the most
+likely one is taken. Those that don't agree are all returned, for later observations to decide
 (:mod:`slam_observer_ros.hypotheses`).
 """
 
@@ -16,24 +16,25 @@ from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
-from slam_observer_ros.joint_compatibility import columns_of, huber_loss, JointSearch, Pairs
+from slam_observer_ros.joint_compatibility import (
+    columns_of,
+    huber_loss,
+    JointSearch,
+    MARGIN,
+    Pairs,
+    RESOLUTION,
+)
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
-
-MARGIN = 35.0
-"""How much more than the cheapest a reading may cost: at odds of e¹⁷ it is given up."""
-
-RESOLUTION = 2.0
-"""Two places are one if the sensor can't tell them apart by this many standard deviations."""
 
 MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class Assignment:
     """What the points of an observation are taken for.
 
     Attributes
@@ -41,7 +42,7 @@ class Reading:
     rows : IntArray
         (m,) row of the landmark that each point is, −1 for a new one.
     cost : float
-        −2 ln of its likelihood, up to what all readings of the observation share.
+        −2 ln of its likelihood, up to what all assignments share.
 
     """
 
@@ -49,7 +50,7 @@ class Reading:
     cost: float
 
 
-def find_readings(
+def find_assignments(
     observer: Observer,
     gains: RiccatiGains,
     index: LandmarkIndex,
@@ -58,8 +59,8 @@ def find_readings(
     known_rows: IntArray,
     settings: Settings,
     budget: float,
-) -> list[Reading]:
-    """Return all readings of an observation that put the robot at different places.
+) -> list[Assignment]:
+    """Return all assignments that put the robot at different places.
 
     Parameters
     ----------
@@ -76,11 +77,11 @@ def find_readings(
     settings : Settings
         ``rejection_distance`` is how far a point may be from its landmark, in σ.
     budget : float
-        What a reading may cost at most.
+        What an assignment may cost at most.
 
     Returns
     -------
-    list of Reading
+    list of Assignment
         The most likely first.
 
     """
@@ -97,16 +98,16 @@ def find_readings(
     margin = 0.0 if nearly.all() else MARGIN
     search = JointSearch(pairs, nearly, gate, margin, budget - lonely_cost)
     J = np.linalg.inv(np.linalg.cholesky(noise[:, :k, :k])) @ axes.output_matrix(points)
-    readings: list[Reading] = []
+    assignments: list[Assignment] = []
     moves: list[FloatArray] = []
     for pairing in search.pairings():
         move = J @ PC[:, columns_of(pairing.chosen, k)] @ (pairing.L.T @ pairing.z)  # in σ
         if all(_largest(move - other) > RESOLUTION for other in moves):
             found = np.full(m, -1)
             found[at[pairing.chosen]] = rows[pairing.chosen]
-            readings.append(Reading(found, pairing.cost + lonely_cost))
+            assignments.append(Assignment(found, pairing.cost + lonely_cost))
             moves.append(move)
-    return readings
+    return assignments
 
 
 def _pairs_within(

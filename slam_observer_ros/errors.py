@@ -28,6 +28,10 @@ class InvalidEventError(SlamObserverError):
         self.reason = reason
 
 
+class SmoothingError(SlamObserverError):
+    """What was observed does not determine the whole trajectory."""
+
+
 class MessageError(SlamObserverError):
     """A ROS message is malformed or lacks a field that is needed."""
 

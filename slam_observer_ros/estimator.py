@@ -105,7 +105,7 @@ class Estimator:
         self.flush()
         if self._stamp_ns is not None:
             self._advance(self._stamp_ns)
-        self._hypotheses.decide().restart_time()
+        self._hypotheses.restart_time()
         self._forget_time()
 
     def load_map(
@@ -159,7 +159,7 @@ class Estimator:
     def change_settings(self, settings: Settings) -> None:
         """Use other gains from now on; parameters that are read-only keep their effect."""
         self.settings = settings
-        self._hypotheses.decide().change_settings(settings)
+        self._hypotheses.change_settings(settings)
 
     def add(self, event: Event) -> bool:
         """Take an event; return whether it was accepted.
@@ -195,6 +195,8 @@ class Estimator:
         ------
         ParameterError
             If the gain design keeps no history.
+        SmoothingError
+            If the observations don't determine the whole trajectory.
 
         """
         stamps_ns, poses, world_points = self._slam.smooth()
@@ -202,11 +204,7 @@ class Estimator:
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""
-        rows = self._slam.landmarks.indices_of(np.array([landmark_id]))
-        if rows[0] < 0:
-            return False
-        self._hypotheses.decide().remove(rows)
-        return True
+        return self._hypotheses.forget(landmark_id)
 
     @property
     def counts(self) -> Counter[str]:
@@ -406,7 +404,8 @@ class Estimator:
             self._counts['not_localised'] += not self._is_in_map
 
     def _enter_map(self) -> None:
-        if self._map is not None and enter_map(self._hypotheses.decide(), self._map):
+        if self._map is not None and enter_map(self._slam, self._map):
+            self._hypotheses.decide()
             self._is_in_map = True
             logger.info('Found the place in the map of %d landmarks.', len(self._map.ids))
 

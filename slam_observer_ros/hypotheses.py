@@ -11,14 +11,19 @@ from __future__ import annotations
 
 from collections import Counter
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 
-from slam_observer_ros.association import MARGIN
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, is_automatic, ObservationEvent
-from slam_observer_ros.readings import are_one, is_plain, readings
+from slam_observer_ros.events import (
+    FIRST_AUTOMATIC_ID,
+    is_automatic,
+    ObservationEvent,
+    UNKNOWN_ID,
+)
+from slam_observer_ros.joint_compatibility import MARGIN
+from slam_observer_ros.readings import are_one, Reading, readings, suspect_ids
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray, IntArray
@@ -29,9 +34,8 @@ from slam_observer_ros.velocity_history import VelocityHistory
 class _Followed:
     """A state after an observation, what it took that for, and what it returned."""
 
-    cost: float
     slam: Slam
-    reading: ObservationEvent
+    reading: Reading
     seen: tuple[IntArray, FloatArray]
 
 
@@ -72,53 +76,71 @@ class Hypotheses:
         for slam in self._states:
             slam.advance(velocities, start_ns, end_ns)
 
+    def change_settings(self, settings: Settings) -> None:
+        """Use other gains from now on, in all states."""
+        for slam in self._states:
+            slam.change_settings(settings)
+
+    def restart_time(self) -> None:
+        """Let all states go on from where they are at any other time."""
+        for slam in self._states:
+            slam.restart_time()
+
+    def forget(self, landmark_id: int) -> bool:
+        """Remove a landmark from all maps; return whether the most likely one had it."""
+        rows = [slam.landmarks.indices_of(np.array([landmark_id])) for slam in self._states]
+        for slam, row in zip(self._states, rows, strict=True):
+            if row[0] >= 0:
+                slam.remove(row)
+        return bool(rows[0][0] >= 0)
+
     def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
         """Use an observation made at the states' instant; return what the best one makes of it.
 
         Ids and residuals are those of :meth:`slam_observer_ros.slam.Slam.observe`.
         """
-        if len(self._states) == 1:
+        if len(self._states) == 1 and not (event.ids == UNKNOWN_ID).any():
             sighting = self.best.look(event)
-            if is_plain(self.best, event, sighting):
+            if self._limit == 1 or not len(suspect_ids(self.best, sighting)):
                 return self.best.observe(event, sighting)
         possible = self._possible(event)
-        least = possible[0][0]
-        uses = Counter(number for _, number, _ in possible)
+        uses = Counter(number for number, _ in possible)
         followed: list[_Followed] = []
-        for cost, number, reading in possible:
+        for number, reading in possible:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
-            seen = slam.observe(reading)
-            slam.counts['rejected_landmark'] += len(event.ids) - len(reading.ids)
+            seen = slam.observe(reading.event)
+            slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
             if not any(_are_one(slam, reading, other) for other in followed):
-                followed.append(_Followed(cost - least, slam, reading, seen))
+                followed.append(_Followed(slam, reading, seen))
             if len(followed) == self._limit:
                 break
-        self._costs = [one.cost for one in followed]
+        least = followed[0].reading.cost
+        self._costs = [one.reading.cost - least for one in followed]
         self._states = [one.slam for one in followed]
         return followed[0].seen
 
-    def _possible(self, event: ObservationEvent) -> list[tuple[float, int, ObservationEvent]]:
-        """Return what each state may take an observation for: cost, number of the state, reading.
+    def _possible(self, event: ObservationEvent) -> list[tuple[int, Reading]]:
+        """Return what each state may take an observation for, by the number of the state.
 
-        A point has the same id in all of them that take it for a new landmark.
+        The cheapest comes first; the cost is that of the state as well. A point has the same id
+        in all of them that take it for a new landmark.
         """
         for slam in self._states:
-            slam.forget_unsupported(event.stamp_ns)
             given = slam.landmarks.ids[is_automatic(slam.landmarks.ids)]  # of a loaded map, too
             self._next_id = max(self._next_id, int(np.max(given, initial=0)) + 1)
         new_ids = self._next_id + np.arange(len(event.ids))
-        possible: list[tuple[float, int, ObservationEvent]] = []
+        possible: list[tuple[int, Reading]] = []
         worst = math.inf
         for number, (slam, cost) in enumerate(zip(self._states, self._costs, strict=True)):
-            for reading, rise in readings(slam, event, new_ids, worst - cost):
-                possible.append((cost + rise, number, reading))
-                worst = min(worst, cost + rise + MARGIN)
-        possible.sort(key=lambda reading: reading[:2])
-        return [reading for reading in possible if reading[0] <= worst]
+            for reading in readings(slam, event, new_ids, worst - cost):
+                possible.append((number, replace(reading, cost=cost + reading.cost)))
+                worst = min(worst, cost + reading.cost + MARGIN)
+        possible.sort(key=lambda one: one[1].cost)
+        return [one for one in possible if one[1].cost <= worst]
 
 
-def _are_one(slam: Slam, reading: ObservationEvent, other: _Followed) -> bool:
+def _are_one(slam: Slam, reading: Reading, other: _Followed) -> bool:
     """Return whether a state has the robot and the landmarks seen where another one has them."""
-    same_ids = np.array_equal(reading.ids, other.reading.ids)
-    return same_ids and are_one(slam, other.slam, reading)
+    same_ids = np.array_equal(reading.event.ids, other.reading.event.ids)
+    return same_ids and are_one(slam, other.slam, reading.event)

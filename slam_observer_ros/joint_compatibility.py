@@ -20,6 +20,7 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.gains.robust import diagonal_blocks, mahalanobis
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -28,6 +29,12 @@ MAX_PARTIAL = 16
 
 A search in depth would spend its time below the first pair, and never see that it is wrong.
 """
+
+MARGIN = 35.0
+"""How much more than the cheapest something may cost: at odds of e¹⁷ it is given up."""
+
+RESOLUTION = 2.0
+"""Two places are one if the sensor can't tell them apart by this many standard deviations."""
 
 HEAVY_TAIL = 2.0
 """Standard deviations from which on the cost of a pair grows in proportion to its distance."""
@@ -158,13 +165,9 @@ class JointSearch:
         """Return the pairings, the cheapest first; what no pair belongs to is left out of it."""
         partial = [Pairing(0.0, [], np.empty((0, 0)), np.empty(0))]
         for options in self._options:
-            sizes = {len(one.chosen): one for one in partial}
-            partial = self._cheapest(
-                [
-                    self._extensions([one for one in partial if len(one.chosen) == size], options)
-                    for size in sizes
-                ]
-            )
+            sizes = dict.fromkeys(len(one.chosen) for one in partial)
+            groups = [[one for one in partial if len(one.chosen) == size] for size in sizes]
+            partial = self._cheapest([self._extensions(group, options) for group in groups])
         return partial
 
     def _cheapest(self, extensions: list[_Extensions]) -> list[Pairing]:
@@ -172,10 +175,12 @@ class JointSearch:
 
         No point makes a pairing cheaper, so one that costs too much can be given up at once.
         """
+        if not extensions:
+            return []
         places = [(some, *place) for some in extensions for place in np.ndindex(some.costs.shape)]
-        costs = np.concatenate([[np.inf], *(some.costs.ravel() for some in extensions)])[1:]
+        costs = np.concatenate([some.costs.ravel() for some in extensions])
         order = np.argsort(costs, kind='stable')[:MAX_PARTIAL]
-        worst = min(self._budget, costs.min(initial=np.inf) + self._margin)
+        worst = min(self._budget, costs[order[0]] + self._margin)
         kept = order[np.isfinite(costs[order]) & (costs[order] <= worst)]
         return [some.extended(i, j) for some, i, j in (places[place] for place in kept)]
 
@@ -207,10 +212,16 @@ class JointSearch:
         return np.asarray(same.any(axis=2))
 
 
-def joint_cost(r: FloatArray, covariance: FloatArray, noise: FloatArray) -> float:
-    """Return what a pairing costs, of residuals r (m, k) with S (m k, m k) and R (m, k, k)."""
-    L = np.linalg.cholesky(covariance)
-    z = np.linalg.solve(L, r.ravel()).reshape(r.shape)
+def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
+    """Return what a pairing costs, of residuals r (m, k) with S (m k, m k) and R (m, k, k).
+
+    The pairs are taken in the order of their distances, so that one which is wrong is judged by
+    the others, and not they by it.
+    """
+    order = np.argsort(mahalanobis(r, diagonal_blocks(S, r.shape[1])), kind='stable')
+    columns = columns_of(order.tolist(), r.shape[1])
+    L = np.linalg.cholesky(S[np.ix_(columns, columns)])
+    z = np.linalg.solve(L, r[order].ravel()).reshape(r.shape)
     log_det = 2.0 * np.log(np.diagonal(L)).sum() - np.linalg.slogdet(noise)[1].sum()
     return float(huber_loss(np.sqrt((z * z).sum(axis=1))).sum() + log_det)
 

@@ -19,7 +19,7 @@ class LandmarkTable:
     rejections : IntArray
         (n,) how many observations in a row were rejected at one place, up to now.
     last_seen_ns : IntArray
-        (n,) stamp of the latest observation of each, nanoseconds.
+        (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
 
     """
 
@@ -54,8 +54,12 @@ class LandmarkTable:
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
         """Append landmarks (m,) that were seen ``counts`` (m,) times before this run."""
-        self.add(ids, 0)
+        self.add(ids, -1)
         self.counts[len(self.counts) - len(ids) :] = counts
+
+    def restart_time(self) -> None:
+        """Take all landmarks as last seen before any stamp to come."""
+        self.last_seen_ns = np.full(len(self), -1)
 
     def renumber(self, indices: IntArray, ids: IntArray) -> None:
         """Give the rows ``indices`` (m,) other ids (m,)."""

@@ -7,32 +7,41 @@ both ways, as what it says and as an outlier, and later observations decide.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam_observer_ros.association import find_readings, RESOLUTION
+from slam_observer_ros.association import Assignment, find_assignments
 from slam_observer_ros.events import ObservationEvent, select, UNKNOWN_ID
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import distances, mahalanobis, with_blocks
+from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.joint_compatibility import huber_loss, joint_cost
+from slam_observer_ros.joint_compatibility import huber_loss, joint_cost, RESOLUTION
 from slam_observer_ros.slam import Sighting, Slam
 from slam_observer_ros.types import IntArray
 
 
-def is_plain(slam: Slam, event: ObservationEvent, sighting: Sighting) -> bool:
-    """Return whether there is but one reading of an observation: as it came."""
-    if not isinstance(slam.gains, RiccatiGains):
-        return True
-    has_ids = not (event.ids == UNKNOWN_ID).any()
-    return has_ids and not slam.gains.suspects(sighting.innovation).any()
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What an observation is taken for.
+
+    Attributes
+    ----------
+    event : ObservationEvent
+        The observation with all ids filled in, without points that are taken for outliers.
+    cost : float
+        −2 ln of its likelihood, up to what all readings of the observation share.
+
+    """
+
+    event: ObservationEvent
+    cost: float
 
 
 def readings(
     slam: Slam, event: ObservationEvent, new_ids: IntArray, budget: float
-) -> list[tuple[ObservationEvent, float]]:
+) -> list[Reading]:
     """Return what an observation may mean.
 
     Parameters
@@ -48,26 +57,35 @@ def readings(
 
     Returns
     -------
-    list of tuple
-        The observation with all ids filled in, or without a point that is taken for an outlier;
-        and what it costs: −2 ln of its likelihood. As it came and 0 if the gains know no joint
-        covariance to judge it by.
+    list of Reading
+        As it came and at no cost if the gains know no joint covariance to judge it by.
 
     """
-    if not isinstance(slam.gains, RiccatiGains):
-        return [(event, 0.0)]
-    if (event.ids == UNKNOWN_ID).any():
-        return _named(slam, slam.gains, event, new_ids, budget)
+    gains = slam.gains
+    if not isinstance(gains, RiccatiGains):
+        return [Reading(event, 0.0)]
+    slam.forget_unsupported(event.stamp_ns)
     sighting = slam.look(event)
-    trusting = _cost(slam, slam.gains, event, sighting.innovation)
-    found = [(event, trusting)]
-    suspects = slam.gains.suspects(sighting.innovation)
-    for row in sighting.innovation.indices[suspects]:
-        others = select(event, event.ids != slam.landmarks.ids[row])
-        cost = _cost(slam, slam.gains, others, slam.look(others).innovation)
-        cost += float(huber_loss(slam.settings.rejection_distance))
-        found.append((others, max(cost, trusting)))
+    suspects = suspect_ids(slam, sighting)
+    if (event.ids == UNKNOWN_ID).any():
+        return _named(slam, gains, event, new_ids, suspects, budget)
+    trusting = _cost(slam, gains, event, sighting.innovation)
+    found = [Reading(event, trusting)]
+    left_out = [suspects] if len(suspects) > 1 else []
+    for ids in [*suspects[:, None], *left_out]:
+        others = select(event, ~np.isin(event.ids, ids))
+        cost = _cost(slam, gains, others, slam.look(others).innovation)
+        cost += len(ids) * float(huber_loss(slam.settings.rejection_distance))
+        found.append(Reading(others, max(cost, trusting)))
     return found
+
+
+def suspect_ids(slam: Slam, sighting: Sighting) -> IntArray:
+    """Return the ids of points that pass the gate only since the state is so uncertain."""
+    if not isinstance(slam.gains, RiccatiGains):
+        return np.empty(0, dtype=np.int64)
+    innovation = sighting.innovation
+    return slam.landmarks.ids[innovation.indices[slam.gains.suspects(innovation)]]
 
 
 def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:
@@ -79,26 +97,52 @@ def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:
 
 
 def _named(
-    slam: Slam, gains: RiccatiGains, event: ObservationEvent, new_ids: IntArray, budget: float
-) -> list[tuple[ObservationEvent, float]]:
-    """Return the readings of points some of which have no id, the most likely first."""
-    ids = slam.landmarks.ids
-    found = find_readings(
+    slam: Slam,
+    gains: RiccatiGains,
+    event: ObservationEvent,
+    new_ids: IntArray,
+    suspects: IntArray,
+    budget: float,
+) -> list[Reading]:
+    """Return the readings of points some of which have no id.
+
+    An id is believed here, too, until something contradicts it: without a suspect a reading
+    costs no less than with all of them.
+    """
+    is_new = (event.ids != UNKNOWN_ID) & (slam.landmarks.indices_of(event.ids) < 0)
+    judged = select(event, ~is_new)
+    new_cost = float(np.sum(is_new) * huber_loss(slam.settings.rejection_distance))
+    found = find_assignments(
         slam.observer,
         gains,
         slam.index,
-        se3.transform(slam.observer.A, event.points),
-        slam.turned(slam.noise.observation(event)),
-        slam.landmarks.indices_of(event.ids),
+        se3.transform(slam.observer.A, judged.points),
+        slam.turned(slam.noise.observation(judged)),
+        slam.landmarks.indices_of(judged.ids),
         slam.settings,
-        budget,
+        budget - new_cost,
     )
-    events = []
-    for reading in found:
-        named = np.where(reading.rows < 0, new_ids, np.append(ids, UNKNOWN_ID)[reading.rows])
-        named = np.where(event.ids == UNKNOWN_ID, named, event.ids)
-        events.append((replace(event, ids=named), reading.cost))
-    return events
+    outliers = [np.isin(judged.ids, suspects) & (one.rows < 0) for one in found]
+    costs = np.array([new_cost + one.cost for one in found])
+    trusting = costs[[not some.any() for some in outliers]].min(initial=np.inf)
+    named = []
+    for one, some, cost in zip(found, outliers, costs, strict=True):
+        ids = event.ids.copy()
+        ids[~is_new] = _ids_of(slam, judged, one, new_ids[~is_new])
+        kept = np.ones(len(ids), dtype=np.bool_)
+        kept[~is_new] = ~some
+        cost = max(cost, trusting) if some.any() and np.isfinite(trusting) else cost
+        named.append(Reading(select(replace(event, ids=ids), kept), float(cost)))
+    return named
+
+
+def _ids_of(
+    slam: Slam, event: ObservationEvent, assignment: Assignment, new_ids: IntArray
+) -> IntArray:
+    """Return the ids (m,) of points, where they have none those that an assignment gives them."""
+    known = np.append(slam.landmarks.ids, UNKNOWN_ID)[assignment.rows]
+    assigned = np.where(assignment.rows < 0, new_ids, known)
+    return np.where(event.ids == UNKNOWN_ID, assigned, event.ids)
 
 
 def _cost(
@@ -107,9 +151,7 @@ def _cost(
     """Return what it costs to take points for the landmarks whose ids they have."""
     gate, k = slam.settings.rejection_distance, 2 if slam.settings.two_d_mode else 3
     r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
-    predicted = gains.foretold(innovation)[1]
-    passed = distances(r, predicted, noise) <= gate
-    used = np.flatnonzero(np.repeat(passed, k))
-    S = with_blocks(predicted[used][:, used], noise[passed])
+    passed, own = gated(r, gains.foretold(innovation)[1], noise, slam.settings)
     unpaired = len(event.ids) - np.sum(passed)
+    S = with_blocks(own, noise[passed])
     return joint_cost(r[passed], S, noise[passed]) + float(unpaired * huber_loss(gate))

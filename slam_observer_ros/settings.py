@@ -202,7 +202,7 @@ class Settings:
     )
     confirmations: int = parameter(
         3,
-        'Observations that must agree before a landmark outweighs one that contradicts it',
+        'Observations after which a landmark is in the map',
         minimum=1,
     )
     max_rejections: int = parameter(

@@ -37,7 +37,7 @@ class Sighting:
     Attributes
     ----------
     event : ObservationEvent
-        The observation, of those of its m points that have an id and may be used.
+        The observation without points that have no id, or are of no landmark that is mapped.
     rows : IntArray
         (m,) row of the landmark that each of them is, −1 where it is new.
     covariances : FloatArray
@@ -158,6 +158,7 @@ class Slam:
     def restart_time(self) -> None:
         """Go on from here at any other time; what was seen before can't be looked back at."""
         self._innovation_ns = self._end_velocity = None
+        self.landmarks.restart_time()
         self.gains.restart(self.observer)
 
     def change_settings(self, settings: Settings) -> None:
@@ -185,7 +186,10 @@ class Slam:
         )
 
     def look(self, event: ObservationEvent) -> Sighting:
-        """Return what an observation made at the state's instant tells, before it is used."""
+        """Return what an observation made at the state's instant tells, before it is used.
+
+        It moves landmarks whose gains had put that off.
+        """
         event = select(event, event.ids != UNKNOWN_ID)
         rows = self.landmarks.indices_of(event.ids)
         if not self.is_mapping:
@@ -221,16 +225,17 @@ class Slam:
         self.counts['unknown_id'] += unknown
         self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
         event, rows, covariances = sighting.event, sighting.rows, sighting.covariances
-        known = rows >= 0
+        known, used = rows >= 0, np.ones(len(rows), dtype=np.bool_)
         ids = event.ids[known]
-        self._innovate(select(event, known), sighting.innovation)
+        used[known] = self._innovate(select(event, known), sighting.innovation)
         if not known.all():
             self._initialise(select(event, ~known), covariances[~known])
             rows = self.landmarks.indices_of(event.ids)
             kept = rows >= 0
             event, rows, covariances = select(event, kept), rows[kept], covariances[kept]
+            used = used[kept]
         if event.velocities is not None:
-            self.observer.set_landmark_velocities(rows, event.velocities)
+            self.observer.set_landmark_velocities(rows[used], event.velocities[used])
         self._look_back(event, rows, covariances)
         return ids, sighting.innovation.r
 
@@ -241,6 +246,8 @@ class Slam:
         ------
         ParameterError
             If the gain design keeps no history.
+        SmoothingError
+            If the observations don't determine the whole trajectory.
 
         """
         if not isinstance(self.gains, RiccatiGains) or self.settings.hindsight_interval == 0:
@@ -283,11 +290,11 @@ class Slam:
         J[3:, :3] = -so3.hat(A[:3, 3])
         return np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
 
-    def _innovate(self, event: ObservationEvent, innovation: Innovation) -> None:
-        """Correct the state by m known landmarks, those of ``event``."""
+    def _innovate(self, event: ObservationEvent, innovation: Innovation) -> BoolArray:
+        """Correct the state by the landmarks of ``event``; return which (m,) were not rejected."""
         rows = innovation.indices
         if not len(rows):
-            return
+            return np.empty(0, dtype=np.bool_)
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
@@ -299,6 +306,7 @@ class Slam:
             places = se3.transform(self.observer.pose, event.points[rejected])
             self.landmarks.reject(rows[rejected], places, SAME_PLACE * spread_m)
             self.counts['rejected_landmark'] += int(np.sum(rejected))
+        return np.asarray(~rejected)
 
     def _innovation(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
@@ -344,7 +352,8 @@ class Slam:
     def _in_doubt(self, rows: IntArray) -> BoolArray:
         """Return which of the landmarks seen (m,) have been rejected too often to be trusted.
 
-        That is more often than they were seen: until then they may be outliers themselves.
+        That is ``max_rejections`` times, or once more than they were seen: what contradicts a
+        landmark that was seen once or twice may itself be the outlier.
         """
         counts, rejections = self.landmarks.counts[rows], self.landmarks.rejections[rows]
         if not rejections.any():  # as nearly always

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.axes import Axes
+from slam_observer_ros.errors import SmoothingError
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.settings import Settings
@@ -114,8 +115,21 @@ class Hindsight:
         return step, covariance
 
     def smooth(self, start: Solution) -> Solution:
-        """Return the estimates in hindsight, iterated from ``start`` until nothing moves."""
-        return self._smoother().smooth(start, 50, 1e-6).end
+        """Return the estimates in hindsight, iterated from ``start`` until nothing moves.
+
+        Raises
+        ------
+        SmoothingError
+            If the observations don't determine everything.
+
+        """
+        try:
+            return self._smoother().smooth(start, 50, 1e-6).end
+        except np.linalg.LinAlgError as error:
+            raise SmoothingError(
+                'can not smooth: the observations leave some pose or landmark open, or contradict '
+                'covariances that say they are exact'
+            ) from error
 
     def _smoother(self) -> Smoother:
         history = self.history

@@ -34,9 +34,9 @@ from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.gains.robust import (
     are_far,
     block_diagonal,
+    far_from_the_others,
     mahalanobis,
     observation_weights,
-    suspects,
     with_blocks,
 )
 from slam_observer_ros.geometry import se3, slam_group, so3
@@ -226,7 +226,8 @@ class RiccatiGains:
         r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
         far = are_far(r, noise, self._settings)
         if far.any():
-            far &= suspects(r, self.foretold(innovation)[1], noise, self._settings)
+            predicted = self.foretold(innovation)[1]
+            far &= far_from_the_others(r, predicted, noise, self._settings)
         return far
 
     def foretold(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:

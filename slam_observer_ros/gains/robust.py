@@ -1,6 +1,7 @@
 """How far an observation is trusted: a Mahalanobis gate, then Huber's weight on what passes.
 
-Where the state is uncertain the gate is wide, and outliers pass it: see :func:`suspects`.
+Where the state is uncertain the gate is wide, and outliers pass it; see
+:func:`far_from_the_others`.
 """
 
 from __future__ import annotations
@@ -45,13 +46,10 @@ def observation_weights(
     pull = _pull(r, predicted, noise)
     # No residual is further out than all of them together are.
     if np.vdot(r, pull) > gate**2:
-        passed = distances(r, predicted, noise) <= gate
+        passed, own = gated(r, predicted, noise, settings)
         if not passed.all():
-            used = np.flatnonzero(np.repeat(passed, r.shape[1]))
             weights[~passed] = 0.0
-            weights[passed] = observation_weights(
-                r[passed], predicted[used][:, used], noise[passed], settings
-            )
+            weights[passed] = observation_weights(r[passed], own, noise[passed], settings)
             return weights
     weights = huber_weights(pull, noise, weights, settings.huber_threshold)
     for _ in range(REWEIGHTINGS - 1):
@@ -67,28 +65,37 @@ def are_far(r: FloatArray, noise: FloatArray, settings: Settings) -> BoolArray:
     return mahalanobis(r, noise) > SUSPICION * settings.rejection_distance
 
 
-def suspects(
+def far_from_the_others(
     r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
 ) -> BoolArray:
-    """Return which observations (m,) only pass the gate since the state is so uncertain.
+    """Return which observations (m,) pass the gate, but are far off if all others are true.
 
-    They are far off even if all others are true, which leave ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i of r_i.
+    These leave ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i of the residual r_i. Parameters as above.
+    """
+    passed, own = gated(r, predicted, noise, settings)
+    information: FloatArray = np.linalg.inv(with_blocks(own, noise[passed])).astype(np.float64)
+    pull = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
+    blocks = diagonal_blocks(information, r.shape[1])
+    left = np.asarray(np.linalg.solve(blocks, pull)[:, :, 0])
+    passed[passed] = are_far(left, noise[passed], settings)
+    return passed
+
+
+def gated(
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
+) -> tuple[BoolArray, FloatArray]:
+    """Return which observations (m,) pass the gate, and the part of ``predicted`` that is theirs.
+
     Parameters as above.
     """
-    passed, k = distances(r, predicted, noise) <= settings.rejection_distance, r.shape[1]
-    used = np.flatnonzero(np.repeat(passed, k))
-    S = with_blocks(predicted[used][:, used], noise[passed])
-    information: FloatArray = np.linalg.inv(S).astype(np.float64)
-    pull = (information @ r[passed].ravel()).reshape(-1, k, 1)
-    left = np.asarray(np.linalg.solve(_diagonal_blocks(information, k), pull)[:, :, 0])
-    found = np.zeros(len(r), dtype=np.bool_)
-    found[passed] = are_far(left, noise[passed], settings)
-    return found
+    passed = distances(r, predicted, noise) <= settings.rejection_distance
+    used = np.flatnonzero(np.repeat(passed, r.shape[1]))
+    return passed, predicted[used][:, used]
 
 
 def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
     """Return the Mahalanobis distance (m,) of each residual; parameters as above."""
-    return mahalanobis(r, _diagonal_blocks(predicted, r.shape[1]) + noise)
+    return mahalanobis(r, diagonal_blocks(predicted, r.shape[1]) + noise)
 
 
 def huber_weights(
@@ -129,12 +136,12 @@ def block_diagonal(blocks: FloatArray) -> FloatArray:
 def with_blocks(matrix: FloatArray, blocks: FloatArray) -> FloatArray:
     """Return a matrix (m k, m k) plus the block-diagonal one of blocks (m, k, k)."""
     total: FloatArray = matrix.copy()
-    diagonal = _diagonal_blocks(total, blocks.shape[1])
+    diagonal = diagonal_blocks(total, blocks.shape[1])
     diagonal += blocks
     return total
 
 
-def _diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
+def diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
     """Return the blocks (m, k, k) on the diagonal of a matrix (m k, m k), as a view of it."""
     m = len(matrix) // k
     blocks: FloatArray = np.einsum('ijik->ijk', matrix.reshape(m, k, m, k))
