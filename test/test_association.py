@@ -261,15 +261,37 @@ def test_where_few_pairings_are_possible_the_search_finds_the_cheapest(seed, poi
     least = min(cost(chosen) for chosen in possible)
     assert found[0].cost == pytest.approx(least)
     assert found[0].cost == pytest.approx(cost(found[0].chosen))
-    best = found[0].chosen
-    columns = columns_of(best, k)
-    unpaired_cost = (len(np.unique(at)) - len(best)) * huber_loss(gate)
-    paired_cost = joint_cost(r[best], S[np.ix_(columns, columns)], noise[best])
-    assert paired_cost + unpaired_cost == pytest.approx(least)
     assert len(found) == min(len(possible), MAX_PARTIAL)
     costs = [pairing.cost for pairing in JointSearch(pairs, certain, gate, 10.0).pairings()]
     assert costs == sorted(costs)
     assert costs[-1] <= costs[0] + 10.0
+
+
+@given(st.integers(0, 10_000), st.integers(0, 5), st.sampled_from([2, 3]))
+def test_what_ids_cost_does_not_depend_on_the_order_of_points(seed, m, k):
+    rng = np.random.default_rng(seed)
+    root, noise = rng.normal(size=(m * k, m * k)), np.tile(0.3 * np.eye(k), (m, 1, 1))
+    S = root @ root.T + np.kron(np.eye(m), 0.3 * np.eye(k))
+    r = rng.normal(scale=5.0, size=(m, k))
+    order = rng.permutation(m)
+    columns = columns_of(order.tolist(), k)
+    turned = joint_cost(r[order], S[np.ix_(columns, columns)], noise)
+    assert joint_cost(r, S, noise) == pytest.approx(turned)
+    near = 0.1 * r / (1.0 + np.linalg.norm(np.linalg.solve(S, r.ravel())))
+    plain = near.ravel() @ np.linalg.solve(S, near.ravel())
+    log_ratio = np.linalg.slogdet(S)[1] - m * k * np.log(0.3)
+    assert joint_cost(near, S, noise) == pytest.approx(plain + log_ratio)
+
+
+def test_a_point_with_a_new_id_takes_no_landmark_from_a_point_without():
+    estimator = Estimator(replace(SPATIAL, confirmations=1))
+    for step in range(20):
+        stand(estimator, 0.1 * step)
+        tag = [[3.0, 0.05, 0.0]] if step >= 10 else []
+        points = [*tag, [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
+        observe(estimator, 0.1 * step, points, [*[7] * len(tag), UNKNOWN_ID, UNKNOWN_ID])
+    assert estimator.landmark_ids.tolist() == [FIRST_AUTOMATIC_ID, FIRST_AUTOMATIC_ID + 1, 7]
+    assert estimator.landmark_counts.tolist() == [20, 20, 10]
 
 
 @pytest.mark.parametrize('seed', range(30))

@@ -290,6 +290,18 @@ def test_after_a_jump_back_in_time_pose_and_map_are_held_if_asked(gains):
     np.testing.assert_allclose(estimator.world_points[-1], pose[:3] @ [1.0, 1.0, 1.0, 1.0])
 
 
+def test_after_a_jump_back_in_time_landmarks_out_of_view_make_room_for_new_ones():
+    settings = Settings(on_time_jump='hold', max_landmarks=3, confirmations=1, reorder_window=0.0)
+    estimator, points = Estimator(settings), 3.0 * np.eye(3)
+    for start_ns, ids in ((10**12, [0, 1, 2]), (10**9, [2, 7, 8])):
+        for step in range(5):
+            stamp_ns = start_ns + step * 10**8
+            assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+            assert estimator.add(ObservationEvent(stamp_ns, np.array(ids), points))
+        estimator.restart_time()
+    assert sorted(estimator.landmark_ids) == [2, 7, 8]
+
+
 def test_told_of_a_jump_the_estimator_starts_again_at_once():
     estimator = run(drive())
     estimator.restart_time()
