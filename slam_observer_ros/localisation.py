@@ -29,6 +29,9 @@ MAX_TURN_STD_RAD = 0.2
 Three of them in a line leave the roll about it open; two that are close together, the heading.
 """
 
+ROUNDING = 1e-14
+"""Least variance that can be told from zero, as a share of the sum of all variances."""
+
 CONTRADICTION_SIGMAS = 4.0
 """Landmarks whose misfit is as improbable as this contradict each other."""
 
@@ -108,13 +111,14 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     joint = slam.gains.joint_covariance(np.arange(n))
     P = joint[len(axes.pose) :, len(axes.pose) :]
     G = axes.output_matrix(observer.y_ref - observer.y_ref.mean(axis=0)).reshape(n * k, -1)
-    information = gauge_information(G, P + JITTER_M2 * np.eye(n * k))
+    least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
+    information = gauge_information(G, _with_variances_above(least_m2, P))
     G_each = G.reshape(n, k, -1)
     common = G_each @ np.linalg.pinv(information, hermitian=True) @ so3.transpose(G_each)
     own = np.zeros((n, 3, 3))
     i = np.arange(n)
     own[:, :k, :k] = P.reshape(n, k, n, k)[i, :, i] - common
-    return _without_negative(R @ own @ R.T)
+    return _with_variances_above(0.0, R @ own @ R.T)
 
 
 def find_transform(
@@ -221,10 +225,10 @@ def _find_frame(
     return find_transform(points, covariance, known.world_points, covariances, axes)
 
 
-def _without_negative(covariances: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) whose variances rounding has not made negative."""
+def _with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArray:
+    """Return covariances (…, k, k) whose variances rounding has made neither too small nor < 0."""
     variances, U = np.linalg.eigh(0.5 * (covariances + so3.transpose(covariances)))
-    clipped: FloatArray = (U * np.maximum(variances, 0.0)[:, None, :]) @ so3.transpose(U)
+    clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ so3.transpose(U)
     return clipped
 
 

@@ -428,3 +428,18 @@ def test_far_from_the_origin_as_in_a_national_grid_nothing_is_lost_to_rounding()
     estimator.load_map(world.map())
     add(estimator, world.drive(0.0, 5.0))
     assert np.linalg.norm(world.error(estimator, 4.9)[3:]) < 0.1
+
+
+@pytest.mark.parametrize('seed', [0, 1, 11, 12, 15])
+def test_a_map_can_be_saved_where_some_landmarks_are_exact_and_others_hardly_known(seed):
+    """Their variances differ by more than double precision can hold in one matrix."""
+    rng = np.random.default_rng(seed)
+    estimator = Estimator(Settings(reorder_window=0.0, confirmations=1, unknown_linear_motion=3e3))
+    points = rng.uniform(-50.0, 50.0, (8, 3))
+    for step in range(12):
+        seen = np.sort(rng.choice(8, 4, replace=False))
+        sigmas_m = 10.0 ** rng.uniform(-6.0, 3.0, 4)
+        covariances = sigmas_m[:, None, None] ** 2 * np.eye(3)
+        estimator.add(ObservationEvent((step + 1) * 3 * 10**9, seen, points[seen], covariances))
+        variances = np.linalg.eigvalsh(estimator.landmark_map.covariances)
+        assert (variances >= -1e-9 * variances.max()).all()
