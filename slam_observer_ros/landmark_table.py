@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.events import is_automatic
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
 class LandmarkTable:
@@ -84,6 +85,28 @@ class LandmarkTable:
         same_place = (self.rejections[indices] > 0) & (shift <= tolerances_m)
         self.rejections[indices] = np.where(same_place, self.rejections[indices] + 1, 1)
         self._rejected_at[indices[~same_place]] = world_points[~same_place]
+
+    def in_doubt(self, indices: IntArray, max_rejections: int) -> BoolArray:
+        """Return which of the rows (m,) have been rejected too often to be trusted.
+
+        That is ``max_rejections`` times, or once more than they were seen: what contradicts a
+        landmark that was seen once or twice may itself be the outlier.
+        """
+        rejections = self.rejections[indices]
+        if not rejections.any():  # as nearly always
+            return np.zeros(len(indices), dtype=np.bool_)
+        needed = np.minimum(self.counts[indices] + 1, max_rejections)
+        return np.asarray(rejections >= needed)
+
+    def unsupported(self, confirmations: int, since_ns: int) -> IntArray:
+        """Return rows without an id, seen too seldom, and not at all since a stamp."""
+        seldom = is_automatic(self.ids) & (self.counts < confirmations)
+        return np.flatnonzero(seldom & (self.last_seen_ns < since_ns))
+
+    def unseen_since(self, stamp_ns: int) -> IntArray:
+        """Return rows not seen since a stamp: least often seen first, then longest ago."""
+        unseen = np.flatnonzero(self.last_seen_ns < stamp_ns)
+        return unseen[np.lexsort((self.last_seen_ns[unseen], self.counts[unseen]))]
 
     def restart(self, indices: IntArray) -> None:
         """Take the rows ``indices`` as seen for the first time."""

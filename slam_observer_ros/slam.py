@@ -9,7 +9,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.events import is_automatic, ObservationEvent, select, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, select, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.motion import Motion
@@ -270,10 +270,8 @@ class Slam:
 
     def forget_unsupported(self, stamp_ns: int) -> None:
         """Forget landmarks without an id that were seen too seldom, and not lately."""
-        table = self.landmarks
-        unseen_s = (stamp_ns - table.last_seen_ns) * 1e-9
-        unsupported = is_automatic(table.ids) & (table.counts < self.settings.confirmations)
-        forgotten = np.flatnonzero(unsupported & (unseen_s > self.settings.support_timeout))
+        since_ns = stamp_ns - round(self.settings.support_timeout * 1e9)
+        forgotten = self.landmarks.unsupported(self.settings.confirmations, since_ns)
         if len(forgotten):
             self.remove(forgotten)
             self.counts['unsupported_landmark'] += len(forgotten)
@@ -334,13 +332,17 @@ class Slam:
         if event.covariances is not None or not len(self.landmarks):
             return self.noise.observation(event)
         is_confirmed = self.landmarks.counts[rows] >= self.settings.confirmations
-        is_sure = (rows >= 0) & is_confirmed & ~self._in_doubt(rows)
+        is_sure = (
+            (rows >= 0)
+            & is_confirmed
+            & ~self.landmarks.in_doubt(rows, self.settings.max_rejections)
+        )
         points = np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
         return self.noise.observation(replace(event, points=points))
 
     def _look_back(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them."""
-        in_doubt = self._in_doubt(rows) & self.is_mapping
+        in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
         if some_are:
             covariances = self._covariances(event, rows)
@@ -348,19 +350,6 @@ class Slam:
         self.gains.look_back(self.observer, seen, some_are)
         if some_are:
             self._relocate(select(event, in_doubt), rows[in_doubt], covariances[in_doubt])
-
-    def _in_doubt(self, rows: IntArray) -> BoolArray:
-        """Return which of the landmarks seen (m,) have been rejected too often to be trusted.
-
-        That is ``max_rejections`` times, or once more than they were seen: what contradicts a
-        landmark that was seen once or twice may itself be the outlier.
-        """
-        counts, rejections = self.landmarks.counts[rows], self.landmarks.rejections[rows]
-        if not rejections.any():  # as nearly always
-            return np.zeros(len(rows), dtype=np.bool_)
-        needed = np.minimum(counts + 1, self.settings.max_rejections)
-        in_doubt: BoolArray = rejections >= needed
-        return in_doubt
 
     def _relocate(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Start landmarks anew that are still far from where they were expected."""
@@ -382,11 +371,9 @@ class Slam:
         if limit == 0:
             return event
         table = self.landmarks
-        unseen = np.flatnonzero(table.last_seen_ns < event.stamp_ns)
+        unseen = table.unseen_since(event.stamp_ns)
         fitting = min(new, max(limit - len(table) + len(unseen), 0))  # a map may exceed it
-        surplus = max(len(table) + fitting - limit, 0)
-        order = np.lexsort((table.last_seen_ns[unseen], table.counts[unseen]))
-        forgotten = np.sort(unseen[order[:surplus]])
+        forgotten = np.sort(unseen[: max(len(table) + fitting - limit, 0)])
         self.remove(forgotten)
         self.counts['forgotten_landmark'] += len(forgotten)
         self.counts['unmapped_landmark'] += new - fitting
