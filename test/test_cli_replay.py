@@ -163,6 +163,41 @@ class TestOutputs:
             slam_observer.succeed('replay', simulated, option, path, '--force')
             assert b'mine' not in mine.read_bytes()[:4]
 
+    def test_what_is_read_is_not_replaced_even_by_force(
+        self, slam_observer, simulated, tmp_path, monkeypatch
+    ):
+        config, landmarks = tmp_path / 'robot.yaml', tmp_path / 'map.yaml'
+        config.write_text('/**: {ros__parameters: {gains: constant}}')
+        slam_observer.succeed('replay', simulated, '--map', landmarks)
+        before = [path.read_bytes() for path in (simulated, config, landmarks)]
+        monkeypatch.chdir(tmp_path)
+        arguments = ('replay', simulated, '--config', config, '--load-map', landmarks, '--force')
+        for option, name, what in (
+            ('--tum', simulated.name, str(simulated)),
+            ('--map', simulated, str(simulated)),
+            ('--tum', config, '--config'),
+            ('--map', config, '--config'),
+            ('--tum', landmarks, '--load-map'),
+        ):
+            error = slam_observer.fail(*arguments, option, name)
+            assert f'{option} {name} would replace' in error
+            assert what in error
+        assert [path.read_bytes() for path in (simulated, config, landmarks)] == before
+        assert slam_observer(*arguments, '--map', landmarks).code == 0
+
+    def test_files_of_a_recorded_directory_are_not_replaced_but_others_in_it_are(
+        self, slam_observer, run_in_every_format
+    ):
+        directory = run_in_every_format['sqlite3 directory']
+        for file in directory.iterdir():
+            before = file.read_bytes()
+            assert str(directory) in slam_observer.fail(
+                'replay', directory, '--force', '--map', file
+            )
+            assert file.read_bytes() == before
+        slam_observer.succeed('replay', directory, '--force', '--tum', directory / 'run.tum')
+        slam_observer.succeed('replay', directory, '--force', '--tum', directory / 'run.tum')
+
     def test_figures_leave_other_files_alone(self, slam_observer, simulated, tmp_path):
         (tmp_path / 'notes.txt').write_text('mine')
         slam_observer.succeed('replay', simulated, '--plot', tmp_path)

@@ -85,7 +85,7 @@ def read_settings(
 
 def read_config(args: argparse.Namespace) -> dict[str, object]:
     """Read the parameter file that ``--config`` names, the node's own parameters included."""
-    return {} if args.config is None else read_parameter_file(_find_config(args.config))
+    return {} if args.config is None else read_parameter_file(find_config(args.config))
 
 
 def read_assignments(args: argparse.Namespace) -> dict[str, object]:
@@ -102,7 +102,8 @@ def _is_only_for_node(name: str) -> bool:
     )
 
 
-def _find_config(name: str) -> Path:
+def find_config(name: str) -> Path:
+    """Return the path of a parameter file, or of one that comes with the package, by its name."""
     path = Path(name)
     if path.exists() or path.suffix or len(path.parts) > 1:
         return path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 import tempfile
@@ -51,6 +51,31 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
             raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
         if file in wanted[:number]:
             raise UsageError(f'{file} is named for two outputs')
+
+
+def check_inputs_stay(
+    outputs: Mapping[str, Path | None], inputs: Mapping[str, Iterable[Path]]
+) -> None:
+    """Refuse outputs that would replace a file which is read, by whatever name.
+
+    Parameters
+    ----------
+    outputs : mapping of str to Path or None
+        Files to be written, by option; None for those not asked for.
+    inputs : mapping of str to iterable of Path
+        Files that are read, by what they are.
+
+    Raises
+    ------
+    UsageError
+        If a file is both.
+
+    """
+    read = {file.resolve(): what for what, files in inputs.items() for file in files}
+    for option, file in outputs.items():
+        if file is not None and file.resolve() in read:
+            what = read[file.resolve()]
+            raise UsageError(f'{option} {file} would replace {what}; give another name')
 
 
 def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> None:

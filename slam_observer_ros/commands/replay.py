@@ -10,9 +10,10 @@ from pathlib import Path
 from slam_observer_ros.accuracy import trajectory_of
 from slam_observer_ros.commands.console import print_json, show_progress
 from slam_observer_ros.commands.errors import UsageError
-from slam_observer_ros.commands.options import add_settings_options, read_settings
+from slam_observer_ros.commands.options import add_settings_options, find_config, read_settings
 from slam_observer_ros.commands.outputs import (
     add_force_option,
+    check_inputs_stay,
     check_outputs,
     check_plots,
     filled_directory,
@@ -37,6 +38,7 @@ from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.map_file import read_map, write_map
 from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.sources import files_of
 from slam_observer_ros.replay import replay
 
 logger = logging.getLogger(__name__)
@@ -86,8 +88,7 @@ def run(args: argparse.Namespace) -> None:
     settings, inputs = read_settings(args, INPUT_NAMES), read_inputs(args)
     if args.smooth and settings.gains != 'riccati':
         raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
-    check_outputs([args.tum, args.map], args.force)
-    check_plots(args.plot, FIGURES, args.force)
+    _check_files(args)
     landmark_map = None if args.load_map is None else read_map(args.load_map)
     with open_recording(args.recording) as recording:
         if recording.warning:
@@ -109,6 +110,18 @@ def run(args: argparse.Namespace) -> None:
         print_json(as_json(outcome))
     else:
         print_summary(args, selected, outcome)
+
+
+def _check_files(args: argparse.Namespace) -> None:
+    """Refuse outputs that are in the way of what is there; --map may update the map loaded."""
+    read = {f'the recording {args.recording}': files_of(args.recording)}
+    if args.config is not None:
+        read['the file of --config'] = [find_config(args.config)]
+    loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
+    check_inputs_stay({'--tum': args.tum}, read | loaded)
+    check_inputs_stay({'--map': args.map}, read)
+    check_outputs([args.tum, args.map], args.force)
+    check_plots(args.plot, FIGURES, args.force)
 
 
 def _write_files(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> None:

@@ -213,6 +213,14 @@ def open_source(path: Path) -> tuple[MessageSource, str | None]:
         return _salvage(path, error)
 
 
+def files_of(path: Path) -> list[Path]:
+    """List the files that a recording consists of, compressed ones as well."""
+    if not path.is_dir():
+        return [path]
+    parts = (*FILE_SUFFIXES, 'metadata.yaml')
+    return [file for file in sorted(path.iterdir()) if any(part in file.name for part in parts)]
+
+
 def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
     if (path / 'metadata.yaml').exists():
         try:
