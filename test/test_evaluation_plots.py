@@ -97,6 +97,13 @@ def test_map_of_a_robot_that_saw_and_did_nothing(tmp_path: Path) -> None:
     assert rgb(RED) in colours(replay_plots.plot_map(tmp_path / 'map.png', standing, *empty))
 
 
+@pytest.mark.parametrize('landmarks', [0, 4])
+def test_map_without_a_path(tmp_path: Path, landmarks: int) -> None:
+    nowhere = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)))
+    ids, points = IDS[:landmarks], LANDMARKS[:landmarks]
+    assert replay_plots.plot_map(tmp_path / 'map.png', nowhere, ids, points).exists()
+
+
 def test_errors(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
     errors = trajectory_errors(estimate, truth)
     path = replay_plots.plot_errors(tmp_path / 'errors.png', errors)

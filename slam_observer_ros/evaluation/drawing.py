@@ -60,6 +60,8 @@ _PLANAR_RATIO = 0.01
 
 def is_flat(points: FloatArray) -> bool:
     """Return whether points (k, 3) are to be drawn from above."""
+    if not len(points):
+        return True
     width, depth, height = np.ptp(points, axis=0)
     return bool(height <= _PLANAR_RATIO * max(width, depth))
 

@@ -94,6 +94,7 @@ def plot_map(
         landmark_truth = None
     layers = _map_layers(estimate, world_points, truth, landmark_truth)
     drawn = np.concatenate([points for points, _ in layers])
+    drawn = drawn if len(drawn) else np.zeros((1, 3))
     low, high = drawn.min(axis=0), drawn.max(axis=0)
     margin = 0.06 * float(np.max(high - low)) or 1.0
     low, high = low - margin, high + margin
