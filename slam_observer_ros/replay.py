@@ -23,6 +23,7 @@ from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 SAMPLE_PERIOD_NS = 50_000_000
 """Least time between two poses of a sampled trajectory: 20 Hz at most."""
@@ -100,6 +101,8 @@ class Replay:
         CPU time of the estimator alone, without reading and measuring.
     in_known_map : bool
         Whether the poses are in the frame of a map that was known in advance.
+    start_ns : int
+        Stamp of the first event that was used, nanoseconds; 0 if none was.
 
     """
 
@@ -113,6 +116,11 @@ class Replay:
     events: int
     seconds: float
     in_known_map: bool
+    start_ns: int
+
+    def seconds_until(self, stamp_ns: int) -> float:
+        """Return the time from the first event to a stamp, seconds."""
+        return float(stamp_ns - self.start_ns) / NANOSECONDS_PER_SECOND
 
 
 def replay(
@@ -158,6 +166,7 @@ class _Run:
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
+        self._start_ns: int | None = None
         self._events = 0
         self._seconds = 0.0
 
@@ -166,7 +175,7 @@ class _Run:
         start_s = time.thread_time()
         accepted = self._estimator.add(event)
         self._seconds += time.thread_time() - start_s
-        self._sampler.sample()
+        self._sample()
         if accepted and isinstance(event, VelocityEvent):
             self._blind.add(event)
             self._blind_sampler.sample()
@@ -175,7 +184,7 @@ class _Run:
         start_s = time.thread_time()
         self._estimator.flush()
         self._seconds += time.thread_time() - start_s
-        self._sampler.sample()
+        self._sample()
         return Replay(
             self._estimator,
             self._sampler.trajectory,
@@ -190,7 +199,13 @@ class _Run:
             self._events,
             self._seconds,
             self._in_known_map,
+            self._start_ns or 0,
         )
+
+    def _sample(self) -> None:
+        if self._start_ns is None:
+            self._start_ns = self._estimator.stamp_ns
+        self._sampler.sample()
 
     def _on_update(self, update: Update) -> None:
         start_s = time.thread_time()

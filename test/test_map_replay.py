@@ -9,12 +9,16 @@ import pytest
 from slam_observer_ros.evaluation.trajectory import read_tum
 from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.map_file import read_map
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.recording.map_file import read_map, write_map
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.settings import Settings
 
 BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
+LANDMARKS = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
 POINT_NOISE_M = 0.02
 SETTINGS = ('--set', 'observation_model=cartesian', '--set', f'point_noise={POINT_NOISE_M}')
+ONE_STATE = (*SETTINGS, '--set', 'max_hypotheses=1')
 
 
 @pytest.fixture
@@ -22,20 +26,24 @@ def slam_observer(capsys):
     return CommandLine(capsys)
 
 
-def record(path, start, seed):
-    """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks."""
-    landmarks = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
+def record(path, start, seed, first_id=lambda step: 0, stamp_ns=lambda step: step * 10**8):
+    """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
+
+    Their ids go up from ``first_id``, which may change from step to step.
+    """
     random = np.random.default_rng(seed)
     with RecordingWriter(path) as writer:
         for step in range(80):
             noise = random.normal(scale=0.01, size=6)
-            writer.write_velocity(VelocityEvent(step * 10**8, BODY_VELOCITY + noise))
+            writer.write_velocity(VelocityEvent(stamp_ns(step), BODY_VELOCITY + noise))
             pose = start @ se3.exp(BODY_VELOCITY * 0.1 * step)
-            writer.write_pose(PoseTruth(step * 10**8, pose))
-            points = se3.transform(se3.inverse(pose), landmarks)
+            writer.write_pose(PoseTruth(stamp_ns(step), pose))
+            points = se3.transform(se3.inverse(pose), LANDMARKS)
             seen = np.flatnonzero(np.linalg.norm(points, axis=1) < 6.0)
             points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
-            writer.write_observation(ObservationEvent(step * 10**8, seen, points))
+            writer.write_observation(
+                ObservationEvent(stamp_ns(step), first_id(step) + seen, points)
+            )
     return path
 
 
@@ -101,3 +109,57 @@ def test_a_map_that_cannot_be_read_is_refused_before_anything_is_done(slam_obser
     missing = tmp_path / 'no.yaml'
     error = slam_observer.fail('replay', recording, '--load-map', missing)
     assert f"can't read map {missing}: No such file or directory" in error
+
+
+class TestPlaceNotKnown:
+    """In a map of the landmarks, which have other ids some of the time."""
+
+    @pytest.fixture
+    def saved(self, tmp_path):
+        covariances = np.tile(1e-4 * np.eye(3), (50, 1, 1))
+        surveyed = LandmarkMap(np.arange(50), LANDMARKS, covariances, np.zeros(50, dtype=np.int64))
+        write_map(tmp_path / 'map.yaml', surveyed, Settings())
+        return tmp_path / 'map.yaml'
+
+    @pytest.mark.parametrize('more', [(), ('--smooth',)])
+    def test_a_place_never_found_leaves_nothing_but_the_reason(
+        self, slam_observer, tmp_path, saved, more
+    ):
+        other = record(tmp_path / 'other.mcap', np.eye(4), seed=2, first_id=lambda step: 100)
+        poses, figures, before = tmp_path / 'poses.tum', tmp_path / 'figures', saved.read_bytes()
+        error = slam_observer.fail(
+            'replay', other, '--load-map', saved, '--map', saved, '--tum', poses, '--force',
+            '--plot', figures, *SETTINGS, *more,
+        )  # fmt: skip
+        for text in (str(saved), 'not found', 'three of its landmarks', '0 of its 50'):
+            assert text in error
+        assert saved.read_bytes() == before
+        assert not poses.exists()
+        assert not figures.exists()
+
+    def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
+        late = record(tmp_path / 'late.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s < 40))
+        poses = tmp_path / 'poses.tum'
+        arguments = ('replay', late, '--load-map', saved, '--force', '--tum', poses, *ONE_STATE)
+        report = slam_observer(*arguments, '--json').json
+        assert report['localised_after_s'] == pytest.approx(4.0, abs=0.3)
+        assert read_tum(poses).stamps_ns[0] * 1e-9 == report['localised_after_s']
+        assert (
+            f'found after {report["localised_after_s"]:.1f} s' in slam_observer(*arguments).output
+        )
+
+    def test_a_place_lost_at_the_end_gives_poses_but_no_map(self, slam_observer, tmp_path, saved):
+        jumped = record(
+            tmp_path / 'jumped.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s >= 40),
+            stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 40),
+        )  # fmt: skip
+        poses, again = tmp_path / 'poses.tum', tmp_path / 'again.yaml'
+        arguments = ('replay', jumped, '--load-map', saved, '--tum', poses, *ONE_STATE)
+        refused = slam_observer(*arguments, '--map', again)
+        assert refused.code == 2
+        assert 'lost after 3.8 s' in refused.errors
+        assert not again.exists()
+        ended = slam_observer(*arguments, '--force')
+        assert ended.code == 0
+        assert 'lost after 3.8 s' in ended.errors
+        assert 30 < len(read_tum(poses)) <= 40

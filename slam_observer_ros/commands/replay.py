@@ -18,6 +18,7 @@ from slam_observer_ros.commands.outputs import (
     check_plots,
     filled_directory,
 )
+from slam_observer_ros.commands.replay_checks import check_place
 from slam_observer_ros.commands.replay_inputs import (
     add_input_options,
     INPUT_NAMES,
@@ -102,6 +103,8 @@ def run(args: argparse.Namespace) -> None:
             recording.event_count(selected),
         )
         result = replay(events, settings, truth, landmark_map)
+        if landmark_map is not None:
+            check_place(args, result, landmark_map)
         outcome = outcome_of(recording, selected, result, truth)
     if args.smooth:
         outcome = with_smoothed(outcome)

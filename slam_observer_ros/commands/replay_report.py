@@ -46,6 +46,9 @@ class Report:
         See :class:`.ConfigurationError`; None without truth.
     anees : float or None
         Of the pose, per degree of freedom; None without truth or covariance.
+    localised_after_s : float or None
+        Time until the place in a loaded map was found, from when on the trajectory has poses,
+        seconds; None without such a map.
 
     """
 
@@ -60,6 +63,7 @@ class Report:
     landmark_rmse_m: float | None = None
     configuration_rmse_m: float | None = None
     anees: float | None = None
+    localised_after_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +96,9 @@ def outcome_of(
         configuration_rmse_m=accuracy.configuration_rmse_m,
         anees=accuracy.anees,
     )
+    if result.in_known_map and len(result.trajectory):
+        localised_after_s = result.seconds_until(result.trajectory.stamps_ns[0])
+        report = replace(report, localised_after_s=localised_after_s)
     if accuracy.pose_errors is not None:
         report = replace(
             report,
@@ -148,6 +155,10 @@ def print_summary(args: argparse.Namespace, selected: SelectedTopics, outcome: O
         'landmarks': str(report.landmarks),
         'dropped': ', '.join(f'{n} {reason}' for reason, n in report.dropped.items()) or 'none',
     }
+    if report.localised_after_s is not None:
+        rows['place in the map'] = (
+            f'found after {report.localised_after_s:.1f} s, where the trajectory begins'
+        )
     rows |= {part.name: str(part) for part in outcome.result.estimator.calibration}
     rows |= _accuracy_rows(outcome)
     rows |= {

@@ -1,0 +1,50 @@
+"""What must hold of a replay before its outcome is told and written."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.commands.errors import UsageError
+from slam_observer_ros.events import is_automatic
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.replay import Replay
+
+logger = logging.getLogger(__name__)
+
+
+def check_place(args: argparse.Namespace, result: Replay, known: LandmarkMap) -> None:
+    """Refuse an outcome that is not in the frame of the map that was loaded.
+
+    Where the place was found and lost again the trajectory is still of use, but not the map.
+
+    Raises
+    ------
+    UsageError
+        If the place was never found, or is not known at the end and the map is asked for.
+
+    """
+    if result.estimator.is_localised:
+        return
+    if not len(result.trajectory):
+        raise UsageError(_never_found(args.load_map, result, known))
+    end_s = result.seconds_until(result.trajectory.stamps_ns[-1])
+    lost = (
+        f'the place in the map {args.load_map} was lost after {end_s:.1f} s, and not found again'
+    )
+    if args.map is not None or args.smooth:
+        raise UsageError(f'{lost}; --map and --smooth need it at the end')
+    logger.warning('%s; the trajectory ends there.', lost[0].upper() + lost[1:])
+
+
+def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
+    named = known.ids[~is_automatic(known.ids)]
+    least = 'two' if result.estimator.settings.two_d_mode else 'three'
+    return (
+        f'the place in the map {path} was not found: that takes {least} of its landmarks or more, '
+        'recognised by their ids, well apart, and seen where the map has them; '
+        f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(known.ids)} were seen'
+    )
