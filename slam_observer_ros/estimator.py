@@ -61,6 +61,8 @@ class Estimator:
         ``'unsupported_landmark'``, and ``'unknown_id'``, which are not used).
     dropped : Counter
         Events refused, by reason.
+    jumps : int
+        How often the clock has jumped.
 
     """
 
@@ -73,6 +75,7 @@ class Estimator:
         self.settings = settings
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.jumps = 0
         self._map: LandmarkMap | None = None
         self._on_update = on_update
         self._hypotheses = Hypotheses(Slam(settings, np.eye(4)), settings)
@@ -97,6 +100,7 @@ class Estimator:
         ``reset`` starts again where the run began, or anywhere in a loaded map; ``hold`` keeps
         pose and map, and goes on from there.
         """
+        self.jumps += 1
         if self.settings.on_time_jump == 'reset':
             logger.warning('The clock has jumped; starting again.')
             self.reset(None if self._map else self._slam.observer.reference_pose)

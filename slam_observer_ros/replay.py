@@ -103,6 +103,10 @@ class Replay:
         Whether the poses are in the frame of a map that was known in advance.
     start_ns : int
         Stamp of the first event that was used, nanoseconds; 0 if none was.
+    history_since : str
+        Since when it is possible to look back, in words.
+    observations_since : int
+        Observations used since then.
 
     """
 
@@ -117,6 +121,8 @@ class Replay:
     seconds: float
     in_known_map: bool
     start_ns: int
+    history_since: str
+    observations_since: int
 
     def seconds_until(self, stamp_ns: int) -> float:
         """Return the time from the first event to a stamp, seconds."""
@@ -167,6 +173,9 @@ class _Run:
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None
+        self._jumps = 0
+        self._was_localised = self._estimator.is_localised
+        self._history_since, self._observations_since = 'the start', 0
         self._events = 0
         self._seconds = 0.0
 
@@ -200,6 +209,8 @@ class _Run:
             self._seconds,
             self._in_known_map,
             self._start_ns or 0,
+            self._history_since,
+            self._observations_since,
         )
 
     def _sample(self) -> None:
@@ -210,8 +221,27 @@ class _Run:
     def _on_update(self, update: Update) -> None:
         start_s = time.thread_time()
         self._updates.append(update)
+        self._note_jump()
+        self._note_observation()
         self._compare(update)
         self._seconds -= time.thread_time() - start_s
+
+    def _note_jump(self) -> None:
+        if self._estimator.jumps == self._jumps:
+            return
+        self._jumps = self._estimator.jumps
+        self._history_since, self._observations_since = 'the clock jumped', 0
+        if self._estimator.settings.on_time_jump == 'reset':
+            self._was_localised = not self._in_known_map
+
+    def _note_observation(self) -> None:
+        """Count an observation, unless with it what was seen until then became the prior."""
+        self._observations_since += 1
+        is_localised = self._estimator.is_localised
+        if is_localised and not self._was_localised:
+            self._history_since = 'the place in the loaded map was found'
+            self._observations_since = 0
+        self._was_localised = is_localised
 
     def _compare(self, update: Update) -> None:
         if self._pose_truth is None or self._landmark_truth is None:

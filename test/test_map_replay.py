@@ -163,3 +163,17 @@ class TestPlaceNotKnown:
         assert ended.code == 0
         assert 'lost after 3.8 s' in ended.errors
         assert 30 < len(read_tum(poses)) <= 40
+
+
+def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
+    path = record(
+        tmp_path / 'run.mcap', np.eye(4), seed=1,
+        stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 40),
+    )  # fmt: skip
+    saved = tmp_path / 'map.yaml'
+    hold = ('--smooth', '--set', 'on_time_jump=hold', *ONE_STATE)
+    jumped = slam_observer('replay', path, '--map', saved, *hold)
+    assert 'those since the clock jumped' in jumped.errors
+    loaded = slam_observer('replay', path, '--load-map', saved, '--smooth', *ONE_STATE)
+    assert 'those since the place in the loaded map was found' in loaded.errors
+    assert 'hindsight_window' not in jumped.errors + loaded.errors

@@ -114,10 +114,7 @@ def with_smoothed(outcome: Outcome) -> Outcome:
     estimator = outcome.result.estimator
     smoothed = estimator.smooth()
     if len(smoothed.stamps_ns) < estimator.counts['observation']:
-        logger.warning(
-            'Only the last %d observations are smoothed; --set hindsight_window=0 for all.',
-            len(smoothed.stamps_ns),
-        )
+        _warn_of_cut(outcome.result, len(smoothed.stamps_ns))
     errors, landmark_rmse_m = measure_smoothed(smoothed, outcome.truth)
     return replace(
         outcome,
@@ -125,6 +122,15 @@ def with_smoothed(outcome: Outcome) -> Outcome:
         smoothed_errors=errors,
         smoothed_landmark_rmse_m=landmark_rmse_m,
     )
+
+
+def _warn_of_cut(result: Replay, smoothed: int) -> None:
+    """Tell why only the last observations are smoothed."""
+    if 0 < result.estimator.settings.hindsight_window <= result.observations_since:
+        why = 'others are only kept as a summary; --set hindsight_window=0 smooths more'
+    else:
+        why = f'those since {result.history_since}'
+    logger.warning('Only the last %d observations are smoothed: %s.', smoothed, why)
 
 
 def as_json(outcome: Outcome) -> dict[str, object]:
