@@ -201,6 +201,18 @@ class TestOutputs:
         slam_observer.succeed('replay', directory, '--force', '--tum', directory / 'run.tum')
         slam_observer.succeed('replay', directory, '--force', '--tum', directory / 'run.tum')
 
+    def test_what_can_not_be_written_loses_nothing_else(self, slam_observer, simulated, tmp_path):
+        too_long, landmarks = tmp_path / ('x' * 250), tmp_path / 'map.yaml'
+        arguments = ('replay', simulated, '--tum', too_long, '--map', landmarks)
+        ended = slam_observer(*arguments)
+        assert ended.code == 2
+        assert ended.errors.startswith('slam-observer: error: ')
+        assert 'name too long' in ended.errors.lower()
+        assert ended.errors.count('\n') == 1
+        assert landmarks.exists()
+        assert '(ATE)' in ended.output
+        assert 'trajectory' not in ended.output
+
     def test_figures_leave_other_files_alone(self, slam_observer, simulated, tmp_path):
         (tmp_path / 'notes.txt').write_text('mine')
         slam_observer.succeed('replay', simulated, '--plot', tmp_path)
@@ -315,6 +327,36 @@ class TestTroubledRecordings:
         errors = slam_observer('replay', path).errors
         assert 'base_link' in errors
         assert 'camera' in errors
+
+    @pytest.fixture
+    def unplaced(self, tmp_path):
+        """A recording with truth, whose camera is nowhere on /tf."""
+        with RecordingWriter(tmp_path / 'unplaced.mcap') as writer:
+            for event in recordings.events():
+                if isinstance(event, VelocityEvent):
+                    writer.write_velocity(event)
+                else:
+                    writer.write_observation(event, frame_id='camera')
+            for truth in recordings.true_poses():
+                writer.write_pose(truth)
+        return tmp_path / 'unplaced.mcap'
+
+    def test_that_no_observation_was_used_is_told(self, slam_observer, unplaced):
+        errors = slam_observer('replay', unplaced).errors
+        assert 'warning: No observation was used (dropped: 50 no_transform)' in errors
+
+    def test_without_any_observation_nothing_is_smoothed_or_written(
+        self, slam_observer, unplaced, tmp_path
+    ):
+        tum, landmarks, figures = tmp_path / 'a.tum', tmp_path / 'a.yaml', tmp_path / 'figures'
+        ended = slam_observer(
+            'replay', unplaced, '--smooth', '--gains', 'riccati',
+            '--tum', tum, '--map', landmarks, '--plot', figures,
+        )  # fmt: skip
+        assert (ended.code, ended.output) == (2, '')
+        last = ended.errors.splitlines()[-1]
+        assert 'error: no observation was used (dropped: 50 no_transform)' in last
+        assert not any(path.exists() for path in (tum, landmarks, figures))
 
     def test_two_topics_that_fit_are_listed_with_the_option_that_decides(
         self, slam_observer, tmp_path

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 import dataclasses
 import logging
 from pathlib import Path
 
 from slam_observer_ros.accuracy import trajectory_of
 from slam_observer_ros.commands.console import print_json, show_progress
-from slam_observer_ros.commands.errors import UsageError
+from slam_observer_ros.commands.errors import OutputError, UsageError
 from slam_observer_ros.commands.options import add_settings_options, find_config, read_settings
 from slam_observer_ros.commands.outputs import (
     add_force_option,
@@ -18,7 +19,7 @@ from slam_observer_ros.commands.outputs import (
     check_plots,
     filled_directory,
 )
-from slam_observer_ros.commands.replay_checks import check_place
+from slam_observer_ros.commands.replay_checks import check_observations, check_place
 from slam_observer_ros.commands.replay_inputs import (
     add_input_options,
     INPUT_NAMES,
@@ -31,8 +32,10 @@ from slam_observer_ros.commands.replay_report import (
     Outcome,
     outcome_of,
     print_summary,
+    unused_messages,
     with_smoothed,
 )
+from slam_observer_ros.errors import SlamObserverError
 from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_map, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
@@ -40,6 +43,7 @@ from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.map_file import read_map, write_map
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.sources import files_of
+from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import replay
 
 logger = logging.getLogger(__name__)
@@ -103,16 +107,15 @@ def run(args: argparse.Namespace) -> None:
             recording.event_count(selected),
         )
         result = replay(events, settings, truth, landmark_map)
-        if landmark_map is not None:
-            check_place(args, result, landmark_map)
-        outcome = outcome_of(recording, selected, result, truth)
+        unused = unused_messages(recording, selected)
+    check_observations(args, result, result.estimator.dropped + unused)
+    if landmark_map is not None:
+        check_place(args, result, landmark_map)
+    outcome = outcome_of(result, truth, recording.duration_s, unused)
     if args.smooth:
         outcome = with_smoothed(outcome)
-    _write_files(args, outcome, landmark_map.frame_id if landmark_map else inputs.map_frame)
-    if args.json:
-        print_json(as_json(outcome))
-    else:
-        print_summary(args, selected, outcome)
+    map_frame = landmark_map.frame_id if landmark_map else inputs.map_frame
+    _give_out(args, selected, outcome, map_frame)
 
 
 def _check_files(args: argparse.Namespace) -> None:
@@ -127,7 +130,23 @@ def _check_files(args: argparse.Namespace) -> None:
     check_plots(args.plot, FIGURES, args.force)
 
 
-def _write_files(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> None:
+def _give_out(
+    args: argparse.Namespace, selected: SelectedTopics, outcome: Outcome, map_frame: str
+) -> None:
+    """Write and print all that can be, and only then say what could not be written."""
+    written, errors = _write_files(args, outcome, map_frame)
+    if args.json:
+        print_json(as_json(outcome))
+    else:
+        print_summary(args.recording, selected, outcome, written)
+    if errors:
+        raise OutputError('; '.join(errors))
+
+
+def _write_files(
+    args: argparse.Namespace, outcome: Outcome, map_frame: str
+) -> tuple[dict[str, Path], list[str]]:
+    """Write what was asked for; return what was written, and why something was not."""
     estimator, smoothed = outcome.result.estimator, outcome.smoothed
     landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=map_frame)
     trajectory = outcome.result.trajectory
@@ -135,31 +154,48 @@ def _write_files(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> 
         # The covariances stay: what the filter knows of the map in the end is hindsight, too.
         landmark_map = dataclasses.replace(landmark_map, world_points=smoothed.world_points)
         trajectory = trajectory_of(smoothed)
-    if args.tum is not None:
-        write_tum(trajectory, args.tum)
-    if args.map is not None:
-        write_map(args.map, landmark_map, estimator.settings)
-    if args.plot is not None:
-        with filled_directory(args.plot) as unfinished:
-            _draw(outcome, trajectory, landmark_map, unfinished)
+    outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
+        ('trajectory', args.tum, lambda path: write_tum(trajectory, path)),
+        ('map', args.map, lambda path: write_map(path, landmark_map, estimator.settings)),
+        ('figures', args.plot, lambda path: _draw(outcome, trajectory, landmark_map, path)),
+    )
+    written: dict[str, Path] = {}
+    errors: list[str] = []
+    for name, path, write in outputs:
+        if path is None:
+            continue
+        try:
+            write(path)
+            written[name] = path
+        except (SlamObserverError, OSError) as error:
+            errors.append(str(error))
+    return written, errors
 
 
 def _draw(
     outcome: Outcome, trajectory: Trajectory, landmark_map: LandmarkMap, directory: Path
 ) -> None:
+    with filled_directory(directory) as unfinished:
+        _draw_figures(outcome, trajectory, landmark_map, unfinished)
+
+
+def _draw_figures(
+    outcome: Outcome, trajectory: Trajectory, landmark_map: LandmarkMap, directory: Path
+) -> None:
     result, truth = outcome.result, outcome.truth
+    errors = outcome.accuracy.pose_errors if outcome.smoothed is None else outcome.smoothed_errors
     plot_map(
         directory / 'map.png',
         trajectory if outcome.smoothed is None else fill_gaps(trajectory, result.dead_reckoning),
         landmark_map.ids,
         landmark_map.world_points,
-        Trajectory(truth.stamps_ns, truth.poses) if outcome.accuracy.pose_errors else None,
+        Trajectory(truth.stamps_ns, truth.poses) if errors is not None else None,
         truth.landmarks,
     )
     if outcome.smoothed_errors is not None:
         plot_errors(directory / 'errors.png', outcome.smoothed_errors)
-    elif outcome.accuracy.pose_errors is not None:
-        errors, covariances = outcome.accuracy.pose_errors, result.pose_covariances
+    elif errors is not None:
+        covariances = result.pose_covariances
         plot_errors(
             directory / 'errors.png',
             errors,

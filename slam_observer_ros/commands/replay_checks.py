@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 import logging
 from pathlib import Path
 
@@ -14,6 +15,39 @@ from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.replay import Replay
 
 logger = logging.getLogger(__name__)
+
+
+def check_observations(
+    args: argparse.Namespace, result: Replay, dropped: Mapping[str, int]
+) -> None:
+    """Warn if no observation was used.
+
+    Parameters
+    ----------
+    args : Namespace
+        The command's options.
+    result : Replay
+        What came of the events.
+    dropped : mapping of str to int
+        How many events were dropped, by reason.
+
+    Raises
+    ------
+    UsageError
+        If none was used though ``--smooth`` or ``--load-map`` needs some.
+
+    """
+    if result.estimator.counts['observation']:
+        return
+    why = f'no observation was used (dropped: {list_dropped(dropped)})'
+    if args.smooth or args.load_map is not None:
+        raise UsageError(f'{why}; --smooth and --load-map need some')
+    logger.warning('%s; the trajectory is that of the velocities alone.', why.capitalize())
+
+
+def list_dropped(dropped: Mapping[str, int]) -> str:
+    """Return how many events were dropped, by reason, as text."""
+    return ', '.join(f'{count} {reason}' for reason, count in dropped.items()) or 'none'
 
 
 def check_place(args: argparse.Namespace, result: Replay, known: LandmarkMap) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 import logging
+from pathlib import Path
 
 from slam_observer_ros.accuracy import Accuracy, measure, measure_smoothed
 from slam_observer_ros.commands.console import print_table
+from slam_observer_ros.commands.replay_checks import list_dropped
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.reader import Recording
@@ -79,16 +81,31 @@ class Outcome:
     smoothed_landmark_rmse_m: float | None = None
 
 
-def outcome_of(
-    recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
-) -> Outcome:
-    """Measure a replay, and count what of the recording was dropped on the way."""
-    accuracy = measure(result, truth)
+def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[str]:
+    """Count the messages that did not become events, by reason."""
     malformed = sum(recording.malformed[topic.name] for topic in selected.inputs)
-    unused = recording.dropped + Counter({MALFORMED: malformed})
+    return recording.dropped + Counter({MALFORMED: malformed})
+
+
+def outcome_of(result: Replay, truth: Truth, duration_s: float, unused: Counter[str]) -> Outcome:
+    """Measure a replay.
+
+    Parameters
+    ----------
+    result : Replay
+        What is measured.
+    truth : Truth
+        What it is compared with.
+    duration_s : float
+        Time that the recording spans, seconds.
+    unused : Counter
+        From :func:`unused_messages`.
+
+    """
+    accuracy = measure(result, truth)
     report = Report(
         events=result.events + unused.total(),
-        duration_s=recording.duration_s,
+        duration_s=duration_s,
         seconds=result.seconds,
         landmarks=len(result.estimator.landmark_ids),
         dropped=dict(result.estimator.dropped + unused),
@@ -148,8 +165,10 @@ def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
     return None if errors is None else errors.ate_rmse_m
 
 
-def print_summary(args: argparse.Namespace, selected: SelectedTopics, outcome: Outcome) -> None:
-    """Print the figures as a table."""
+def print_summary(
+    recording: Path, selected: SelectedTopics, outcome: Outcome, written: Mapping[str, Path]
+) -> None:
+    """Print the figures as a table, and what was written where."""
     report = outcome.report
     rows = {
         'velocity topic': str(selected.velocity),
@@ -159,7 +178,7 @@ def print_summary(args: argparse.Namespace, selected: SelectedTopics, outcome: O
         'estimator': f'{outcome.result.estimator.settings.gains} gains, '
         f'{report.seconds:.2f} s of CPU time',
         'landmarks': str(report.landmarks),
-        'dropped': ', '.join(f'{n} {reason}' for reason, n in report.dropped.items()) or 'none',
+        'dropped': list_dropped(report.dropped),
     }
     if report.localised_after_s is not None:
         rows['place in the map'] = (
@@ -167,12 +186,8 @@ def print_summary(args: argparse.Namespace, selected: SelectedTopics, outcome: O
         )
     rows |= {part.name: str(part) for part in outcome.result.estimator.calibration}
     rows |= _accuracy_rows(outcome)
-    rows |= {
-        name: str(path)
-        for name, path in (('trajectory', args.tum), ('map', args.map), ('figures', args.plot))
-        if path is not None
-    }
-    print_table(str(args.recording), rows)
+    rows |= {name: str(path) for name, path in written.items()}
+    print_table(str(recording), rows)
 
 
 def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
