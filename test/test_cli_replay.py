@@ -264,6 +264,23 @@ class TestSettings:
         output = slam_observer.succeed('replay', simulated, '--config', config).output
         assert 'constant gains' in output
 
+    def test_what_the_node_does_and_a_replay_only_by_its_options_is_told(
+        self, slam_observer, simulated, tmp_path
+    ):
+        landmarks = tmp_path / 'map.yaml'
+        slam_observer.succeed('replay', simulated, '--map', landmarks)
+        config = self.config(
+            tmp_path, f'map_file: {landmarks}, autosave_map: true, path_length: 9'
+        )
+        arguments = ('replay', simulated, '--config', config)
+        errors = slam_observer(*arguments).errors
+        assert errors == (
+            'slam-observer: warning: Not used of --config: map_file (use --load-map), '
+            'autosave_map (use --map).\n'
+        )
+        given = ('--load-map', landmarks, '--map', tmp_path / 'again.yaml')
+        slam_observer.succeed(*arguments, *given)
+
     def test_the_command_line_wins(self, slam_observer, simulated, tmp_path):
         config = self.config(tmp_path, 'gains: constant')
         arguments = ('replay', simulated, '--config', config)

@@ -62,6 +62,7 @@ def test_help_has_examples(slam_observer):
         ('replay nothing.mcap --set gain_kk=1', "did you mean 'gain_k'?"),
         ('replay nothing.mcap --set gain_k=-1', "'gain_k' takes a value ≥ 1e-06"),
         ('replay nothing.mcap --set publish_rate=1', "that is the node's parameter"),
+        ('replay nothing.mcap --set map_file=a.yaml', 'use --load-map'),
         ('replay nothing.mcap --tum nowhere/a.tum', 'there is no directory nowhere'),
         ('replay nothing.mcap --tum .', '. is a directory'),
         ('replay nothing.mcap --tum a --map a', 'a is named for two outputs'),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 import json
 import os
 from pathlib import Path
 import sys
+from types import MappingProxyType
 
 from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.errors import ParameterError
@@ -49,7 +50,10 @@ def add_settings_options(parser: argparse.ArgumentParser) -> None:
 
 
 def read_settings(
-    args: argparse.Namespace, other_names: Collection[str] = (), **defaults: Value
+    args: argparse.Namespace,
+    other_names: Collection[str] = (),
+    instead: Mapping[str, str] = MappingProxyType({}),
+    **defaults: Value,
 ) -> Settings:
     """Build settings from defaults, ``--config``, ``--set`` and ``--gains``; later ones win.
 
@@ -59,6 +63,8 @@ def read_settings(
         With the options of :func:`add_settings_options`.
     other_names : collection of str
         Names that ``--set`` takes for other settings of the command.
+    instead : mapping of str to str
+        Options that do what the node's parameters of these names do.
     **defaults : Value
         What the command sets if the user doesn't.
 
@@ -76,7 +82,8 @@ def read_settings(
         if name in other_names:
             continue
         if _is_only_for_node(name):
-            raise UsageError(f"--set {name}: that is the node's parameter, of no use here")
+            hint = f'use {instead[name]}' if name in instead else 'of no use here'
+            raise UsageError(f"--set {name}: that is the node's parameter; {hint}")
         values[name] = value
     if args.gains is not None:
         values['gains'] = args.gains

@@ -23,8 +23,10 @@ from slam_observer_ros.commands.replay_checks import check_observations, check_p
 from slam_observer_ros.commands.replay_inputs import (
     add_input_options,
     INPUT_NAMES,
+    INSTEAD,
     read_inputs,
     topic_names,
+    warn_of_unused,
     with_base_frame,
 )
 from slam_observer_ros.commands.replay_report import (
@@ -90,10 +92,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(args: argparse.Namespace) -> None:
     """Replay a recording, and write what was asked for."""
-    settings, inputs = read_settings(args, INPUT_NAMES), read_inputs(args)
+    settings, inputs = read_settings(args, INPUT_NAMES, INSTEAD), read_inputs(args)
     if args.smooth and settings.gains != 'riccati':
         raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
     _check_files(args)
+    warn_of_unused(args)
     landmark_map = None if args.load_map is None else read_map(args.load_map)
     with open_recording(args.recording) as recording:
         if recording.warning:

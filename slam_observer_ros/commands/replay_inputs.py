@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import logging
 
 from slam_observer_ros.commands.options import read_assignments, read_config
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.reader import Recording
@@ -14,6 +16,15 @@ from slam_observer_ros.recording.topics import SelectedTopics, TopicNames
 _ROWS = {row.name: row for row in table(InputSettings)}
 INPUT_NAMES = frozenset(_ROWS)
 """Parameters of the node that a replay knows, too."""
+
+INSTEAD = {
+    'map_file': '--load-map',
+    'autosave_map': '--map',
+    'velocity_type': '--velocity-topic',
+}
+"""Options of a replay for what the node does by these parameters."""
+
+logger = logging.getLogger(__name__)
 
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
@@ -89,6 +100,20 @@ def read_inputs(args: argparse.Namespace) -> InputSettings:
     }
     values |= {name: value for name, value in options.items() if value is not None}
     return from_parameters(InputSettings, values)
+
+
+def warn_of_unused(args: argparse.Namespace) -> None:
+    """Warn of parameters in ``--config`` for which a replay has options, if these aren't given."""
+    defaults = {row.name: row.default for row in table(ObserverNodeSettings)}
+    unused = [
+        f'{name} (use {INSTEAD[name]})'
+        for name, value in read_config(args).items()
+        if name in INSTEAD
+        and value != defaults[name]
+        and getattr(args, INSTEAD[name].removeprefix('--').replace('-', '_')) is None
+    ]
+    if unused:
+        logger.warning('Not used of --config: %s.', ', '.join(unused))
 
 
 def with_base_frame(
