@@ -101,11 +101,16 @@ class Estimator:
         pose and map, and goes on from there.
         """
         self.jumps += 1
+        newest_ns = self.newest_stamp_ns
+        after = '' if newest_ns is None else f' after {newest_ns * 1e-9:.3f} s'
         if self.settings.on_time_jump == 'reset':
-            logger.warning('The clock has jumped; starting again.')
+            logger.warning(
+                'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
+                after,
+            )
             self.reset(None if self._map else self._slam.observer.reference_pose)
             return
-        logger.warning('The clock has jumped; pose and map are held.')
+        logger.warning('The clock has jumped%s; pose and map are held.', after)
         self.flush()
         if self._stamp_ns is not None:
             self._advance(self._stamp_ns)

@@ -45,6 +45,10 @@ class TrajectorySampler:
         self._poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
 
+    def follow(self, estimator: Estimator) -> None:
+        """Go on with the poses of another estimator."""
+        self._estimator = estimator
+
     def sample(self) -> None:
         """Keep the present pose, unless the one kept last is less than a period older.
 
@@ -77,7 +81,7 @@ class TrajectorySampler:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What came of a replay.
+    """What came of a replay; since its last start, if the clock jumped and all started again.
 
     Attributes
     ----------
@@ -103,6 +107,8 @@ class Replay:
         Whether the poses are in the frame of a map that was known in advance.
     start_ns : int
         Stamp of the first event that was used, nanoseconds; 0 if none was.
+    restarts : int
+        How often all started again after a jump of the clock.
     history_since : str
         Since when it is possible to look back, in words.
     observations_since : int
@@ -121,6 +127,7 @@ class Replay:
     seconds: float
     in_known_map: bool
     start_ns: int
+    restarts: int
     history_since: str
     observations_since: int
 
@@ -161,29 +168,33 @@ class _Run:
     def __init__(
         self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
     ) -> None:
+        self._settings = settings
         self._estimator = Estimator(settings, on_update=self._on_update)
         self._in_known_map = landmark_map is not None
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
-        self._sampler = TrajectorySampler(self._estimator)
-        self._blind = Estimator(settings)
-        self._blind_sampler = TrajectorySampler(self._blind)
         self._landmark_truth = truth.landmarks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
+        self._history_since, self._observations_since = 'the start', 0
+        self._jumps = self._restarts = self._events = 0
+        self._seconds = 0.0
+        self._start()
+
+    def _start(self) -> None:
+        self._sampler = TrajectorySampler(self._estimator)
+        self._blind = Estimator(self._settings)
+        self._blind_sampler = TrajectorySampler(self._blind)
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None
-        self._jumps = 0
-        self._was_localised = self._estimator.is_localised
-        self._history_since, self._observations_since = 'the start', 0
-        self._events = 0
-        self._seconds = 0.0
+        self._was_localised = not self._in_known_map
 
     def add(self, event: Event) -> None:
         self._events += 1
         start_s = time.thread_time()
         accepted = self._estimator.add(event)
         self._seconds += time.thread_time() - start_s
+        self._note_jump()
         self._sample()
         if accepted and isinstance(event, VelocityEvent):
             self._blind.add(event)
@@ -209,6 +220,7 @@ class _Run:
             self._seconds,
             self._in_known_map,
             self._start_ns or 0,
+            self._restarts,
             self._history_since,
             self._observations_since,
         )
@@ -220,19 +232,26 @@ class _Run:
 
     def _on_update(self, update: Update) -> None:
         start_s = time.thread_time()
-        self._updates.append(update)
         self._note_jump()
+        self._updates.append(update)
         self._note_observation()
         self._compare(update)
         self._seconds -= time.thread_time() - start_s
 
     def _note_jump(self) -> None:
+        """Start again, or let the velocities alone go on at another time, as the estimator did."""
         if self._estimator.jumps == self._jumps:
             return
         self._jumps = self._estimator.jumps
         self._history_since, self._observations_since = 'the clock jumped', 0
-        if self._estimator.settings.on_time_jump == 'reset':
-            self._was_localised = not self._in_known_map
+        if self._settings.on_time_jump == 'reset':
+            self._restarts += 1
+            self._start()
+            return
+        self._blind.flush()
+        self._blind_sampler.sample()
+        self._blind = Estimator(self._settings, self._blind.pose)
+        self._blind_sampler.follow(self._blind)
 
     def _note_observation(self) -> None:
         """Count an observation, unless with it what was seen until then became the prior."""

@@ -26,10 +26,12 @@ def slam_observer(capsys):
     return CommandLine(capsys)
 
 
-def record(path, start, seed, first_id=lambda step: 0, stamp_ns=lambda step: step * 10**8):
+def record(
+    path, start, seed, first_id=lambda s: 0, stamp_ns=lambda s: s * 10**8, scale=lambda s: 1.0
+):
     """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
 
-    Their ids go up from ``first_id``, which may change from step to step.
+    At each step ids go up from ``first_id``, and the landmarks' world is ``scale`` times as large.
     """
     random = np.random.default_rng(seed)
     with RecordingWriter(path) as writer:
@@ -38,8 +40,9 @@ def record(path, start, seed, first_id=lambda step: 0, stamp_ns=lambda step: ste
             writer.write_velocity(VelocityEvent(stamp_ns(step), BODY_VELOCITY + noise))
             pose = start @ se3.exp(BODY_VELOCITY * 0.1 * step)
             writer.write_pose(PoseTruth(stamp_ns(step), pose))
-            points = se3.transform(se3.inverse(pose), LANDMARKS)
-            seen = np.flatnonzero(np.linalg.norm(points, axis=1) < 6.0)
+            near = np.linalg.norm(LANDMARKS - pose[:3, 3], axis=1) < 6.0
+            seen, points = np.flatnonzero(near), scale(step) * LANDMARKS
+            points = se3.transform(se3.inverse(pose), points)
             points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
             writer.write_observation(
                 ObservationEvent(stamp_ns(step), first_id(step) + seen, points)
@@ -149,20 +152,22 @@ class TestPlaceNotKnown:
         )
 
     def test_a_place_lost_at_the_end_gives_poses_but_no_map(self, slam_observer, tmp_path, saved):
-        jumped = record(
-            tmp_path / 'jumped.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s >= 40),
-            stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 40),
-        )  # fmt: skip
+        misled = record(
+            tmp_path / 'misled.mcap', np.eye(4), seed=2, scale=lambda s: 10.0 if s >= 40 else 1.0
+        )
         poses, again = tmp_path / 'poses.tum', tmp_path / 'again.yaml'
-        arguments = ('replay', jumped, '--load-map', saved, '--tum', poses, *ONE_STATE)
+        arguments = (
+            'replay', misled, '--load-map', saved, '--tum', poses, *ONE_STATE,
+            '--set', 'localization_mode=uncertain',
+        )  # fmt: skip
         refused = slam_observer(*arguments, '--map', again)
         assert refused.code == 2
-        assert 'lost after 3.8 s' in refused.errors
+        assert ', and not found again' in refused.errors
         assert not again.exists()
         ended = slam_observer(*arguments, '--force')
         assert ended.code == 0
-        assert 'lost after 3.8 s' in ended.errors
-        assert 30 < len(read_tum(poses)) <= 40
+        assert ', and not found again' in ended.errors
+        assert 40 <= len(read_tum(poses)) < 50
 
 
 def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
@@ -177,3 +182,25 @@ def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
     loaded = slam_observer('replay', path, '--load-map', saved, '--smooth', *ONE_STATE)
     assert 'those since the place in the loaded map was found' in loaded.errors
     assert 'hindsight_window' not in jumped.errors + loaded.errors
+
+
+@pytest.mark.parametrize('resets', [True, False])
+def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_told(
+    slam_observer, tmp_path, resets
+):
+    path = record(
+        tmp_path / 'run.mcap', np.eye(4), seed=1, stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 50)
+    )
+    poses = tmp_path / 'poses.tum'
+    jump = 'reset' if resets else 'hold'
+    ended = slam_observer(
+        'replay', path, '--tum', poses, '--json', '--set', f'on_time_jump={jump}', *SETTINGS
+    )
+    assert ended.errors.count('The clock has jumped after 4.900 s') == 1
+    assert ('on_time_jump: hold' in ended.errors) == resets
+    assert ('after the last jump of the clock (1 in all)' in ended.errors) == resets
+    assert (read_tum(poses).stamps_ns[0] > 10**12) == resets
+    if resets:
+        assert ended.json['ate_rmse_m'] < 0.05
+        assert ended.json['dead_reckoning_ate_rmse_m'] < 0.2
+        assert ended.json['anees'] < 5.0

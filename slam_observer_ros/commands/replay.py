@@ -19,7 +19,7 @@ from slam_observer_ros.commands.outputs import (
     check_plots,
     filled_directory,
 )
-from slam_observer_ros.commands.replay_checks import check_observations, check_place
+from slam_observer_ros.commands.replay_checks import check_observations, check_place, tell_restart
 from slam_observer_ros.commands.replay_inputs import (
     add_input_options,
     INPUT_NAMES,
@@ -111,6 +111,7 @@ def run(args: argparse.Namespace) -> None:
         )
         result = replay(events, settings, truth, landmark_map)
         unused = unused_messages(recording, selected)
+    tell_restart(result)
     check_observations(args, result, result.estimator.dropped + unused)
     if landmark_map is not None:
         check_place(args, result, landmark_map)

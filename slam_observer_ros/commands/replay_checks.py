@@ -17,6 +17,18 @@ from slam_observer_ros.replay import Replay
 logger = logging.getLogger(__name__)
 
 
+def tell_restart(result: Replay) -> None:
+    """Warn if only a part of the recording is told of, because the clock jumped."""
+    if not result.restarts:
+        return
+    logger.warning(
+        'Trajectory, map, errors and figures are only of the %.1f s after the last jump of the '
+        'clock (%d in all).',
+        result.seconds_until(result.estimator.stamp_ns or 0),
+        result.restarts,
+    )
+
+
 def check_observations(
     args: argparse.Namespace, result: Replay, dropped: Mapping[str, int]
 ) -> None:
