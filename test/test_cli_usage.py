@@ -108,7 +108,7 @@ def test_output_that_exists(slam_observer, recording, data_dir):
     file = data_dir / 'starry_night' / 'dataset3.mat'
     for command in (('simulate', '--output'), ('convert', 'starry-night', file)):
         assert '--force' in slam_observer.fail(*command, recording)
-    assert '--force' in slam_observer.fail('replay', recording, '--tum', recording)
+    assert 'give another name' in slam_observer.fail('replay', recording, '--tum', recording)
     assert recording.read_bytes() == before
 
 

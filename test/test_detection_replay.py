@@ -203,7 +203,7 @@ def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observ
     assert ended.code == 0
     assert ended.json['landmarks'] == 0
     assert ended.json['dropped'] == {'no_transform': 41}
-    assert ended.errors.count('no_transform') == 1
+    assert ended.errors.count('Dropped a message (no_transform)') == 1
 
 
 @pytest.mark.parametrize(

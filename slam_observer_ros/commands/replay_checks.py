@@ -51,10 +51,10 @@ def check_observations(
     """
     if result.estimator.counts['observation']:
         return
-    why = f'no observation was used (dropped: {list_dropped(dropped)})'
+    why = f'observation was used (dropped: {list_dropped(dropped)})'
     if args.smooth or args.load_map is not None:
-        raise UsageError(f'{why}; --smooth and --load-map need some')
-    logger.warning('%s; the trajectory is that of the velocities alone.', why.capitalize())
+        raise UsageError(f'no {why}; --smooth and --load-map need some')
+    logger.warning('No %s; the trajectory is that of the velocities alone.', why)
 
 
 def list_dropped(dropped: Mapping[str, int]) -> str:
