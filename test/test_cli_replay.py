@@ -202,7 +202,7 @@ class TestOutputs:
         slam_observer.succeed('replay', directory, '--force', '--tum', directory / 'run.tum')
 
     def test_what_can_not_be_written_loses_nothing_else(self, slam_observer, simulated, tmp_path):
-        too_long, landmarks = tmp_path / ('x' * 250), tmp_path / 'map.yaml'
+        too_long, landmarks = tmp_path / ('x' * 254), tmp_path / 'map.yaml'
         arguments = ('replay', simulated, '--tum', too_long, '--map', landmarks)
         ended = slam_observer(*arguments)
         assert ended.code == 2
