@@ -54,11 +54,12 @@ class Estimator:
     Attributes
     ----------
     counts : Counter
-        Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``),
-        observations made before the place in a loaded map was found (``'not_localised'``), how
-        often it was lost again (``'lost'``), and what became of landmarks
-        (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``,
-        ``'unsupported_landmark'``, and ``'unknown_id'``, which are not used).
+        Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``), points
+        in these observations (``'observed_point'``), observations made before the place in a
+        loaded map was found (``'not_localised'``), how often it was lost again (``'lost'``), and
+        what became of landmarks (``'rejected_landmark'``, ``'moved_landmark'``,
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``, which are not
+        used).
     dropped : Counter
         Events refused, by reason.
     jumps : int
@@ -369,6 +370,7 @@ class Estimator:
         self._advance(event.stamp_ns)
         ids, residuals = self._hypotheses.observe(event)
         self._counts['observation'] += 1
+        self._counts['observed_point'] += len(event.ids)
         self._localise(ids)
         level = lyapunov(self.settings.gain_k, residuals)
         observer = self._slam.observer

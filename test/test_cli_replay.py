@@ -10,14 +10,14 @@ import ros_messages as ros
 import yaml
 
 from slam_observer_ros.evaluation.trajectory import read_tum
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 
 REPORT_KEYS = {
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
     'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
     'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',
-    'localised_after_s',
+    'localised_after_s', 'used',
 }  # fmt: skip
 
 
@@ -48,6 +48,16 @@ def write_events(path, events):
             else:
                 writer.write_observation(event)
     return path
+
+
+def nameless(events):
+    """Take the ids of all points away."""
+    return [
+        event
+        if isinstance(event, VelocityEvent)
+        else ObservationEvent(event.stamp_ns, np.full(len(event.ids), UNKNOWN_ID), event.points)
+        for event in events
+    ]
 
 
 class TestReport:
@@ -122,6 +132,43 @@ class TestReport:
 
     def test_without_an_unknown_calibration_none_is_told(self, slam_observer, simulated):
         assert slam_observer.succeed('replay', simulated, '--json').json['calibration'] == {}
+
+
+class TestPoints:
+    """What became of the points that were observed."""
+
+    def test_all_used(self, slam_observer, simulated):
+        report = slam_observer.succeed('replay', simulated, '--json').json
+        assert report['used'] == {'velocity': 251, 'observation': 251, 'observed_point': 1004}
+        assert '1004 used ' in slam_observer.succeed('replay', simulated).output
+
+    def test_a_landmark_that_jumps_is_rejected_and_then_has_moved(self, slam_observer, tmp_path):
+        def jumped(event):
+            points = event.points + np.array([[0.0, 5.0, 0.0]]) * (event.ids == 5)[:, None]
+            return ObservationEvent(event.stamp_ns, event.ids, points)
+
+        events = [
+            jumped(event) if isinstance(event, ObservationEvent) and index > 100 else event
+            for index, event in enumerate(recordings.events())
+        ]
+        path = write_events(tmp_path / 'jump.mcap', events)
+        used = slam_observer('replay', path, '--gains', 'riccati', '--json').json['used']
+        assert used['moved_landmark'] == 1
+        rejected = used['rejected_landmark']
+        output = slam_observer('replay', path, '--gains', 'riccati').output
+        assert f'{150 - rejected} used, {rejected} rejected ({rejected / 1.5:.1f} %)' in output
+        assert '3, 1 moved' in output
+
+    def test_gains_that_use_no_point_without_id_say_so(self, slam_observer, tmp_path):
+        path = write_events(tmp_path / 'nameless.mcap', nameless(recordings.events()))
+        arguments = ('replay', path, '--landmarks-topic', '/landmarks', '--gains')
+        ended = slam_observer(*arguments, 'constant')
+        assert '0 used, 150 without id (100.0 %)' in ended.output
+        assert ended.errors == (
+            'slam-observer: warning: 150 points without id are not used by constant gains; '
+            'use --gains riccati.\n'
+        )
+        assert '150 used' in slam_observer.succeed(*arguments, 'riccati').output
 
 
 class TestOutputs:

@@ -21,6 +21,16 @@ from slam_observer_ros.replay import Replay
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
 
+UNUSED_POINTS = {
+    'rejected_landmark': 'rejected',
+    'unknown_id': 'without id',
+    'unmapped_landmark': 'not mapped',
+}
+"""What befalls points that were observed and are not used, and how it is told."""
+
+LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
+"""What befalls landmarks that are in the map."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -123,7 +133,17 @@ def outcome_of(result: Replay, truth: Truth, duration_s: float, unused: Counter[
             rotation_rmse_rad=accuracy.pose_errors.rotation_rmse_rad,
             heading_rmse_rad=accuracy.pose_errors.heading_rmse_rad,
         )
+    _warn_of_unknown_ids(result)
     return Outcome(result, truth, accuracy, report)
+
+
+def _warn_of_unknown_ids(result: Replay) -> None:
+    """Say what would use points without id, if they were left out."""
+    unknown, gains = result.estimator.counts['unknown_id'], result.estimator.settings.gains
+    if unknown and gains != 'riccati':
+        logger.warning(
+            '%d points without id are not used by %s gains; use --gains riccati.', unknown, gains
+        )
 
 
 def with_smoothed(outcome: Outcome) -> Outcome:
@@ -154,6 +174,7 @@ def as_json(outcome: Outcome) -> dict[str, object]:
     """Return the figures as ``--json`` prints them."""
     calibration = outcome.result.estimator.calibration
     return asdict(outcome.report) | {
+        'used': dict(outcome.result.estimator.counts),
         'calibration': {part.name: asdict(part) for part in calibration},
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
         'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
@@ -177,7 +198,8 @@ def print_summary(
         'events': f'{report.events} over {report.duration_s:.1f} s',
         'estimator': f'{outcome.result.estimator.settings.gains} gains, '
         f'{report.seconds:.2f} s of CPU time',
-        'landmarks': str(report.landmarks),
+        'landmarks': _told_landmarks(report.landmarks, outcome.result.estimator.counts),
+        'observed points': _told_points(outcome.result.estimator.counts),
         'dropped': list_dropped(report.dropped),
     }
     if report.localised_after_s is not None:
@@ -188,6 +210,24 @@ def print_summary(
     rows |= _accuracy_rows(outcome)
     rows |= {name: str(path) for name, path in written.items()}
     print_table(str(recording), rows)
+
+
+def _told_landmarks(landmarks: int, counts: Counter[str]) -> str:
+    befell = {fate: counts[f'{fate}_landmark'] for fate in LANDMARK_FATES}
+    told = [f'{count} {fate}' for fate, count in befell.items() if count]
+    return ', '.join([str(landmarks), *told])
+
+
+def _told_points(counts: Counter[str]) -> str:
+    """Tell how many points were used, and what befell the others."""
+    seen, unused = counts['observed_point'], {name: counts[name] for name in UNUSED_POINTS}
+    told = [f'{seen - sum(unused.values())} used']
+    told += [
+        f'{count} {UNUSED_POINTS[name]} ({100.0 * count / seen:.1f} %)'
+        for name, count in unused.items()
+        if count
+    ]
+    return ', '.join(told)
 
 
 def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
