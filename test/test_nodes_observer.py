@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
@@ -248,6 +248,17 @@ def test_malformed_and_impossible_messages_are_counted_and_do_no_harm(ros, obser
         ros.spin_until(lambda: _malformed(diagnostics[-1]) == malformed + 1, 'the count')
     assert _dropped(diagnostics[-1]) == dropped + 1
     assert all(np.isfinite(m.pose.pose.position.x) for m in poses)
+
+
+def test_a_lidars_scan_is_dropped_and_counted(ros, observer):
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    scan = ObservationEvent(time.time_ns(), np.full(501, UNKNOWN_ID), np.ones((501, 3)))
+    with Robot(ros) as robot:
+        robot.run(RUN)
+        robot.send(scan)
+        ros.spin_until(
+            lambda: diagnostics and _sum(diagnostics[-1], 'dropped: scan') == 1, 'the count'
+        )
 
 
 def _malformed(diagnostics):

@@ -167,6 +167,22 @@ class TestDamage:
         assert 'too short' in caplog.text
 
 
+@pytest.mark.parametrize('count', [500, 501])
+def test_a_lidars_scan_is_not_taken_for_landmarks(tmp_path, count):
+    path = tmp_path / 'lidar.mcap'
+    cloud = ros.point_cloud(np.ones((count, 3)), {'intensity': np.zeros(count)})
+    with RecordingWriter(path) as writer:
+        for topic, message in (('/twist', ros.twist([1.0] * 6)), ('/landmarks', cloud)):
+            writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
+    with open_recording(path) as recording:
+        events = recording.events(recording.find_topics())
+        if count == 500:
+            assert len(list(events)) == 2
+        else:
+            with pytest.raises(RecordingError, match=r'501 points without id .* not scans'):
+                list(events)
+
+
 class TestNothingToRead:
     def test_missing_file(self, tmp_path):
         with pytest.raises(RecordingError, match='no such file'):

@@ -19,7 +19,7 @@ from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.event_builder import EventBuilder, Measured, NO_TRANSFORM
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
-from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
 
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports of one kind of drop."""
@@ -102,7 +102,11 @@ class Intake:
             self._build(timed)
 
     def add_observation(self, message: ObservationMessage, receive_ns: int) -> None:
-        """Take landmarks."""
+        """Take landmarks, unless they are a lidar's scan."""
+        trouble = scan_trouble(message.event)
+        if self.is_active and trouble:
+            self._drop('scan', trouble)
+            return
         event = self._timed(message.event, 'landmarks', receive_ns)
         if event is not None:
             self._build(replace(message, event=event))

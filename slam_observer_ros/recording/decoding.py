@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeAlias
 
+from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.recording.detections import (
     APRILTAGS_TYPE,
     decode_apriltags,
@@ -26,12 +27,15 @@ from slam_observer_ros.recording.messages import (
     VELOCITY_DECODERS,
     VelocityMessage,
 )
-from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics, TRANSFORMS_TYPE
 
 Decode: TypeAlias = Callable[[RawMessage], Sequence[Measured]]
-"""From a message to what it measures; raises :class:`MessageError` if it is malformed."""
+"""From a message to what it measures.
+
+Raises :class:`MessageError` if it is malformed, :class:`RecordingError` if it is a lidar's scan.
+"""
 
 
 _OBSERVATION_DECODERS = LANDMARK_DECODERS | DETECTION_DECODERS
@@ -82,7 +86,11 @@ def _imu(raw: RawMessage) -> list[ImuMessage]:
 
 
 def _landmarks(raw: RawMessage) -> list[ObservationMessage]:
-    return [decode_landmarks(raw)]
+    message = decode_landmarks(raw)
+    trouble = scan_trouble(message.event)
+    if trouble:
+        raise RecordingError(f'{raw.topic}: {trouble}')
+    return [message]
 
 
 def _tags(raw: RawMessage) -> list[TagDetections]:

@@ -27,6 +27,9 @@ from slam_observer_ros.recording.point_cloud_layout import (
 )
 from slam_observer_ros.types import FloatArray, IntArray
 
+MAX_UNKNOWN_POINTS = 500
+"""Most points without id in a message: telling them apart costs their number cubed."""
+
 _READ_NAMES = frozenset((ID_NAME, *POINT_NAMES, *COVARIANCE_NAMES, *VELOCITY_NAMES))
 _UPPER_TRIANGLE_TO_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 
@@ -125,6 +128,24 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationM
     dtype = _record_type(fields, byte_order, point_step)
     records = _records(data, dtype, height, width, row_step)
     return ObservationMessage(frame_id, _observation(stamp_ns, records, is_dense))
+
+
+def scan_trouble(event: ObservationEvent) -> str:
+    """Return why an observation is a lidar's scan rather than landmarks; empty if it is not.
+
+    Parameters
+    ----------
+    event : ObservationEvent
+        What one message holds.
+
+    """
+    unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
+    if unknown <= MAX_UNKNOWN_POINTS:
+        return ''
+    return (
+        f'{unknown} points without id in one message, more than {MAX_UNKNOWN_POINTS}: landmarks '
+        'are wanted, a few to a few hundred a message, not scans'
+    )
 
 
 def has_ids(raw: Buffer, message_type: str) -> bool:
