@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from slam_observer_ros.evaluation.drawing import BLUE, GREEN, GREY, RED
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import LandmarkTruth
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID, LandmarkTruth
 from slam_observer_ros.geometry import se3
 
 LANDMARKS = np.array([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, -4.0, 0.0]])
@@ -75,6 +76,37 @@ def test_configuration(tmp_path: Path, estimate: Trajectory, truth: Trajectory) 
         tmp_path / 'paths.png', estimate, truth, tracks, LANDMARKS
     )
     assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
+
+
+@pytest.mark.parametrize('height_m', [0.0, 3.0], ids=['flat', 'space'])
+def test_legend_of_a_configuration_covers_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, height_m: float
+) -> None:
+    saved: list[Figure] = []
+    monkeypatch.setattr(simulation_plots, 'save', lambda figure, _path: saved.append(figure))
+    poses = se3.exp(SECONDS[:, None] * np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0]))
+    circle = Trajectory((SECONDS * 1e9).astype(np.int64), poses)
+    points = LANDMARKS + np.array([0.0, 0.0, height_m]) * np.array([[1.0], [-1.0], [1.0], [-1.0]])
+    tracks = np.tile(points, (200, 1, 1))
+    simulation_plots.plot_configuration(tmp_path / 'a.png', circle, circle, tracks, points)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    (axes,) = figure.axes
+    drawn = axes.get_tightbbox()
+    assert drawn is not None
+    assert not legend.get_window_extent().overlaps(drawn)
+
+
+def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -> None:
+    crowded = np.linspace(0.0, 2.0, 30)[:, None] * np.array([1.0, 0.2, 0.0])
+    numbers = np.arange(30)
+    labelled = replay_plots.plot_map(tmp_path / 'a.png', estimate, numbers, crowded)
+    unnamed = numbers + FIRST_AUTOMATIC_ID
+    bare = replay_plots.plot_map(tmp_path / 'b.png', estimate, unnamed, crowded)
+    green, bare_green = (int(np.sum(pixels_of(path) == rgb(GREEN))) for path in (labelled, bare))
+    assert green == bare_green
+    assert np.any(pixels_of(labelled) != pixels_of(bare))
 
 
 def test_map_with_truth(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
@@ -143,9 +175,14 @@ def test_residuals(tmp_path: Path, dropped: dict[str, int]) -> None:
     assert (rgb(BLUE) in colours(path)) is bool(dropped)
 
 
-def test_residuals_of_a_run_without_any(tmp_path: Path) -> None:
+def test_residuals_of_a_run_without_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved: list[Figure] = []
+    monkeypatch.setattr(replay_plots, 'save', lambda figure, _path: saved.append(figure))
     empty = np.empty(0, dtype=np.int64), np.empty((0, 3))
-    assert replay_plots.plot_residuals(tmp_path / 'none.png', *empty, {}, 0).stat().st_size > 0
+    replay_plots.plot_residuals(tmp_path / 'none.png', *empty, {}, 0)
+    (axes,) = saved[0].axes
+    assert [text.get_text() for text in axes.texts] == ['no residuals']
+    assert len(axes.get_xticks()) == len(axes.get_yticks()) == 0
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:

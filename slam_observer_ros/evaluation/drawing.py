@@ -51,7 +51,7 @@ END: Any = {
 TRUE_LANDMARKS: Any = {**TRUE_END, 'markersize': 10, 'label': 'true landmarks'}
 TRACKS: Any = {'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2, 'label': 'landmark estimates'}
 LANDMARKS: Any = {**END, 'color': GREEN, 'markersize': 9}
-LEGEND_BELOW: Any = {'loc': 'upper center', 'bbox_to_anchor': (0.5, 0.0), 'ncols': 4}
+LEGEND_BELOW: Any = {'loc': 'outside lower center', 'ncols': 4}  # of a figure, not of its axes
 LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
 
 _PLANAR_RATIO = 0.01

@@ -116,7 +116,7 @@ def plot_map(
     panels[0].set_title(f'Trajectory and map{aligned}')
     panels[-1].set_xlabel('x [m]')
     figure.align_ylabels(panels)
-    panels[-1].legend(**LEGEND_BELOW, borderaxespad=4.0)
+    figure.legend(*panels[-1].get_legend_handles_labels(), **LEGEND_BELOW)
     return save(figure, path)
 
 
@@ -158,7 +158,7 @@ def _label_landmarks(
             verticalalignment='bottom' if up > 0 else 'top',
             fontsize=8,
             color='#004D38',
-            zorder=6,
+            zorder=3,  # above paths, below markers, which the halo would erase
             path_effects=[withStroke(linewidth=2.5, foreground='white')],
         )
 
@@ -171,6 +171,9 @@ def plot_errors(
     configuration: ConfigurationError | None = None,
 ) -> Path:
     """Draw position and heading errors over time, with the band that three sigma allow.
+
+    The errors are those after the alignment; the covariances are relative to the first pose, or
+    in the frame of a map that was loaded.
 
     Parameters
     ----------
@@ -243,7 +246,7 @@ def _deviations(covariances: FloatArray, alignment: FloatArray) -> FloatArray:
 
 def _draw_band(axes: Axes, times_s: FloatArray, limit: FloatArray) -> None:
     axes.fill_between(
-        times_s, -limit, limit, color=BLUE, alpha=0.16, linewidth=0.0, label='±3σ'
+        times_s, -limit, limit, color=BLUE, alpha=0.16, linewidth=0.0, label='±3σ before alignment'
     )  # fmt: skip
 
 
@@ -304,10 +307,13 @@ def plot_residuals(
 
 
 def _draw_residuals(axes: Axes, stamps_ns: IntArray, lengths_m: FloatArray) -> None:
-    axes.set(title='Residuals', xlabel='time [s]', ylabel='residual [m]', yscale='log')
+    axes.set(title='Residuals', xlabel='time [s]', ylabel='residual [m]')
     positive = lengths_m > 0.0
     if not positive.any():
+        axes.text(0.5, 0.5, 'no residuals', transform=axes.transAxes, ha='center', va='center')
+        axes.set(xticks=[], yticks=[])
         return
+    axes.set_yscale('log')
     times_s = _seconds_since(int(stamps_ns.min()), stamps_ns)[positive]
     lengths_m = lengths_m[positive]
     axes.plot(times_s, lengths_m, '.', color=BLUE, markersize=2.5, alpha=0.35)

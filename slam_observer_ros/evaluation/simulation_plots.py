@@ -149,11 +149,10 @@ def plot_configuration(
     axes.set(title='Configuration after the rigid correction', xlabel='x [m]', ylabel='y [m]')
     if flat:
         axes.set_aspect('equal')
-        axes.legend(**LEGEND_BELOW, borderaxespad=4.0)
     else:
         limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
-        axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.2)
-        axes.legend(**LEGEND_BELOW)
+        axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.1)
+    figure.legend(**LEGEND_BELOW)
     return save(figure, path)
 
 
