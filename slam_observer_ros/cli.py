@@ -38,6 +38,13 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse what is not known here, where the command whose help tells more is known."""
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return namespace, unknown
+
     def error(self, message: str) -> NoReturn:
         """Show what is wrong and where help is, and exit."""
         show_message('error', f"{message}; see '{self.prog} --help'")

@@ -50,7 +50,7 @@ def test_help_has_examples(slam_observer):
         ('replay', "required: RECORDING; see 'slam-observer replay --help'"),
         ('replay nothing.mcap', 'nothing.mcap: no such file or directory'),
         ('replay . --json', 'no rosbag2 directory'),
-        ('replay nothing.mcap --jsn', 'unrecognized arguments: --jsn'),
+        ('replay nothing.mcap --jsn', "--jsn; see 'slam-observer replay --help'"),
         ('replay nothing.mcap --gain constant', 'unrecognized arguments: --gain'),
         ('replay nothing.mcap --gains best', "--gains: invalid choice: 'best'"),
         ('replay nothing.mcap --config nowhere', 'come with the package: observer'),
