@@ -132,12 +132,13 @@ class TestMrclam:
     @pytest.mark.parametrize(
         'content', ['', '# a header', '1 2', '1 2 3 4 5', 'a b c d', '1 2\n3']
     )
-    @pytest.mark.filterwarnings('ignore:loadtxt')
+    @pytest.mark.filterwarnings('error')
     def test_malformed_file_is_named(self, tmp_path, content):
         folder = write_mrclam(tmp_path / 'run')
         (folder / 'Robot2_Measurement.dat').write_text(content)
-        with pytest.raises(DataSetError, match=r'Robot2_Measurement\.dat'):
+        with pytest.raises(DataSetError, match=r'Robot2_Measurement\.dat') as raised:
             load_mrclam(folder, 2)
+        assert 'usecols' not in str(raised.value)
 
     @pytest.mark.parametrize('robot', [1, 2, 3, 4, 5])
     def test_real_measurements_agree_with_the_truth(self, data_dir, robot):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 
 from mcap.reader import make_reader
 import numpy as np
@@ -125,6 +126,25 @@ def test_file_that_appears_while_writing_is_not_overwritten(tmp_path):
     with pytest.raises(RecordingError, match='not overwritten'):
         writer.close()
     assert path.read_text() == 'precious'
+
+
+def test_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+    random = np.random.default_rng(0)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill() -> None:
+        with RecordingWriter(tmp_path / 'run.mcap') as writer:
+            for index in range(100_000):
+                velocity = VelocityEvent(ros.STAMP_NS + index, random.normal(size=6))
+                writer.write_velocity(velocity)
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
+    try:
+        with pytest.raises(RecordingError, match=r'run\.mcap: File too large'):
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

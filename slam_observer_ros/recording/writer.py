@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 import tempfile
 from types import TracebackType
@@ -112,12 +113,15 @@ class RecordingWriter:
                 self._bag.close()
                 self._refuse_to_overwrite()
                 (self._bag.path / self.path.name).replace(self.path)
-            except (WriterError, OSError) as error:
+            except WriterError as error:
                 raise RecordingError(f'{self.path}: {error}') from error
+            except OSError as error:
+                raise RecordingError(f'{self.path}: {error.strerror}') from error
 
     def abort(self) -> None:
         """Leave nothing behind."""
-        with self._directory:
+        # On a full disk closing fails, too; the file goes with its directory.
+        with self._directory, suppress(OSError):
             self._bag.abort()
 
     def write(
@@ -143,6 +147,11 @@ class RecordingWriter:
         latched : bool
             Whether players shall keep the message for late subscribers.
 
+        Raises
+        ------
+        RecordingError
+            If the file can't be written, as on a full disk.
+
         """
         key = (topic, message_type)
         if key not in self._connections:
@@ -152,7 +161,10 @@ class RecordingWriter:
                 typestore=self._messages.typestore,
                 offered_qos_profiles=[_LATCHED] if latched else [],
             )
-        self._bag.write(self._connections[key], receive_stamp_ns, memoryview(data))
+        try:
+            self._bag.write(self._connections[key], receive_stamp_ns, memoryview(data))
+        except OSError as error:
+            raise RecordingError(f'{self.path}: {error.strerror}') from error
 
     def write_velocity(
         self,

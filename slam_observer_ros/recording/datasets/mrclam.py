@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 import re
+import warnings
 
 import numpy as np
 
@@ -109,11 +110,16 @@ def _require_robot(folder: Path, robot: int) -> None:
 
 def _table(path: Path, columns: int) -> FloatArray:
     try:
-        table: FloatArray = np.loadtxt(path, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # No data at all is refused below.
+            table: FloatArray = np.loadtxt(path, ndmin=2)
     except FileNotFoundError as error:
         raise DataSetError(f'{path}: no such file') from error
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise DataSetError(f'{path}: {error}') from error
+    except ValueError as error:
+        reason = str(error).partition(';')[0]  # After it numpy has advice for programmers.
+        raise DataSetError(f'{path}: {reason}') from error
     if len(table) == 0 or table.shape[1] != columns:
         raise DataSetError(f'{path}: {columns} columns of numbers are expected')
     return table
