@@ -319,6 +319,16 @@ class TestPointCloud2:
         event = messages.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
         assert event.covariances is None
 
+    @pytest.mark.parametrize('id_type', ['<u4', '<f4'])
+    def test_any_bits_may_be_in_a_float(self, id_type):
+        signalling_nan = np.uint32(0x7F800001).view(np.float32)
+        points = np.full((1, 2), 0, [*POINT_TYPE.descr[:3], ('id', id_type)])
+        points['y'] = signalling_nan
+        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(points))).event
+        assert np.isnan(event.points[:, 1]).all()
+        cloud = ros.point_cloud(np.full((1, 3), signalling_nan), {})
+        assert np.isnan(point_clouds.decode_point_cloud(ros.serialise(cloud)).event.points).all()
+
     def test_unmeasured_points_of_a_cloud_that_is_not_dense_are_left_out(self):
         cloud = records(POINT_TYPE)
         cloud['y'][0, 1] = np.nan

@@ -106,7 +106,8 @@ class CdrReader:
         if count == 0:  # CDR puts no alignment bytes before an empty sequence.
             return np.zeros(0)
         start = self._take(count * dtype.itemsize, alignment)
-        return np.frombuffer(self._raw, dtype, count, start).astype(np.float64)
+        with np.errstate(invalid='ignore'):  # Any bits may be there, signalling NaNs, too.
+            return np.frombuffer(self._raw, dtype, count, start).astype(np.float64)
 
     def data(self, size: int) -> memoryview:
         """Read ``size`` bytes without copying them."""

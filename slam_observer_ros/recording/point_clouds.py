@@ -267,8 +267,9 @@ def _names(records: Records) -> tuple[str, ...]:
 def _columns(records: Records, names: tuple[str, ...]) -> FloatArray:
     """Gather fields as (n, len(names)) float64."""
     columns = np.empty((records.size, len(names)))
-    for index, name in enumerate(names):
-        columns[:, index] = records[name].ravel()
+    with np.errstate(invalid='ignore'):  # Any bits may be there, signalling NaNs, too.
+        for index, name in enumerate(names):
+            columns[:, index] = records[name].ravel()
     return columns
 
 
@@ -277,7 +278,8 @@ def _ids(records: Records) -> IntArray:
         return np.full(records.size, UNKNOWN_ID, dtype=np.int64)
     values = records[ID_NAME].ravel()
     if values.dtype.kind == 'f':
-        return _ids_from_floats(values.astype(np.float64))
+        with np.errstate(invalid='ignore'):
+            return _ids_from_floats(values.astype(np.float64))
     ids = values.astype(np.int64)
     ids[ids == UNKNOWN_UINT32_ID] = UNKNOWN_ID
     if np.any(ids < UNKNOWN_ID):
