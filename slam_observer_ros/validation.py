@@ -64,14 +64,14 @@ def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> 
         return
     _check_array(name, array, shape)
     if np.abs(array).max(initial=0.0) > LARGEST:
-        raise InvalidEventError('too_large', f'{name} have an entry beyond {LARGEST:g}')
+        raise InvalidEventError('too_large', f'an entry of the {name} is beyond {LARGEST:g}')
 
 
 def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
-        raise InvalidEventError('wrong_shape', f'{name} have shape {array.shape}, not {shape}')
+        raise InvalidEventError('wrong_shape', f'{name}: shape {array.shape}, not {shape}')
     if not np.isfinite(array).all():
-        raise InvalidEventError('not_finite', f'{name} have a NaN or infinite entry')
+        raise InvalidEventError('not_finite', f'an entry of the {name} is NaN or infinite')
 
 
 def _check_definite(name: str, covariances: FloatArray) -> None:
@@ -79,4 +79,6 @@ def _check_definite(name: str, covariances: FloatArray) -> None:
     allowed = ROUNDING * np.trace(covariances, axis1=-2, axis2=-1)
     skew = np.abs(covariances - covariances.swapaxes(-1, -2)).max(axis=(-2, -1))
     if np.any(skew > allowed) or np.any(np.linalg.eigvalsh(covariances)[..., 0] < -allowed):
-        raise InvalidEventError('bad_covariance', f'{name} is no covariance matrix')
+        raise InvalidEventError(
+            'bad_covariance', f'{name}: asymmetric, or with a negative eigenvalue'
+        )

@@ -107,7 +107,8 @@ class TestDamage:
         with open_recording(path) as recording:
             selected = recording.find_topics()
             events = list(recording.events(selected))
-            assert f'only the {len(events)} messages before the damage' in recording.warning
+            assert f'only the {len(events)} messages before that' in recording.warning
+            assert 'can not be read' not in recording.warning
             assert recording.event_count(selected) == len(events)
         assert len(whole) // 3 < len(events) < len(whole)
         assert_same_events(events, whole[: len(events)])
@@ -119,7 +120,7 @@ class TestDamage:
         data = (tmp_path / 'killed_0.mcap').read_bytes()
         (directory / 'killed_0.mcap').write_bytes(data[: len(data) // 2])
         with open_recording(directory) as recording:
-            assert 'before the damage' in recording.warning
+            assert 'cut off or damaged' in recording.warning
         shutil.copy(paths['sqlite3 file'], tmp_path / 'whole.db3')
         (directory / 'killed_0.mcap').unlink()
         (tmp_path / 'whole.db3').rename(directory / 'killed_0.db3')
@@ -192,6 +193,12 @@ class TestNothingToRead:
         (tmp_path / 'run.csv').touch()
         with pytest.raises(RecordingError, match=r'not a recording; give a \.mcap, \.db3, \.bag'):
             open_recording(tmp_path / 'run.csv')
+
+    def test_bytes_that_are_no_bag(self, tmp_path):
+        path = tmp_path / 'x.bag'
+        path.write_bytes(bytes([250] * 200))
+        with pytest.raises(RecordingError, match=r'it is damaged, or no \.bag file'):
+            open_recording(path)
 
     @pytest.mark.parametrize('suffix', ['.mcap', '.db3', '.bag'])
     def test_empty_file(self, tmp_path, suffix):

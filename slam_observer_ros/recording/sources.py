@@ -248,7 +248,7 @@ def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str]:
     count = sum(topic.count for topic in source.topics)
     if count == 0:
         raise RecordingError(f'{error}; no whole message is left') from error
-    return source, f'{error}; only the {count} messages before the damage are used'
+    return source, f'{path}: cut off or damaged; only the {count} messages before that are used'
 
 
 @contextmanager
@@ -262,6 +262,8 @@ def _damage_reported(path: Path) -> Iterator[None]:
         yield
     except Exception as error:
         reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
+        if isinstance(error, UnicodeError):  # bytes where text should be
+            reason = f'it is damaged, or no {path.suffix} file'
         raise RecordingError(f'{path}: can not be read: {reason}') from error
 
 
