@@ -77,6 +77,7 @@ class Estimator:
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
+        self._times_moved = 0
         self._map: LandmarkMap | None = None
         self._on_update = on_update
         self._hypotheses = Hypotheses(Slam(settings, np.eye(4)), settings)
@@ -369,6 +370,7 @@ class Estimator:
             event = self._carry_forward(event)
         self._advance(event.stamp_ns)
         ids, residuals = self._hypotheses.observe(event)
+        self._tell_of_moved(self._slam.moved_ids)
         self._counts['observation'] += 1
         self._counts['observed_point'] += len(event.ids)
         self._localise(ids)
@@ -378,6 +380,13 @@ class Estimator:
         self._last = Update(event.stamp_ns, observer.pose, ids, residuals, level)
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _tell_of_moved(self, ids: IntArray) -> None:
+        if not len(ids):
+            return
+        self._times_moved += 1
+        if _is_power_of_ten(self._times_moved):
+            logger.warning('Landmarks %s have moved (%d so far).', ids.tolist(), self._times_moved)
 
     def _forget_time(self) -> None:
         """Forget all that has a stamp but the map."""

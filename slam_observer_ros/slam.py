@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-import logging
 
 import numpy as np
 
@@ -23,8 +22,6 @@ from slam_observer_ros.odometry import motion
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.velocity_history import VelocityHistory
-
-logger = logging.getLogger(__name__)
 
 SAME_PLACE = 4.0
 """Rejections within this many standard deviations of each other are at one place."""
@@ -79,6 +76,8 @@ class Slam:
         For landmarks near a point.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
+    moved_ids : IntArray
+        Landmarks that the last observation showed to have moved.
 
     """
 
@@ -89,6 +88,7 @@ class Slam:
         self.landmarks = LandmarkTable()
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
+        self.moved_ids = np.empty(0, dtype=np.int64)
         self.noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
@@ -220,6 +220,7 @@ class Slam:
             (m, 3) their residuals before the correction, metres, reference frame.
 
         """
+        self.moved_ids = np.empty(0, dtype=np.int64)
         sighting = self.look(event) if sighting is None else sighting
         unknown = int(np.sum(event.ids == UNKNOWN_ID))
         self.counts['unknown_id'] += unknown
@@ -358,7 +359,7 @@ class Slam:
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():
             self.counts['moved_landmark'] += int(np.sum(moved))
-            logger.warning('Landmarks %s have moved.', event.ids[moved].tolist())
+            self.moved_ids = event.ids[moved]
         if far.any():
             self.observer.relocate_landmarks(rows[far], event.points[far])
             y_ref = self.observer.y_ref[rows[far]]

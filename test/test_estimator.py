@@ -236,6 +236,20 @@ def test_a_full_map_forgets_the_landmark_seen_least_often_never_one_in_view():
     assert estimator.counts['unmapped_landmark'] == 2
 
 
+def test_landmarks_that_move_again_and_again_are_told_of_ever_more_seldom(caplog):
+    def moved(index, event):
+        shift = true_pose(0.1 * index)[:3, :3].T @ [0.0, 0.0, 20.0 * (index // 10)]
+        return replace(event, points=event.points + (event.ids == 2)[:, None] * shift)
+
+    events = [velocity(0.1 * index) for index in range(140)]
+    events += [moved(index, observation(0.1 * index)) for index in range(140)]
+    events.sort(key=lambda event: event.stamp_ns)
+    estimator = run(events, gains='riccati')
+    assert 10 <= estimator.counts['moved_landmark'] < 100
+    told = [text for text in caplog.messages if 'moved' in text]
+    assert told == [f'Landmarks [2] have moved ({times} so far).' for times in (1, 10)]
+
+
 @pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
 def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains):
     speed = np.array(
