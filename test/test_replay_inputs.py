@@ -200,6 +200,22 @@ class TestVelocities:
         assert report['dead_reckoning_ate_rmse_m'] < 0.01
         assert report['dropped'] == {}
 
+    @pytest.mark.parametrize('moves', [True, False])
+    def test_odometry_without_velocities_but_with_poses(self, slam_observer, tmp_path, moves):
+        path = tmp_path / 'odometry.mcap'
+        with RecordingWriter(path) as writer:
+            drive = Drive(writer)
+            for stamp_ns in stamps_ns():
+                position = true_pose(stamp_ns)[:3, 3] if moves else np.zeros(3)
+                odometry = ros.odometry(np.zeros(6), np.zeros((6, 6)), position, stamp_ns=stamp_ns)
+                drive.write('/odom', odometry, stamp_ns)
+                if stamp_ns == ros.STAMP_NS:
+                    drive.landmarks(stamp_ns)
+        errors = slam_observer('replay', path).errors
+        assert errors.count('try --velocity-source pose_differences') == moves
+        again = slam_observer('replay', path, '--velocity-source', 'pose_differences')
+        assert again.errors == ''
+
     def test_an_imu_with_the_stamps_of_the_odometry_turns_it_at_once(
         self, slam_observer, tmp_path
     ):

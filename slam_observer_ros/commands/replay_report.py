@@ -134,6 +134,7 @@ def outcome_of(result: Replay, truth: Truth, duration_s: float, unused: Counter[
             heading_rmse_rad=accuracy.pose_errors.heading_rmse_rad,
         )
     _warn_of_unknown_ids(result)
+    _warn_of_unused_poses(recording, selected, result)
     return Outcome(result, truth, accuracy, report)
 
 
@@ -143,6 +144,18 @@ def _warn_of_unknown_ids(result: Replay) -> None:
     if unknown and gains != 'riccati':
         logger.warning(
             '%d points without id are not used by %s gains; use --gains riccati.', unknown, gains
+        )
+
+
+def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
+    """Say where the motion is, if an odometry's velocities are all zero and its poses are not."""
+    poses = result.dead_reckoning.poses
+    stands_still = len(poses) > 0 and bool((poses == poses[0]).all())
+    if stands_still and recording.poses_move(selected.velocity):
+        logger.warning(
+            'All velocities on %s are zero, but its poses move; '
+            'try --velocity-source pose_differences.',
+            selected.velocity.name,
         )
 
 

@@ -6,10 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 import dataclasses
+from itertools import pairwise
 import logging
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
+
+import numpy as np
 
 from slam_observer_ros.errors import MessageError, RecordingError, TransformError
 from slam_observer_ros.events import Event
@@ -26,6 +29,7 @@ from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.point_clouds import has_ids
 from slam_observer_ros.recording.sources import open_source, RawMessage, Topic
 from slam_observer_ros.recording.topics import (
+    ODOMETRY_TYPE,
     select_topics,
     SelectedTopics,
     TopicNames,
@@ -172,6 +176,13 @@ class Recording:
         decoders = input_decoders(selected, dataclasses.replace(inputs, velocity_source='twist'))
         velocity_frame = self._frame(selected.velocity, decoders[selected.velocity])
         return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
+
+    def poses_move(self, topic: Topic) -> bool:
+        """Tell whether a topic holds an odometry's poses, and they are not all the same."""
+        if topic.message_type != ODOMETRY_TYPE:
+            return False
+        poses = (message.pose for message in self._all_decoded(topic, decode_pose))
+        return any(not np.array_equal(pose, after) for pose, after in pairwise(poses))
 
     def truth(self, selected: SelectedTopics) -> Truth:
         """Read the true poses and landmarks.
