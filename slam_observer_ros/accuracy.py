@@ -55,8 +55,8 @@ def measure(result: Replay, truth: Truth) -> Accuracy:
     if result.pose_covariances is not None and not result.in_known_map:
         anees = anchored_average_nees(result.trajectory, result.pose_covariances, pose_truth)
     return Accuracy(
-        _pose_errors(result.trajectory, pose_truth),
-        _pose_errors(result.dead_reckoning, pose_truth),
+        _pose_errors('trajectory', result.trajectory, pose_truth),
+        _pose_errors('dead reckoning', result.dead_reckoning, pose_truth),
         _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
         result.configuration.rmse_m,
         anees,
@@ -76,8 +76,9 @@ def measure_smoothed(
         Of the map, after a rigid alignment of its own, metres.
 
     """
+    pose_truth = Trajectory(truth.stamps_ns, truth.poses)
     return (
-        _pose_errors(trajectory_of(smoothed), Trajectory(truth.stamps_ns, truth.poses)),
+        _pose_errors('smoothed trajectory', trajectory_of(smoothed), pose_truth),
         _landmark_rmse_m(smoothed.ids, smoothed.world_points, truth),
     )
 
@@ -87,13 +88,13 @@ def trajectory_of(smoothed: Smoothed) -> Trajectory:
     return Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
 
 
-def _pose_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
+def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
     if not len(truth):
         return None
     try:
         return trajectory_errors(estimate, truth)
     except EvaluationError as error:
-        logger.warning('The trajectory is not compared with the truth: %s', error)
+        logger.warning('The %s is not compared with the truth: %s', name, error)
         return None
 
 

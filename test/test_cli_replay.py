@@ -110,6 +110,37 @@ class TestReport:
         assert ended.json['ate_rmse_m'] is None
         assert 'slam-observer: warning: The trajectory is not compared' in ended.errors
 
+    def test_stamps_that_are_all_zero_are_named_and_truth_is_not_denied(
+        self, slam_observer, tmp_path
+    ):
+        path = tmp_path / 'zero.mcap'
+        with RecordingWriter(path) as writer:
+            for velocity in recordings.events():
+                if isinstance(velocity, VelocityEvent):
+                    received_ns = velocity.stamp_ns
+                    writer.write_velocity(
+                        VelocityEvent(0, velocity.body_velocity), receive_stamp_ns=received_ns
+                    )
+            writer.write_observation(ObservationEvent(0, np.array([1]), np.ones((1, 3))))
+            for truth in recordings.true_poses():
+                writer.write_pose(truth)
+        ended = slam_observer('replay', path)
+        assert ended.errors.count('All stamps are zero') == 1
+        assert 'the truth fits nothing estimated' in ended.output
+
+    def test_what_is_not_compared_is_named(self, slam_observer, tmp_path):
+        path = tmp_path / 'late.mcap'
+        with RecordingWriter(path) as writer:
+            for event, truth in zip(
+                recordings.events()[1::3], recordings.true_poses()[::2], strict=True
+            ):
+                writer.write_observation(event)
+                writer.write_pose(truth)
+            writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.full(6, np.nan)))
+        errors = slam_observer('replay', path).errors
+        assert 'The dead reckoning is not compared' in errors
+        assert 'The trajectory is not compared' not in errors
+
     def test_summary_names_topics_and_errors(self, slam_observer, simulated):
         output = slam_observer.succeed('replay', simulated).output
         for text in ('/twist', '/landmarks', '502 over 5.0 s', '(ATE)', 'not aligned'):

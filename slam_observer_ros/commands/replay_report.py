@@ -133,6 +133,8 @@ def outcome_of(result: Replay, truth: Truth, duration_s: float, unused: Counter[
             rotation_rmse_rad=accuracy.pose_errors.rotation_rmse_rad,
             heading_rmse_rad=accuracy.pose_errors.heading_rmse_rad,
         )
+    if result.estimator.newest_stamp_ns == 0:
+        logger.warning('All stamps are zero: the publishers do not fill in header.stamp.')
     _warn_of_unknown_ids(result)
     _warn_of_unused_poses(recording, selected, result)
     return Outcome(result, truth, accuracy, report)
@@ -264,4 +266,10 @@ def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
     rows = {
         name: f'{value:.3f} {unit}' for name, (value, unit) in figures.items() if value is not None
     }
-    return rows or {'accuracy': 'not known: the recording holds no truth to compare with'}
+    if rows:
+        return rows
+    has_truth = len(outcome.truth.stamps_ns) > 0 or outcome.truth.landmarks is not None
+    why = 'the truth fits nothing estimated'
+    if not has_truth:
+        why = 'the recording holds no truth to compare with'
+    return {'accuracy': f'not known: {why}'}
