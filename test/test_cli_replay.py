@@ -202,6 +202,37 @@ class TestPoints:
         assert '150 used' in slam_observer.succeed(*arguments, 'riccati').output
 
 
+@pytest.mark.parametrize(
+    ('message', 'note'),
+    [
+        (ros.point_cloud(np.ones((1, 3)), {'id': np.ones(1)}), 'messages) '),
+        (ros.point_cloud(np.ones((1, 3)), {'ID': np.ones(1)}), 'without ids; channels ID '),
+        (ros.point_cloud(np.ones((1, 3)), {}), 'without ids; channels none '),
+        (
+            ros.point_cloud2(np.ones((1, 1), [(name, '<f4') for name in ('x', 'y', 'z', 'ID')])),
+            'without ids; fields x y z ID ',
+        ),
+        (
+            ros.make(
+                'geometry_msgs/msg/PoseArray',
+                ros.header('base_link'),
+                [ros.pose([1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])],
+            ),
+            'without ids ',
+        ),
+    ],
+)
+def test_landmarks_without_ids_are_named(slam_observer, tmp_path, message, note):
+    path = tmp_path / 'run.mcap'
+    with RecordingWriter(path) as writer:
+        writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
+        writer.write('/landmarks', message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
+    cells = [line.split('│') for line in slam_observer.succeed('replay', path).output.split('\n')]
+    told = ' '.join(' '.join(cell[2] for cell in cells if len(cell) > 2).split())
+    assert note in told.partition('events')[0] + ' '
+    assert ('without ids' in told) == ('without ids' in note)
+
+
 class TestOutputs:
     def test_trajectory_and_map_and_figures(self, slam_observer, simulated, tmp_path):
         tum, landmarks, figures = tmp_path / 'run.tum', tmp_path / 'map.yaml', tmp_path / 'figures'

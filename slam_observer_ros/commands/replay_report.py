@@ -80,12 +80,16 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A replay and all that is told about it; what is smoothed is None if it wasn't asked for."""
+    """A replay and all that is told about it; what is smoothed is None if it wasn't asked for.
+
+    ``missing_ids`` is what :meth:`.Recording.missing_ids` says of the landmarks.
+    """
 
     result: Replay
     truth: Truth
     accuracy: Accuracy
     report: Report
+    missing_ids: str = ''
     smoothed: Smoothed | None = None
     smoothed_errors: TrajectoryErrors | None = None
     smoothed_landmark_rmse_m: float | None = None
@@ -137,7 +141,7 @@ def outcome_of(result: Replay, truth: Truth, duration_s: float, unused: Counter[
         logger.warning('All stamps are zero: the publishers do not fill in header.stamp.')
     _warn_of_unknown_ids(result)
     _warn_of_unused_poses(recording, selected, result)
-    return Outcome(result, truth, accuracy, report)
+    return Outcome(result, truth, accuracy, report, recording.missing_ids(selected.landmarks))
 
 
 def _warn_of_unknown_ids(result: Replay) -> None:
@@ -206,9 +210,10 @@ def print_summary(
 ) -> None:
     """Print the figures as a table, and what was written where."""
     report = outcome.report
+    note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
     rows = {
         'velocity topic': str(selected.velocity),
-        'landmarks topic': str(selected.landmarks),
+        'landmarks topic': f'{selected.landmarks}{note}',
         **({} if selected.imu is None else {'Imu topic': str(selected.imu)}),
         'events': f'{report.events} over {report.duration_s:.1f} s',
         'estimator': f'{outcome.result.estimator.settings.gains} gains, '

@@ -148,8 +148,8 @@ def scan_trouble(event: ObservationEvent) -> str:
     )
 
 
-def has_ids(raw: Buffer, message_type: str) -> bool:
-    """Tell whether a PointCloud or PointCloud2 names its points.
+def field_names(raw: Buffer, message_type: str) -> tuple[str, ...]:
+    """Return what a PointCloud2 tells of its points, or a PointCloud beside where they are.
 
     Parameters
     ----------
@@ -157,6 +157,11 @@ def has_ids(raw: Buffer, message_type: str) -> bool:
         The serialised message.
     message_type : str
         ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
+
+    Returns
+    -------
+    tuple of str
+        Names of the fields, or of the channels; with ``id`` the points have ids.
 
     Raises
     ------
@@ -168,13 +173,13 @@ def has_ids(raw: Buffer, message_type: str) -> bool:
     reader.header()
     if message_type.endswith('PointCloud2'):
         reader.uint32(), reader.uint32()
-        return any(_read_field(reader).name == ID_NAME for _ in range(reader.uint32()))
+        return tuple(_read_field(reader).name for _ in range(reader.uint32()))
     reader.float32(3 * reader.uint32())
+    names = []
     for _ in range(reader.uint32()):
-        if reader.string() == ID_NAME:
-            return True
+        names.append(reader.string())
         reader.float32(reader.uint32())
-    return False
+    return tuple(names)
 
 
 def _read_field(reader: CdrReader) -> CloudField:

@@ -23,10 +23,13 @@ from slam_observer_ros.recording.decoding import (
     decode_transform_message,
     input_decoders,
 )
+from slam_observer_ros.recording.detections import POSE_ARRAY_TYPE
 from slam_observer_ros.recording.event_builder import EventBuilder, NO_TRANSFORM
 from slam_observer_ros.recording.frames import BaseFrame, insert_transforms
 from slam_observer_ros.recording.input_settings import InputSettings
-from slam_observer_ros.recording.point_clouds import has_ids
+from slam_observer_ros.recording.messages import LANDMARK_DECODERS
+from slam_observer_ros.recording.point_cloud_layout import ID_NAME
+from slam_observer_ros.recording.point_clouds import field_names
 from slam_observer_ros.recording.sources import open_source, RawMessage, Topic
 from slam_observer_ros.recording.topics import (
     ODOMETRY_TYPE,
@@ -177,6 +180,15 @@ class Recording:
         velocity_frame = self._frame(selected.velocity, decoders[selected.velocity])
         return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
 
+    def missing_ids(self, topic: Topic) -> str:
+        """Tell whether a landmark topic's points have no ids, and what they have; else empty."""
+        if topic.message_type == POSE_ARRAY_TYPE:
+            return 'without ids'
+        if topic.message_type not in LANDMARK_DECODERS or self._identifies(topic):
+            return ''
+        kind = 'fields' if topic.message_type.endswith('PointCloud2') else 'channels'
+        return f'without ids; {kind} {" ".join(self._field_names(topic)) or "none"}'
+
     def poses_move(self, topic: Topic) -> bool:
         """Tell whether a topic holds an odometry's poses, and they are not all the same."""
         if topic.message_type != ODOMETRY_TYPE:
@@ -223,10 +235,13 @@ class Recording:
                 yield message
 
     def _identifies(self, topic: Topic) -> bool:
-        for raw in self._source.messages((topic,)):
+        return ID_NAME in self._field_names(topic)
+
+    def _field_names(self, cloud_topic: Topic) -> tuple[str, ...]:
+        for raw in self._source.messages((cloud_topic,)):
             with suppress(MessageError):
-                return has_ids(raw.data, topic.message_type)
-        return False
+                return field_names(raw.data, cloud_topic.message_type)
+        return ()
 
     def _frame(self, topic: Topic, decode: Decode) -> str:
         for raw in self._source.messages((topic,)):
