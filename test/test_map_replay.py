@@ -18,7 +18,6 @@ BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
 LANDMARKS = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
 POINT_NOISE_M = 0.02
 SETTINGS = ('--set', 'observation_model=cartesian', '--set', f'point_noise={POINT_NOISE_M}')
-ONE_STATE = (*SETTINGS, '--set', 'max_hypotheses=1')
 
 
 @pytest.fixture
@@ -143,7 +142,7 @@ class TestPlaceNotKnown:
     def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
         late = record(tmp_path / 'late.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s < 40))
         poses = tmp_path / 'poses.tum'
-        arguments = ('replay', late, '--load-map', saved, '--force', '--tum', poses, *ONE_STATE)
+        arguments = ('replay', late, '--load-map', saved, '--force', '--tum', poses, *SETTINGS)
         report = slam_observer(*arguments, '--json').json
         assert report['localised_after_s'] == pytest.approx(4.0, abs=0.3)
         assert read_tum(poses).stamps_ns[0] * 1e-9 == report['localised_after_s']
@@ -157,7 +156,7 @@ class TestPlaceNotKnown:
         )
         poses, again = tmp_path / 'poses.tum', tmp_path / 'again.yaml'
         arguments = (
-            'replay', misled, '--load-map', saved, '--tum', poses, *ONE_STATE,
+            'replay', misled, '--load-map', saved, '--tum', poses, *SETTINGS,
             '--set', 'localization_mode=uncertain',
         )  # fmt: skip
         refused = slam_observer(*arguments, '--map', again)
@@ -176,10 +175,10 @@ def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
         stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 40),
     )  # fmt: skip
     saved = tmp_path / 'map.yaml'
-    hold = ('--smooth', '--set', 'on_time_jump=hold', *ONE_STATE)
+    hold = ('--smooth', '--set', 'on_time_jump=hold', *SETTINGS)
     jumped = slam_observer('replay', path, '--map', saved, *hold)
     assert 'those since the clock jumped' in jumped.errors
-    loaded = slam_observer('replay', path, '--load-map', saved, '--smooth', *ONE_STATE)
+    loaded = slam_observer('replay', path, '--load-map', saved, '--smooth', *SETTINGS)
     assert 'those since the place in the loaded map was found' in loaded.errors
     assert 'hindsight_window' not in jumped.errors + loaded.errors
 

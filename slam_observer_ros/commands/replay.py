@@ -110,12 +110,12 @@ def run(args: argparse.Namespace) -> None:
             recording.event_count(selected),
         )
         result = replay(events, settings, truth, landmark_map)
+        tell_restart(result)
         unused = unused_messages(recording, selected)
-    tell_restart(result)
-    check_observations(args, result, result.estimator.dropped + unused)
-    if landmark_map is not None:
-        check_place(args, result, landmark_map)
-    outcome = outcome_of(result, truth, recording.duration_s, unused)
+        check_observations(args, result, result.estimator.dropped + unused)
+        if landmark_map is not None:
+            check_place(args, result, landmark_map)
+        outcome = outcome_of(recording, selected, result, truth)
     if args.smooth:
         outcome = with_smoothed(outcome)
     map_frame = landmark_map.frame_id if landmark_map else inputs.map_frame

@@ -101,25 +101,15 @@ def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[s
     return recording.dropped + Counter({MALFORMED: malformed})
 
 
-def outcome_of(result: Replay, truth: Truth, duration_s: float, unused: Counter[str]) -> Outcome:
-    """Measure a replay.
-
-    Parameters
-    ----------
-    result : Replay
-        What is measured.
-    truth : Truth
-        What it is compared with.
-    duration_s : float
-        Time that the recording spans, seconds.
-    unused : Counter
-        From :func:`unused_messages`.
-
-    """
+def outcome_of(
+    recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
+) -> Outcome:
+    """Measure a replay, and count what of the recording was dropped on the way."""
+    unused = unused_messages(recording, selected)
     accuracy = measure(result, truth)
     report = Report(
         events=result.events + unused.total(),
-        duration_s=duration_s,
+        duration_s=recording.duration_s,
         seconds=result.seconds,
         landmarks=len(result.estimator.landmark_ids),
         dropped=dict(result.estimator.dropped + unused),
