@@ -222,9 +222,10 @@ class Slam:
         """
         self.moved_ids = np.empty(0, dtype=np.int64)
         sighting = self.look(event) if sighting is None else sighting
-        unknown = int(np.sum(event.ids == UNKNOWN_ID))
-        self.counts['unknown_id'] += unknown
-        self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
+        if sighting.event is not event:
+            unknown = int(np.sum(event.ids == UNKNOWN_ID))
+            self.counts['unknown_id'] += unknown
+            self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
         event, rows, covariances = sighting.event, sighting.rows, sighting.covariances
         known, used = rows >= 0, np.ones(len(rows), dtype=np.bool_)
         ids = event.ids[known]
