@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from worlds import World
 
-from slam_observer_ros.events import Event, ObservationEvent, select, UNKNOWN_ID
+from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.types import FloatArray, IntArray
 
 GROSS_SHARE = 0.05
@@ -71,7 +71,7 @@ def _untouched(event: Event, other: Event) -> Event:
     """Return what the two have in common."""
     if not isinstance(event, ObservationEvent) or not isinstance(other, ObservationEvent):
         return event
-    return select(event, (event.ids == other.ids) & (event.points == other.points).all(axis=1))
+    return event.select((event.ids == other.ids) & (event.points == other.points).all(axis=1))
 
 
 def _anonymous(event: Event) -> Event:

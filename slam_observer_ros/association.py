@@ -12,17 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.axes import PLANAR, SPATIAL
+from slam_observer_ros.axes import axes_of, SPATIAL
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
 from slam_observer_ros.joint_compatibility import (
     columns_of,
-    huber_loss,
     JointSearch,
     MARGIN,
     Pairs,
     RESOLUTION,
+    unpaired_cost,
 )
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.observer import Observer
@@ -85,7 +85,7 @@ def find_assignments(
         The most likely first.
 
     """
-    axes = PLANAR if settings.two_d_mode else SPATIAL
+    axes = axes_of(settings.two_d_mode)
     gate, m, k = settings.rejection_distance, len(points), axes.point
     at, rows = _pairs_within(gate, observer, gains, index, points, noise, known_rows)
     innovation = _as_innovation(observer, rows, points[at], noise[at])
@@ -94,7 +94,7 @@ def find_assignments(
     S = with_blocks(CPC, own_noise)
     pairs = Pairs(at, rows, innovation.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
-    lonely_cost = float((m - len(np.unique(at))) * huber_loss(gate))
+    lonely_cost = (m - len(np.unique(at))) * unpaired_cost(gate)
     margin = 0.0 if nearly.all() else MARGIN
     search = JointSearch(pairs, nearly, gate, margin, budget - lonely_cost)
     J = np.linalg.inv(np.linalg.cholesky(noise[:, :k, :k])) @ axes.output_matrix(points)

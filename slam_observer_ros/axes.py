@@ -60,3 +60,8 @@ class Axes:
 
 SPATIAL = Axes(np.arange(6), 3)
 PLANAR = Axes(np.array([2, 3, 4]), 2)
+
+
+def axes_of(two_d_mode: bool) -> Axes:
+    """Return the axes that are estimated with the setting ``two_d_mode``."""
+    return PLANAR if two_d_mode else SPATIAL

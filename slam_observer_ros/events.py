@@ -63,6 +63,18 @@ class ObservationEvent:
     covariances: FloatArray | None = None
     velocities: FloatArray | None = None
 
+    def select(self, mask: BoolArray) -> ObservationEvent:
+        """Return the part of it that ``mask`` (m,) picks."""
+        if mask.all():
+            return self
+        return replace(
+            self,
+            ids=self.ids[mask],
+            points=self.points[mask],
+            covariances=None if self.covariances is None else self.covariances[mask],
+            velocities=None if self.velocities is None else self.velocities[mask],
+        )
+
 
 Event: TypeAlias = VelocityEvent | ObservationEvent
 """Anything that :meth:`slam_observer_ros.estimator.Estimator.add` takes."""
@@ -106,19 +118,6 @@ def is_automatic(ids: IntArray) -> BoolArray:
     """Return which ids (m,) were given to landmarks whose sensor gives none."""
     automatic: BoolArray = (ids >= FIRST_AUTOMATIC_ID) & (ids < 2**24)
     return automatic
-
-
-def select(event: ObservationEvent, mask: BoolArray) -> ObservationEvent:
-    """Return the part of an observation that ``mask`` (m,) picks."""
-    if mask.all():
-        return event
-    return replace(
-        event,
-        ids=event.ids[mask],
-        points=event.points[mask],
-        covariances=None if event.covariances is None else event.covariances[mask],
-        velocities=None if event.velocities is None else event.velocities[mask],
-    )
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:

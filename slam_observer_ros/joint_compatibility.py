@@ -136,11 +136,6 @@ class JointSearch:
     margin, budget : float
         How much more than the cheapest a pairing may cost, and how much at all.
 
-    Attributes
-    ----------
-    unpaired_cost : float
-        What each point costs that is taken for no known landmark.
-
     """
 
     def __init__(
@@ -153,7 +148,7 @@ class JointSearch:
     ) -> None:
         self._pairs = pairs
         self._certain = certain
-        self.unpaired_cost = float(huber_loss(gate))
+        self._unpaired_cost = unpaired_cost(gate)
         self._margin, self._budget = margin, budget
         points, counts = np.unique(pairs.points, return_counts=True)
         # Points with the fewest options first: they are the surest, and the others follow them.
@@ -200,7 +195,7 @@ class JointSearch:
         rises[self._are_taken(pairings, options)] = np.inf
         rises -= self._noise_log_dets[options]
         is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
-        without = np.where(is_certain, np.inf, self.unpaired_cost)
+        without = np.where(is_certain, np.inf, self._unpaired_cost)
         costs = np.array([[one.cost] for one in pairings]) + np.column_stack([rises, without])
         rows = np.concatenate([-corners @ so3.transpose(W) @ L[:, None], corners], axis=3)
         return _Extensions(pairings, options, costs, rows, tails)
@@ -224,6 +219,11 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
     z = np.linalg.solve(L, r[order].ravel()).reshape(r.shape)
     log_det = 2.0 * np.log(np.diagonal(L)).sum() - np.linalg.slogdet(noise)[1].sum()
     return float(huber_loss(np.sqrt((z * z).sum(axis=1))).sum() + log_det)
+
+
+def unpaired_cost(gate: float) -> float:
+    """Return what a point costs that is taken for no known landmark."""
+    return float(huber_loss(gate))
 
 
 def huber_loss(distances: FloatArray | float) -> FloatArray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2, norm
 
-from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.axes import Axes, axes_of
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.gains.fixed_map import FixedMapGains
 from slam_observer_ros.gains.gauge import anchor, gauge_information, JITTER_M2
@@ -92,7 +92,10 @@ def is_lost(slam: Slam, seen_ids: IntArray) -> bool:
     """
     rejections = slam.landmarks.rejections
     just_now = rejections[slam.landmarks.indices_of(seen_ids)]
-    often = np.sum(rejections >= slam.settings.max_rejections) >= _axes(slam).point
+    often = (
+        np.sum(rejections >= slam.settings.max_rejections)
+        >= axes_of(slam.settings.two_d_mode).point
+    )
     return not slam.is_mapping and bool(often and len(just_now) and just_now.all())
 
 
@@ -104,7 +107,7 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.gains.gauge`. None
     where the gains know no covariances.
     """
-    n, axes, observer = len(slam.landmarks), _axes(slam), slam.observer
+    n, axes, observer = len(slam.landmarks), axes_of(slam.settings.two_d_mode), slam.observer
     k, R = axes.point, observer.reference_pose[:3, :3]
     if not isinstance(slam.gains, RiccatiGains) or n == 0:
         return slam.landmark_covariances
@@ -214,7 +217,7 @@ def _find_frame(
     slam: Slam, rows: IntArray, known: LandmarkMap
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
-    axes = _axes(slam)
+    axes = axes_of(slam.settings.two_d_mode)
     covariance = slam.gains.joint_covariance(rows)
     if covariance is None:
         variance = slam.settings.point_noise**2
@@ -230,10 +233,6 @@ def _with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArra
     variances, U = np.linalg.eigh(0.5 * (covariances + so3.transpose(covariances)))
     clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ so3.transpose(U)
     return clipped
-
-
-def _axes(slam: Slam) -> Axes:
-    return PLANAR if slam.settings.two_d_mode else SPATIAL
 
 
 def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:

@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_observer_ros.association import Assignment, find_assignments
-from slam_observer_ros.events import ObservationEvent, select, UNKNOWN_ID
+from slam_observer_ros.axes import axes_of
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.joint_compatibility import huber_loss, joint_cost, RESOLUTION
+from slam_observer_ros.joint_compatibility import joint_cost, RESOLUTION, unpaired_cost
 from slam_observer_ros.slam import Sighting, Slam
 from slam_observer_ros.types import IntArray
 
@@ -69,14 +70,14 @@ def readings(
     suspects = suspect_ids(slam, sighting)
     if (event.ids == UNKNOWN_ID).any():
         return _named(slam, gains, event, new_ids, suspects, budget)
-    trusting = _cost(slam, gains, event, sighting.innovation)
+    m, innovation = len(event.ids), sighting.innovation
+    trusting = _cost(slam, gains, m, innovation)
     found = [Reading(event, trusting)]
     left_out = [suspects] if len(suspects) > 1 else []
     for ids in [*suspects[:, None], *left_out]:
-        others = select(event, ~np.isin(event.ids, ids))
-        cost = _cost(slam, gains, others, slam.look(others).innovation)
-        cost += len(ids) * float(huber_loss(slam.settings.rejection_distance))
-        found.append(Reading(others, max(cost, trusting)))
+        others = innovation.select(~np.isin(slam.landmarks.ids[innovation.indices], ids))
+        cost = max(trusting, _cost(slam, gains, m, others))
+        found.append(Reading(event.select(~np.isin(event.ids, ids)), cost))
     return found
 
 
@@ -110,8 +111,8 @@ def _named(
     costs no less than with all of them.
     """
     is_new = (event.ids != UNKNOWN_ID) & (slam.landmarks.indices_of(event.ids) < 0)
-    judged = select(event, ~is_new)
-    new_cost = float(np.sum(is_new) * huber_loss(slam.settings.rejection_distance))
+    judged = event.select(~is_new)
+    new_cost = np.sum(is_new) * unpaired_cost(slam.settings.rejection_distance)
     found = find_assignments(
         slam.observer,
         gains,
@@ -123,16 +124,14 @@ def _named(
         budget - new_cost,
     )
     outliers = [np.isin(judged.ids, suspects) & (one.rows < 0) for one in found]
-    costs = np.array([new_cost + one.cost for one in found])
-    trusting = costs[[not some.any() for some in outliers]].min(initial=np.inf)
+    pairs = list(zip(found, outliers, strict=True))
+    trusting = min((one.cost for one, some in pairs if not some.any()), default=0.0)
     named = []
-    for one, some, cost in zip(found, outliers, costs, strict=True):
-        ids = event.ids.copy()
-        ids[~is_new] = _ids_of(slam, judged, one, new_ids[~is_new])
-        kept = np.ones(len(ids), dtype=np.bool_)
-        kept[~is_new] = ~some
-        cost = max(cost, trusting) if some.any() and np.isfinite(trusting) else cost
-        named.append(Reading(select(replace(event, ids=ids), kept), float(cost)))
+    for one, some in pairs:
+        ids, kept = event.ids.copy(), np.ones(len(event.ids), dtype=np.bool_)
+        ids[~is_new], kept[~is_new] = _ids_of(slam, judged, one, new_ids[~is_new]), ~some
+        cost = max(one.cost, trusting) if some.any() else one.cost
+        named.append(Reading(replace(event, ids=ids).select(kept), new_cost + cost))
     return named
 
 
@@ -145,13 +144,10 @@ def _ids_of(
     return np.where(event.ids == UNKNOWN_ID, assigned, event.ids)
 
 
-def _cost(
-    slam: Slam, gains: RiccatiGains, event: ObservationEvent, innovation: Innovation
-) -> float:
-    """Return what it costs to take points for the landmarks whose ids they have."""
-    gate, k = slam.settings.rejection_distance, 2 if slam.settings.two_d_mode else 3
+def _cost(slam: Slam, gains: RiccatiGains, m: int, innovation: Innovation) -> float:
+    """Return what it costs to take some of m points for the landmarks whose ids they have."""
+    gate, k = slam.settings.rejection_distance, axes_of(slam.settings.two_d_mode).point
     r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
     passed, own = gated(r, gains.foretold(innovation)[1], noise, slam.settings)
-    unpaired = len(event.ids) - np.sum(passed)
-    S = with_blocks(own, noise[passed])
-    return joint_cost(r[passed], S, noise[passed]) + float(unpaired * huber_loss(gate))
+    paired_cost = joint_cost(r[passed], with_blocks(own, noise[passed]), noise[passed])
+    return paired_cost + (m - int(np.sum(passed))) * unpaired_cost(gate)

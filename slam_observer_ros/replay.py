@@ -107,8 +107,6 @@ class Replay:
         Whether the poses are in the frame of a map that was known in advance.
     start_ns : int
         Stamp of the first event that was used, nanoseconds; 0 if none was.
-    restarts : int
-        How often all started again after a jump of the clock.
     history_since : str
         Since when it is possible to look back, in words.
     observations_since : int
@@ -127,9 +125,14 @@ class Replay:
     seconds: float
     in_known_map: bool
     start_ns: int
-    restarts: int
     history_since: str
     observations_since: int
+
+    @property
+    def restarts(self) -> int:
+        """How often all started again after a jump of the clock."""
+        resets = self.estimator.settings.on_time_jump == 'reset'
+        return self.estimator.jumps if resets else 0
 
     def seconds_until(self, stamp_ns: int) -> float:
         """Return the time from the first event to a stamp, seconds."""
@@ -176,7 +179,7 @@ class _Run:
         self._landmark_truth = truth.landmarks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
         self._history_since, self._observations_since = 'the start', 0
-        self._jumps = self._restarts = self._events = 0
+        self._jumps = self._events = 0
         self._seconds = 0.0
         self._start()
 
@@ -220,7 +223,6 @@ class _Run:
             self._seconds,
             self._in_known_map,
             self._start_ns or 0,
-            self._restarts,
             self._history_since,
             self._observations_since,
         )
@@ -245,7 +247,6 @@ class _Run:
         self._jumps = self._estimator.jumps
         self._history_since, self._observations_since = 'the clock jumped', 0
         if self._settings.on_time_jump == 'reset':
-            self._restarts += 1
             self._start()
             return
         self._blind.flush()

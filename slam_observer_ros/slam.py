@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.events import ObservationEvent, select, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.motion import Motion
@@ -190,14 +190,14 @@ class Slam:
 
         It moves landmarks whose gains had put that off.
         """
-        event = select(event, event.ids != UNKNOWN_ID)
+        event = event.select(event.ids != UNKNOWN_ID)
         rows = self.landmarks.indices_of(event.ids)
         if not self.is_mapping:
-            event, rows = select(event, rows >= 0), rows[rows >= 0]
+            event, rows = event.select(rows >= 0), rows[rows >= 0]
         known = rows >= 0
         self.gains.recall(self.observer, rows[known])
         covariances = self._covariances(event, rows)
-        innovation = self._innovation(select(event, known), rows[known], covariances[known])
+        innovation = self._innovation(event.select(known), rows[known], covariances[known])
         return Sighting(event, rows, covariances, innovation)
 
     def observe(
@@ -229,12 +229,12 @@ class Slam:
         event, rows, covariances = sighting.event, sighting.rows, sighting.covariances
         known, used = rows >= 0, np.ones(len(rows), dtype=np.bool_)
         ids = event.ids[known]
-        used[known] = self._innovate(select(event, known), sighting.innovation)
+        used[known] = self._innovate(event.select(known), sighting.innovation)
         if not known.all():
-            self._initialise(select(event, ~known), covariances[~known])
+            self._initialise(event.select(~known), covariances[~known])
             rows = self.landmarks.indices_of(event.ids)
             kept = rows >= 0
-            event, rows, covariances = select(event, kept), rows[kept], covariances[kept]
+            event, rows, covariances = event.select(kept), rows[kept], covariances[kept]
             used = used[kept]
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows[used], event.velocities[used])
@@ -351,7 +351,7 @@ class Slam:
         seen = Seen(event.stamp_ns, rows, event.points, covariances)
         self.gains.look_back(self.observer, seen, some_are)
         if some_are:
-            self._relocate(select(event, in_doubt), rows[in_doubt], covariances[in_doubt])
+            self._relocate(event.select(in_doubt), rows[in_doubt], covariances[in_doubt])
 
     def _relocate(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
         """Start landmarks anew that are still far from where they were expected."""
@@ -379,7 +379,7 @@ class Slam:
         self.remove(forgotten)
         self.counts['forgotten_landmark'] += len(forgotten)
         self.counts['unmapped_landmark'] += new - fitting
-        return select(event, np.arange(new) < fitting)
+        return event.select(np.arange(new) < fitting)
 
     def _initialise(self, event: ObservationEvent, covariances: FloatArray) -> None:
         """Add landmarks where they were seen."""

@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.axes import Axes, axes_of, SPATIAL
 from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.motion import Motion
@@ -52,7 +52,7 @@ class ConstantGains:
     landmark_covariances = None
 
     def __init__(self, settings: Settings) -> None:
-        self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
+        self._axes = axes_of(settings.two_d_mode)
         self.calibration = Calibration(Settings(), self._axes)
         self.change_settings(settings)
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes, PLANAR, SPATIAL
+from slam_observer_ros.axes import axes_of
 from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
@@ -63,7 +63,7 @@ class RiccatiGains:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._axes: Axes = PLANAR if settings.two_d_mode else SPATIAL
+        self._axes = axes_of(settings.two_d_mode)
         self.calibration = Calibration(settings, self._axes)
         self._p = len(self._axes.pose)
         self._first = self._p + self.calibration.count

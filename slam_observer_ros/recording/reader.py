@@ -184,10 +184,11 @@ class Recording:
         """Tell whether a landmark topic's points have no ids, and what they have; else empty."""
         if topic.message_type == POSE_ARRAY_TYPE:
             return 'without ids'
-        if topic.message_type not in LANDMARK_DECODERS or self._identifies(topic):
+        if topic.message_type not in LANDMARK_DECODERS:
             return ''
+        names = self._field_names(topic)
         kind = 'fields' if topic.message_type.endswith('PointCloud2') else 'channels'
-        return f'without ids; {kind} {" ".join(self._field_names(topic)) or "none"}'
+        return '' if ID_NAME in names else f'without ids; {kind} {" ".join(names) or "none"}'
 
     def poses_move(self, topic: Topic) -> bool:
         """Tell whether a topic holds an odometry's poses, and they are not all the same."""
