@@ -234,11 +234,10 @@ class Slam:
             self._initialise(event.select(~known), covariances[~known])
             rows = self.landmarks.indices_of(event.ids)
             kept = rows >= 0
-            event, rows, covariances = event.select(kept), rows[kept], covariances[kept]
-            used = used[kept]
+            event, rows, used = event.select(kept), rows[kept], used[kept]
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows[used], event.velocities[used])
-        self._look_back(event, rows, covariances)
+        self._look_back(event, rows)
         return ids, sighting.innovation.r
 
     def smooth(self) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -342,12 +341,14 @@ class Slam:
         points = np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
         return self.noise.observation(replace(event, points=points))
 
-    def _look_back(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
-        """Let the gains look back; start landmarks in doubt anew if that doesn't explain them."""
+    def _look_back(self, event: ObservationEvent, rows: IntArray) -> None:
+        """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
+
+        Now that the state is corrected, it is known better than before from where they were seen.
+        """
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
-        if some_are:
-            covariances = self._covariances(event, rows)
+        covariances = self._covariances(event, rows)
         seen = Seen(event.stamp_ns, rows, event.points, covariances)
         self.gains.look_back(self.observer, seen, some_are)
         if some_are:

@@ -21,13 +21,15 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Frames, Prior, Smoother, Solution
 
@@ -216,6 +218,27 @@ def test_smoothing_a_run_without_noise_returns_the_truth(two_d_mode):
     np.testing.assert_allclose(
         hindsight.world_points, world.world_points[hindsight.ids], atol=1e-6
     )
+
+
+def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkeypatch):
+    """A stereo camera that has turned further than it knew errs along where it looks now."""
+    noted, see = [], History.see
+
+    def note(history, seen, *rest):
+        noted.append(seen)
+        see(history, seen, *rest)
+
+    monkeypatch.setattr(History, 'see', note)
+    settings = Settings(observation_model='stereo', reorder_window=0.0)
+    settings = replace(settings, angular_velocity_noise=(0.3,) * 3)
+    estimator = Estimator(settings)
+    points = np.array([[4.0, 0.0, 0.0], [3.2, 2.4, 0.0], [3.2, 0.0, 2.4]])
+    turned = points @ so3.exp(np.array([0.0, 0.0, 0.3]))
+    for step, seen in enumerate([points, points, points, turned]):
+        estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
+        estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))
+    there = NoiseModel(settings).observation(ObservationEvent(0, np.arange(3), turned))
+    np.testing.assert_allclose(noted[-1].covariances, there, atol=0.1 * np.max(there))
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
