@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 import logging
 
 import numpy as np
@@ -14,26 +13,16 @@ from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.localisation import (
-    enter_map,
-    is_lost,
-    shape_covariances,
-    start_in_map,
-)
+from slam_observer_ros.map_frame import MapFrame
 from slam_observer_ros.observer import lyapunov
-from slam_observer_ros.odometry import transition
-from slam_observer_ros.settings import MAX_DELAY_S, Settings
+from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
+from slam_observer_ros.timeline import Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.validation import check_event
-from slam_observer_ros.velocity_history import VelocityHistory
 
 logger = logging.getLogger(__name__)
-
-MAX_PENDING_VELOCITIES = 128
-"""Velocities that may wait for an observation before the state is moved on without one."""
 
 
 class Estimator:
@@ -78,9 +67,8 @@ class Estimator:
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
         self._times_moved = 0
-        self._map: LandmarkMap | None = None
         self._on_update = on_update
-        self._hypotheses = Hypotheses(Slam(settings, np.eye(4)), settings)
+        self._frame = MapFrame(settings)
         self.reset(initial_pose)
 
     def reset(self, pose: FloatArray | None = None) -> None:
@@ -92,7 +80,7 @@ class Estimator:
             (4, 4) body to world. By default identity, or unknown in a map that was loaded.
 
         """
-        self._start(pose)
+        self._frame.start(pose)
         self._forget_time()
         self._last: Update | None = None
 
@@ -110,13 +98,12 @@ class Estimator:
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
                 after,
             )
-            self.reset(None if self._map else self._slam.observer.reference_pose)
+            self.reset(None if self._frame.loaded else self._slam.observer.reference_pose)
             return
         logger.warning('The clock has jumped%s; pose and map are held.', after)
         self.flush()
-        if self._stamp_ns is not None:
-            self._advance(self._stamp_ns)
-        self._hypotheses.restart_time()
+        self._catch_up()
+        self._frame.states.restart_time()
         self._forget_time()
 
     def load_map(
@@ -140,14 +127,13 @@ class Estimator:
             (6, 6) covariance of ``pose`` as :attr:`pose_covariance` has it; default exact.
 
         """
-        self._map = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
-        self._is_in_map = False
+        self._frame.load(landmark_map)
         if pose is not None:
             self.set_pose(pose, pose_covariance)
         elif self._slam.is_mapping:
-            self._enter_map()
+            self._frame.enter()
         else:  # in a map that does not grow there is nothing to carry into another one
-            self._start(None)
+            self._frame.start(None)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
         """Move the robot as of ``stamp_ns``; the map stays.
@@ -160,17 +146,13 @@ class Estimator:
             (6, 6) its covariance, as :attr:`pose_covariance` has it; default exact.
 
         """
-        if self._stamp_ns is not None:
-            self._advance(self._stamp_ns)
-        if self.is_localised:
-            self._hypotheses.decide().set_pose(pose, covariance)
-        else:
-            self._start(pose, covariance)
+        self._catch_up()
+        self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other gains from now on; parameters that are read-only keep their effect."""
         self.settings = settings
-        self._hypotheses.change_settings(settings)
+        self._frame.change_settings(settings)
 
     def add(self, event: Event) -> bool:
         """Take an event; return whether it was accepted.
@@ -215,12 +197,12 @@ class Estimator:
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""
-        return self._hypotheses.forget(landmark_id)
+        return self._frame.states.forget(landmark_id)
 
     @property
     def counts(self) -> Counter[str]:
         """How many events were used, by kind, and what befell the landmarks in them."""
-        return self._counts + self._slam.counts
+        return self._counts + self._frame.counts
 
     @property
     def is_localised(self) -> bool:
@@ -228,7 +210,7 @@ class Estimator:
 
         Until the place in a loaded map is found, the estimate is in a frame of its own.
         """
-        return self._map is None or self._is_in_map
+        return self._frame.is_localised
 
     @property
     def landmark_map(self) -> LandmarkMap:
@@ -237,19 +219,12 @@ class Estimator:
         Its covariances are those in its own frame: without the error of how it lies to where
         the robot started, unless the frame is that of a map that was loaded.
         """
-        slam = self._slam
-        covariances = shape_covariances(slam) if self._map is None else slam.landmark_covariances
-        return LandmarkMap(
-            self.landmark_ids,
-            self.world_points,
-            None if covariances is None else covariances[slam.confirmed],
-            self.landmark_counts,
-        )
+        return self._frame.landmark_map
 
     @property
     def stamp_ns(self) -> int | None:
         """Stamp of the last event that was used, nanoseconds; None before the first."""
-        return self._stamp_ns
+        return self._timeline.stamp_ns
 
     @property
     def newest_stamp_ns(self) -> int | None:
@@ -259,13 +234,15 @@ class Estimator:
     @property
     def pose(self) -> FloatArray:
         """(4, 4) estimated pose at ``stamp_ns``, body to world."""
-        return self.pose_at(self._stamp_ns or 0)
+        return self.pose_at(self.stamp_ns or 0)
 
     def pose_at(self, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) at any time: the state, moved on by the velocities since."""
-        if self._state_ns is None or stamp_ns == self._state_ns:
-            return self._slam.observer.pose
-        return self._slam.observer.pose @ self._motion(self._state_ns, stamp_ns)
+        slam, state_ns = self._slam, self._timeline.state_ns
+        if state_ns is None or stamp_ns == state_ns:
+            return slam.observer.pose
+        calibration = slam.gains.calibration
+        return slam.observer.pose @ self._timeline.motion(calibration, state_ns, stamp_ns)
 
     @property
     def pose_covariance(self) -> FloatArray | None:
@@ -273,19 +250,20 @@ class Estimator:
 
         Both along the world's axes, rad² and m². None where the gains know none.
         """
-        start_ns, end_ns = self._state_ns or 0, self._stamp_ns or 0
-        return self._slam.pose_covariance(self._velocities, start_ns, end_ns)
+        timeline = self._timeline
+        start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
+        return self._slam.pose_covariance(timeline.velocities, start_ns, end_ns)
 
     @property
     def body_velocity(self) -> FloatArray:
         """(6,) velocity (Ω, v) in force at ``stamp_ns``; zero when it has timed out."""
-        velocity = None if self._stamp_ns is None else self._velocities.latest(self._stamp_ns)
+        velocity = self._timeline.body_velocity
         return np.zeros(6) if velocity is None else velocity
 
     @property
     def velocity_is_stale(self) -> bool:
         """Whether no velocity was in force at ``stamp_ns``, so that the pose is being held."""
-        return self._stamp_ns is None or self._velocities.latest(self._stamp_ns) is None
+        return self._timeline.body_velocity is None
 
     @property
     def landmark_ids(self) -> IntArray:
@@ -333,7 +311,7 @@ class Estimator:
     @property
     def _slam(self) -> Slam:
         """The most likely state."""
-        return self._hypotheses.best
+        return self._frame.slam
 
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
@@ -352,28 +330,29 @@ class Estimator:
             self._process_observation(event)
 
     def _process_velocity(self, event: VelocityEvent) -> None:
-        if self._stamp_ns is not None and event.stamp_ns < self._stamp_ns:
-            self._drop(InvalidEventError('too_late', 'a newer velocity was already used'))
+        try:
+            self._timeline.append(event)
+        except InvalidEventError as error:
+            self._drop(error)
             return
-        self._velocities.append(event)
-        self._begin(event.stamp_ns)
         self._counts['velocity'] += 1
-        self._pending_velocities += 1
-        if self._pending_velocities >= MAX_PENDING_VELOCITIES:
-            self._advance(event.stamp_ns)
+        if self._timeline.is_full:
+            self._timeline.advance(self._frame.states, event.stamp_ns)
 
     def _process_observation(self, event: ObservationEvent) -> None:
         if self.settings.two_d_mode:
             event = flatten(event)
-        self._begin(event.stamp_ns)
-        if event.stamp_ns < (self._state_ns or 0):
-            event = self._carry_forward(event)
-        self._advance(event.stamp_ns)
-        ids, residuals = self._hypotheses.observe(event)
+        timeline = self._timeline
+        timeline.begin(event.stamp_ns)
+        if event.stamp_ns < (timeline.state_ns or 0):
+            event = timeline.carry_forward(event, self._slam.gains.calibration)
+            self._counts['late_observation'] += 1
+        timeline.advance(self._frame.states, event.stamp_ns)
+        ids, residuals = self._frame.states.observe(event)
         self._tell_of_moved(self._slam.moved_ids)
         self._counts['observation'] += 1
         self._counts['observed_point'] += len(event.ids)
-        self._localise(ids)
+        self._frame.find_place(ids)
         level = lyapunov(self.settings.gain_k, residuals)
         observer = self._slam.observer
         residuals = se3.rotate(observer.reference_pose, residuals)
@@ -388,89 +367,17 @@ class Estimator:
         if _is_power_of_ten(self._times_moved):
             logger.warning('Landmarks %s have moved (%d so far).', ids.tolist(), self._times_moved)
 
+    def _catch_up(self) -> None:
+        """Move the states on to the last event that was used."""
+        if self.stamp_ns is not None:
+            self._timeline.advance(self._frame.states, self.stamp_ns)
+
     def _forget_time(self) -> None:
         """Forget all that has a stamp but the map."""
-        self._queue = EventQueue(
-            _nanoseconds(self.settings.reorder_window),
-            _nanoseconds(self.settings.max_stamp_jump),
-            _nanoseconds(self.settings.late_limit),
-        )
-        self._velocities = VelocityHistory(
-            _nanoseconds(self.settings.velocity_timeout), self.settings.two_d_mode
-        )
-        self._pending_velocities = 0
-        self._state_ns: int | None = None
-        self._stamp_ns: int | None = None
-
-    def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
-        """Start with an empty map, or with the one that was loaded."""
-        self._counts += self._slam.counts
-        slam = Slam(self.settings, np.eye(4) if pose is None else pose)
-        self._hypotheses = Hypotheses(slam, self.settings)
-        self._is_in_map = self._map is not None and pose is not None
-        if self._map is not None and pose is not None:
-            start_in_map(self._slam, self._map, covariance)
-
-    def _localise(self, seen_ids: IntArray) -> None:
-        """Find the place in the loaded map if it is not known, or not any more."""
-        if self._map is None:
-            return
-        if self._is_in_map and is_lost(self._slam, seen_ids):
-            logger.warning('All landmarks are far from where they should be; localising anew.')
-            self._counts['lost'] += 1
-            self._start(None)
-        if not self._is_in_map:
-            self._enter_map()
-            self._counts['not_localised'] += not self._is_in_map
-
-    def _enter_map(self) -> None:
-        if self._map is not None and enter_map(self._slam, self._map):
-            self._hypotheses.decide()
-            self._is_in_map = True
-            logger.info('Found the place in the map of %d landmarks.', len(self._map.ids))
-
-    def _begin(self, stamp_ns: int) -> None:
-        self._stamp_ns = max(stamp_ns, self._stamp_ns or stamp_ns)
-        if self._state_ns is None:
-            self._state_ns = stamp_ns
-
-    def _motion(self, start_ns: int, end_ns: int) -> FloatArray:
-        """Return the body's motion (4, 4), backwards if the end comes first."""
-        if end_ns < start_ns:
-            return se3.inverse(self._motion(end_ns, start_ns))
-        calibration = self._slam.gains.calibration
-        return transition(self._velocities, calibration, start_ns, end_ns)
-
-    def _carry_forward(self, event: ObservationEvent) -> ObservationEvent:
-        """Return what would be seen at the state's stamp: Φ⁻¹ (y + v τ), Φ the motion since."""
-        state_ns = self._state_ns or 0
-        back = self._motion(state_ns, event.stamp_ns)
-        self._counts['late_observation'] += 1
-        turn, points = back[:3, :3], event.points
-        if event.velocities is not None:
-            points = points + event.velocities * (state_ns - event.stamp_ns) * 1e-9
-        return replace(
-            event,
-            stamp_ns=state_ns,
-            points=se3.transform(back, points),
-            covariances=None if event.covariances is None else turn @ event.covariances @ turn.T,
-            velocities=None if event.velocities is None else se3.rotate(back, event.velocities),
-        )
-
-    def _advance(self, stamp_ns: int) -> None:
-        """Move the state on to ``stamp_ns`` along the velocities held since."""
-        start_ns = stamp_ns if self._state_ns is None else self._state_ns
-        if stamp_ns > start_ns:
-            self._hypotheses.advance(self._velocities, start_ns, stamp_ns)
-            # A delay, and beyond it half of what velocities are averaged over to estimate it.
-            kept_s = self.settings.late_limit + 2.0 * MAX_DELAY_S
-            self._velocities.forget_before(stamp_ns - _nanoseconds(kept_s))
-        self._state_ns = stamp_ns
-        self._pending_velocities = 0
-
-
-def _nanoseconds(seconds: float) -> int:
-    return round(seconds * 1e9)
+        settings = self.settings
+        limits_s = settings.reorder_window, settings.max_stamp_jump, settings.late_limit
+        self._queue = EventQueue(*(round(limit_s * 1e9) for limit_s in limits_s))
+        self._timeline = Timeline(settings)
 
 
 def _is_power_of_ten(count: int) -> bool:

@@ -125,9 +125,9 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     seen = se3.transform(se3.inverse(turned), posts)
     for step in range(100, 105):
         observe(estimator, 0.1 * step, seen[1:2])
-    followed = len(estimator._hypotheses)
+    followed = len(estimator._frame.states)
     observe(estimator, 10.45, np.empty((0, 3)))  # tells nothing, and so decides nothing
-    assert len(estimator._hypotheses) == followed
+    assert len(estimator._frame.states) == followed
     for step in range(105, 110):
         observe(estimator, 0.1 * step, seen[1:])
     assert followed > 1
@@ -141,7 +141,7 @@ def test_one_hypothesis_at_most_if_no_more_are_wanted():
     estimator = Estimator(replace(PLANAR, max_hypotheses=1))
     for event in world.events:
         estimator.add(event)
-        assert len(estimator._hypotheses) == 1
+        assert len(estimator._frame.states) == 1
 
 
 @pytest.mark.parametrize('gains', ['constant', 'scheduled'])

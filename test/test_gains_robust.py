@@ -174,7 +174,7 @@ def test_what_says_nothing_of_the_pose_leaves_open_which_state_is_right(do_then)
 
 def test_a_landmark_is_forgotten_in_all_states_that_are_followed():
     def forget(estimator):
-        assert len(estimator._hypotheses) == 2
+        assert len(estimator._frame.states) == 2
         assert estimator.forget(1)
 
     _, estimator = drive_on_blindly(Settings(two_d_mode=True), {2: 0}, forget)

@@ -1,0 +1,134 @@
+"""The states, in a frame of their own or in that of a map that was loaded."""
+
+from __future__ import annotations
+
+from collections import Counter
+import logging
+
+import numpy as np
+
+from slam_observer_ros.hypotheses import Hypotheses
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.localisation import (
+    enter_map,
+    is_lost,
+    shape_covariances,
+    start_in_map,
+)
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam import Slam
+from slam_observer_ros.types import FloatArray, IntArray
+
+logger = logging.getLogger(__name__)
+
+
+class MapFrame:
+    """States, and where they are in a loaded map, as far as that is known.
+
+    Parameters
+    ----------
+    settings : Settings
+        All settings.
+
+    Attributes
+    ----------
+    settings : Settings
+        The settings in force.
+    states : Hypotheses
+        The states.
+    loaded : LandmarkMap or None
+        The map that was loaded.
+    is_localised : bool
+        Whether the states are in their final frame: always, unless a map was loaded.
+
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.loaded: LandmarkMap | None = None
+        self.is_localised = True
+        self.states = Hypotheses(Slam(settings, np.eye(4)), settings)
+        self._counts: Counter[str] = Counter()
+
+    @property
+    def slam(self) -> Slam:
+        """The most likely state."""
+        return self.states.best
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What befell the landmarks, and how often the place in the map was not known or lost."""
+        return self._counts + self.slam.counts
+
+    @property
+    def landmark_map(self) -> LandmarkMap:
+        """The present map; see :attr:`slam_observer_ros.estimator.Estimator.landmark_map`."""
+        slam, rows = self.slam, self.slam.confirmed
+        covariances = shape_covariances(slam) if self.loaded is None else slam.landmark_covariances
+        return LandmarkMap(
+            slam.landmarks.ids[rows],
+            slam.world_points[rows],
+            None if covariances is None else covariances[rows],
+            slam.landmarks.counts[rows],
+        )
+
+    def change_settings(self, settings: Settings) -> None:
+        """Use other gains from now on."""
+        self.settings = settings
+        self.states.change_settings(settings)
+
+    def start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
+        """Start again with an empty map, or with the one that was loaded.
+
+        Parameters
+        ----------
+        pose : FloatArray or None
+            (4, 4) body to world. By default identity, or unknown in a map that was loaded.
+        covariance : FloatArray, optional
+            (6, 6) its covariance in a map that was loaded; default exact.
+
+        """
+        self._counts += self.slam.counts
+        slam = Slam(self.settings, np.eye(4) if pose is None else pose)
+        self.states = Hypotheses(slam, self.settings)
+        self.is_localised = self.loaded is None or pose is not None
+        if self.loaded is not None and pose is not None:
+            start_in_map(self.slam, self.loaded, covariance)
+
+    def load(self, landmark_map: LandmarkMap) -> None:
+        """Take a map in the place of one loaded before; the place in it is not known yet."""
+        self.loaded = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
+        self.is_localised = False
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
+        """Move the robot; if the place in a loaded map was not known, it is now."""
+        if self.is_localised:
+            self.states.decide().set_pose(pose, covariance)
+        else:
+            self.start(pose, covariance)
+
+    def find_place(self, seen_ids: IntArray) -> None:
+        """Find the place in the loaded map if it is not known, or not any more.
+
+        Parameters
+        ----------
+        seen_ids : IntArray
+            Ids of the known landmarks that were just seen.
+
+        """
+        if self.loaded is None:
+            return
+        if self.is_localised and is_lost(self.slam, seen_ids):
+            logger.warning('All landmarks are far from where they should be; localising anew.')
+            self._counts['lost'] += 1
+            self.start(None)
+        if not self.is_localised:
+            self.enter()
+            self._counts['not_localised'] += not self.is_localised
+
+    def enter(self) -> None:
+        """Move the states into the frame of the loaded map, if the landmarks seen suffice."""
+        if self.loaded is not None and enter_map(self.slam, self.loaded):
+            self.states.decide()
+            self.is_localised = True
+            logger.info('Found the place in the map of %d landmarks.', len(self.loaded.ids))

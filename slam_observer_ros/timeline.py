@@ -1,0 +1,108 @@
+"""The instant that an estimate is of, and the velocities that lead on from there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.hypotheses import Hypotheses
+from slam_observer_ros.odometry import transition
+from slam_observer_ros.settings import MAX_DELAY_S, Settings
+from slam_observer_ros.types import FloatArray
+from slam_observer_ros.velocity_history import VelocityHistory
+
+MAX_PENDING_VELOCITIES = 128
+"""Velocities that may wait for an observation before the state is moved on without one."""
+
+
+class Timeline:
+    """Velocities of the recent past, and how far the states have been moved along them.
+
+    Parameters
+    ----------
+    settings : Settings
+        ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
+
+    Attributes
+    ----------
+    velocities : VelocityHistory
+        The velocities.
+    stamp_ns : int or None
+        Stamp of the last event that was used, nanoseconds; None before the first.
+    state_ns : int or None
+        Instant that the states are of: velocities since then wait for an observation.
+
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        timeout_ns = round(settings.velocity_timeout * 1e9)
+        self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
+        self.stamp_ns: int | None = None
+        self.state_ns: int | None = None
+        # A delay, and beyond it half of what velocities are averaged over to estimate it.
+        self._kept_ns = round((settings.late_limit + 2.0 * MAX_DELAY_S) * 1e9)
+        self._pending = 0
+
+    def begin(self, stamp_ns: int) -> None:
+        """Note the stamp of an event that is about to be used."""
+        self.stamp_ns = max(stamp_ns, self.stamp_ns or stamp_ns)
+        if self.state_ns is None:
+            self.state_ns = stamp_ns
+
+    def append(self, event: VelocityEvent) -> None:
+        """Add a velocity.
+
+        Raises
+        ------
+        InvalidEventError
+            If a newer event was used before it (``'too_late'``).
+
+        """
+        if self.stamp_ns is not None and event.stamp_ns < self.stamp_ns:
+            raise InvalidEventError('too_late', 'a newer velocity was already used')
+        self.velocities.append(event)
+        self.begin(event.stamp_ns)
+        self._pending += 1
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no more velocities should wait for an observation."""
+        return self._pending >= MAX_PENDING_VELOCITIES
+
+    @property
+    def body_velocity(self) -> FloatArray | None:
+        """(6,) velocity (Ω, v) in force at ``stamp_ns``; None if none is or it has timed out."""
+        return None if self.stamp_ns is None else self.velocities.latest(self.stamp_ns)
+
+    def advance(self, states: Hypotheses, stamp_ns: int) -> None:
+        """Move the states, which are those of ``state_ns``, on to ``stamp_ns``."""
+        start_ns = stamp_ns if self.state_ns is None else self.state_ns
+        if stamp_ns > start_ns:
+            states.advance(self.velocities, start_ns, stamp_ns)
+            self.velocities.forget_before(stamp_ns - self._kept_ns)
+        self.state_ns = stamp_ns
+        self._pending = 0
+
+    def motion(self, calibration: Calibration, start_ns: int, end_ns: int) -> FloatArray:
+        """Return the body's motion (4, 4), backwards if the end comes first."""
+        if end_ns < start_ns:
+            return se3.inverse(self.motion(calibration, end_ns, start_ns))
+        return transition(self.velocities, calibration, start_ns, end_ns)
+
+    def carry_forward(self, event: ObservationEvent, calibration: Calibration) -> ObservationEvent:
+        """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since."""
+        state_ns = event.stamp_ns if self.state_ns is None else self.state_ns
+        back = self.motion(calibration, state_ns, event.stamp_ns)
+        turn, points = back[:3, :3], event.points
+        if event.velocities is not None:
+            points = points + event.velocities * (state_ns - event.stamp_ns) * 1e-9
+        return replace(
+            event,
+            stamp_ns=state_ns,
+            points=se3.transform(back, points),
+            covariances=None if event.covariances is None else turn @ event.covariances @ turn.T,
+            velocities=None if event.velocities is None else se3.rotate(back, event.velocities),
+        )
