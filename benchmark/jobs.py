@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 import logging
 
@@ -21,6 +21,9 @@ from slam_observer_ros.types import FloatArray
 OUTLIER_SEED = 1
 GTSAM_JOB = 'GTSAM'
 """iSAM2 and batch in one job, since one starts from the other."""
+
+TIMED_RUNS = 3
+"""Runs of which the least CPU time counts: whatever else the machine does only ever adds."""
 
 logger = logging.getLogger(__name__)
 
@@ -67,6 +70,8 @@ def run_job(job: Job) -> dict[str, Scores]:
         world = outliers.without_outliers(world, OUTLIER_SEED)
     try:
         runs = _run(job.column, world)
+        if job.variant == report.CLEAN:
+            runs = _with_least_cpu_time(runs, job.column, world)
     except IndeterminateError as error:
         logger.warning('%s: %s failed %s', job.world, job.column, error)
         failed = (ISAM2, BATCH) if job.column == GTSAM_JOB else (job.column,)
@@ -87,6 +92,15 @@ def _run(column: str, world: World) -> dict[str, Run]:
         return {column: estimators.run_smoothed(world.settings, world.events)}
     estimator = estimators.ONLINE[column](world.settings)
     return {column: estimators.run_online(estimator, world.events)}
+
+
+def _with_least_cpu_time(runs: dict[str, Run], column: str, world: World) -> dict[str, Run]:
+    """Return runs with the CPU time of the fastest of all :data:`TIMED_RUNS`."""
+    again = [runs, *(_run(column, world) for _ in range(TIMED_RUNS - 1))]
+    return {
+        name: replace(run, cpu_s=min(one[name].cpu_s for one in again))
+        for name, run in runs.items()
+    }
 
 
 def _score_without_ids(world: World) -> Scores:
