@@ -375,8 +375,11 @@ class Estimator:
     def _forget_time(self) -> None:
         """Forget all that has a stamp but the map."""
         settings = self.settings
-        limits_s = settings.reorder_window, settings.max_stamp_jump, settings.late_limit
-        self._queue = EventQueue(*(round(limit_s * 1e9) for limit_s in limits_s))
+        self._queue = EventQueue(
+            window_ns=round(settings.reorder_window * 1e9),
+            max_jump_ns=round(settings.max_stamp_jump * 1e9),
+            late_limit_ns=round(settings.late_limit * 1e9),
+        )
         self._timeline = Timeline(settings)
 
 

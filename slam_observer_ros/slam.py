@@ -348,6 +348,8 @@ class Slam:
         """
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
+        if not (some_are or self.gains.looks_back):
+            return
         covariances = self._covariances(event, rows)
         seen = Seen(event.stamp_ns, rows, event.points, covariances)
         self.gains.look_back(self.observer, seen, some_are)

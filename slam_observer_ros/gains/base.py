@@ -153,6 +153,10 @@ class GainDesign(Protocol):
     def settle(self, observer: Observer) -> None:
         """Move the reference to the estimate after a correction, where the design needs that."""
 
+    @property
+    def looks_back(self) -> bool:
+        """Whether the design looks back at what was seen."""
+
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen; where the design looks back, move the observer's reference.
 

@@ -50,6 +50,7 @@ class ConstantGains:
 
     pose_covariance = None
     landmark_covariances = None
+    looks_back = False
 
     def __init__(self, settings: Settings) -> None:
         self._axes = axes_of(settings.two_d_mode)

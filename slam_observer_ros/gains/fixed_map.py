@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
@@ -51,8 +51,10 @@ class FixedMapGains(RiccatiGains):
     def settle(self, observer: Observer) -> None:
         """Do nothing: the landmarks of an exact map do not move."""
 
-    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
-        """Do nothing: in an exact map there is no drift to undo."""
+    @property
+    def looks_back(self) -> bool:
+        """False: in an exact map there is no drift to undo."""
+        return False
 
     def restart(self, observer: Observer) -> None:
         """Do nothing: nothing is kept of the past."""

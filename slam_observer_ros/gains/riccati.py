@@ -107,7 +107,7 @@ class RiccatiGains:
     def predict(self, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
         noise, F = predict(self._P, self._axes, self.calibration, motion)
-        if self._looks_back:
+        if self.looks_back:
             self._hindsight.history.move(motion.path, noise, F, self.calibration.values)
         if self._is_moving:
             everything = np.arange(self._count)
@@ -290,13 +290,18 @@ class RiccatiGains:
         self._P[:, columns] += self._P[:, : self._p] @ L.T
         observer.rebase(observer.A, observer.y_ref + observer.a)
 
+    @property
+    def looks_back(self) -> bool:
+        """Whether there is a history to look back at."""
+        return self._settings.hindsight_interval > 0 and not self._is_moving
+
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise all of it anew.
 
         The smoother's marginal becomes the filter's covariance, and its solution the observer's
         new reference ξ°, with â_i = 0.
         """
-        if not self._looks_back:
+        if not self.looks_back:
             return
         hindsight = self._hindsight
         hindsight.see(seen, observer.A, observer.shifts[seen.indices])
@@ -350,10 +355,6 @@ class RiccatiGains:
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(Correction(D, slice(None), end.points - start.points))
         self.settle(observer)
-
-    @property
-    def _looks_back(self) -> bool:
-        return self._settings.hindsight_interval > 0 and not self._is_moving
 
     @property
     def _count(self) -> int:

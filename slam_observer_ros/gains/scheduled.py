@@ -68,6 +68,7 @@ class ScheduledGains:
 
     pose_covariance = None
     landmark_covariances = None
+    looks_back = False
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
