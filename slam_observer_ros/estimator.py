@@ -352,7 +352,7 @@ class Estimator:
         self._tell_of_moved(self._slam.moved_ids)
         self._counts['observation'] += 1
         self._counts['observed_point'] += len(event.ids)
-        self._frame.find_place(ids)
+        self._frame.find_place()
         level = lyapunov(self.settings.gain_k, residuals)
         observer = self._slam.observer
         residuals = se3.rotate(observer.reference_pose, residuals)

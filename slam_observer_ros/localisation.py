@@ -84,19 +84,16 @@ def enter_map(slam: Slam, known: LandmarkMap) -> bool:
     return True
 
 
-def is_lost(slam: Slam, seen_ids: IntArray) -> bool:
+def is_lost(slam: Slam) -> bool:
     """Return whether a place in a map has been wrong for some time, or the robot was carried.
 
-    All landmarks just seen were rejected then, and as many as would do to find the place again
+    All landmarks seen of late were rejected then, and as many as would do to find the place again
     were rejected so often that elsewhere they would be taken to have moved.
     """
-    rejections = slam.landmarks.rejections
-    just_now = rejections[slam.landmarks.indices_of(seen_ids)]
-    often = (
-        np.sum(rejections >= slam.settings.max_rejections)
-        >= axes_of(slam.settings.two_d_mode).point
-    )
-    return not slam.is_mapping and bool(often and len(just_now) and just_now.all())
+    often = slam.settings.max_rejections
+    moved = np.sum(slam.landmarks.rejections >= often)
+    needed = axes_of(slam.settings.two_d_mode).point
+    return bool(not slam.is_mapping and slam.rejected_in_a_row >= often and moved >= needed)
 
 
 def shape_covariances(slam: Slam) -> FloatArray | None:
@@ -152,14 +149,15 @@ def find_transform(
     -------
     tuple or None
         Transform (4, 4) from the robot's frame to the other one, and by which landmarks (m,) it
-        was found. None unless at least k of them agree and tell how the robot is turned.
+        was found. None unless at least k of them agree, and half of them all, and tell how the
+        robot is turned: of many landmarks some few fit by chance.
 
     """
     p, k = len(axes.pose), axes.point
     J = axes.output_matrix(source).reshape(len(source) * k, p)
     G = np.vstack([np.eye(p), J])
     agree = np.ones(len(source), dtype=np.bool_)
-    while agree.sum() >= k:
+    while agree.sum() >= max(k, 0.5 * len(source)):
         rows = np.flatnonzero(np.append(np.ones(p, dtype=np.bool_), np.repeat(agree, k)))
         P = source_covariance[np.ix_(rows, rows)]
         T = _aligned(source[agree], P[p:, p:], target[agree], target_covariances[agree])
@@ -242,7 +240,8 @@ def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
     r = (observer.y_ref + observer.a)[rows] - targets
     observer.correct(slam.gains.anchor(observer, rows, r, covariances))
     slam.gains.settle(observer)
-    slam.landmarks.counts[rows] += known.counts
+    # A surveyed landmark needs no observation to be believed.
+    slam.landmarks.counts[rows] += np.maximum(known.counts, slam.settings.confirmations)
 
 
 def _renumber(slam: Slam, known: LandmarkMap) -> None:

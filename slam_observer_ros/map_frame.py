@@ -17,7 +17,7 @@ from slam_observer_ros.localisation import (
 )
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -107,18 +107,11 @@ class MapFrame:
         else:
             self.start(pose, covariance)
 
-    def find_place(self, seen_ids: IntArray) -> None:
-        """Find the place in the loaded map if it is not known, or not any more.
-
-        Parameters
-        ----------
-        seen_ids : IntArray
-            Ids of the known landmarks that were just seen.
-
-        """
+    def find_place(self) -> None:
+        """Find the place in the loaded map if it is not known, or not any more."""
         if self.loaded is None:
             return
-        if self.is_localised and is_lost(self.slam, seen_ids):
+        if self.is_localised and is_lost(self.slam):
             logger.warning('All landmarks are far from where they should be; localising anew.')
             self._counts['lost'] += 1
             self.start(None)

@@ -78,6 +78,8 @@ class Slam:
         How many landmarks were rejected, have moved, were forgotten and so on.
     moved_ids : IntArray
         Landmarks that the last observation showed to have moved.
+    rejected_in_a_row : int
+        Observations since the last one of which a known landmark was not rejected.
 
     """
 
@@ -89,6 +91,7 @@ class Slam:
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
         self.moved_ids = np.empty(0, dtype=np.int64)
+        self.rejected_in_a_row = 0
         self.noise = NoiseModel(settings)
         self._innovation_ns: int | None = None
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
@@ -299,6 +302,7 @@ class Slam:
         self.gains.settle(self.observer)
         self._innovation_ns = event.stamp_ns
         rejected = weights == 0.0
+        self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
         if rejected.any():
             spread_m = np.sqrt(np.trace(innovation.covariances[rejected], axis1=1, axis2=2))
