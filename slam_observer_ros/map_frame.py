@@ -7,6 +7,7 @@ import logging
 
 import numpy as np
 
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.localisation import (
@@ -89,7 +90,7 @@ class MapFrame:
 
         """
         self._counts += self.slam.counts
-        slam = Slam(self.settings, np.eye(4) if pose is None else pose)
+        slam = Slam(self.settings, np.eye(4) if pose is None else self._allowed(pose))
         self.states = Hypotheses(slam, self.settings)
         self.is_localised = self.loaded is None or pose is not None
         if self.loaded is not None and pose is not None:
@@ -103,7 +104,7 @@ class MapFrame:
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the place in a loaded map was not known, it is now."""
         if self.is_localised:
-            self.states.decide().set_pose(pose, covariance)
+            self.states.decide().set_pose(self._allowed(pose), covariance)
         else:
             self.start(pose, covariance)
 
@@ -125,3 +126,7 @@ class MapFrame:
             self.states.decide()
             self.is_localised = True
             logger.info('Found the place in the map of %d landmarks.', len(self.loaded.ids))
+
+    def _allowed(self, pose: FloatArray) -> FloatArray:
+        """Return a pose (4, 4), or with ``two_d_mode`` what of it lies in the plane."""
+        return se3.flatten(pose) if self.settings.two_d_mode else pose

@@ -45,15 +45,19 @@ class NoiseModel:
         """Return the covariances (k, 6, 6) of k body-frame motions, rad² and m².
 
         While a velocity is in force its error is white noise: of the stated density and
-        proportional to speed, or, where the message has a covariance, independent from one
-        message to the next. In a gap the robot may do anything that ``unknown_*_motion`` allows.
+        proportional to speed. Where the message has a covariance its error is the same as long
+        as it is held, and another one in the next message: what was held for t has moved the
+        robot by t times the error, however many motions that was cut into. In a gap the robot
+        may do anything that ``unknown_*_motion`` allows.
         """
         rates = self._density_squared + (self._scale * held.body_velocities) ** 2
         in_gaps = self._unknown_squared * held.gap_s[:, None]
         covariances = (rates * held.dt_s[:, None] + in_gaps)[:, :, None] * _IDENTITY_6
         for i, given in enumerate(held.covariances):
             if given is not None:
-                covariances[i] = given * held.dt_s[i] ** 2 + np.diag(in_gaps[i])
+                before_s, dt_s = held.before_s[i], held.dt_s[i]
+                squared = (before_s + dt_s) ** 2 - before_s**2
+                covariances[i] = given * squared + np.diag(in_gaps[i])
         return covariances
 
     def observation(self, event: ObservationEvent) -> FloatArray:

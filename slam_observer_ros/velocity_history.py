@@ -25,6 +25,8 @@ class HeldVelocities:
         (k,) seconds that each was held.
     gap_s : FloatArray
         (k,) seconds after each during which no velocity was known, since it had timed out.
+    before_s : FloatArray
+        (k,) seconds that each had been held for before.
 
     """
 
@@ -32,6 +34,7 @@ class HeldVelocities:
     covariances: list[FloatArray | None]
     dt_s: FloatArray
     gap_s: FloatArray
+    before_s: FloatArray
 
 
 class VelocityHistory:
@@ -79,6 +82,7 @@ class VelocityHistory:
             [event.covariance for event in events],
             _seconds(stops - begins),
             _seconds(ends - stops),
+            _seconds(begins - stamps[:-1]),
         )
 
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -23,6 +25,7 @@ def held(velocities, dt_s, gap_s=None, covariances=None):
         covariances or [None] * len(velocities),
         np.array(dt_s, dtype=float),
         np.zeros(len(velocities)) if gap_s is None else np.array(gap_s, dtype=float),
+        np.zeros(len(velocities)),
     )
 
 
@@ -82,6 +85,16 @@ def test_a_messages_covariance_stands_for_the_settings_while_the_velocity_is_hel
     gap = np.diag([0.25] * 6) * gap_s
     np.testing.assert_allclose(stated, given_covariance * dt_s**2 + gap, atol=1e-12)
     np.testing.assert_allclose(np.sqrt(np.diag(silent) / dt_s), [0.03] * 3 + [0.02] * 3)
+
+
+@pytest.mark.parametrize('cuts', [1, 2, 10, 1000])
+def test_an_error_that_lasts_adds_up_however_often_its_motion_is_cut(cuts):
+    given = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    dt_s = np.full(cuts, 2.0 / cuts)
+    whole = held(np.zeros((cuts, 6)), dt_s, covariances=[given] * cuts)
+    whole = replace(whole, before_s=np.cumsum(dt_s) - dt_s)
+    total = NoiseModel(Settings()).motion(whole).sum(axis=0)
+    np.testing.assert_allclose(total, 4.0 * given, rtol=1e-9)
 
 
 def test_no_motion_has_no_covariances():

@@ -137,6 +137,24 @@ def vee(V: FloatArray) -> FloatArray:
     return np.concatenate([so3.vee(V), V[..., :3, 3]], axis=-1)
 
 
+def flatten(T: FloatArray) -> FloatArray:
+    """Pose at the same x, y and yaw, with no height, roll and pitch.
+
+    Parameters
+    ----------
+    T : FloatArray, shape (4, 4)
+        Pose.
+
+    Returns
+    -------
+    FloatArray, shape (4, 4)
+        Pose in the plane z = 0.
+
+    """
+    yaw = np.arctan2(T[1, 0], T[0, 0])
+    return pose(so3.exp(np.array([0.0, 0.0, yaw])), T[:3, 3] * np.array([1.0, 1.0, 0.0]))
+
+
 def project(M: FloatArray) -> FloatArray:
     """Orthogonal (Frobenius) projection onto se(3): [[(M₁ − M₁ᵀ) / 2, m₂], [0, 0]] (10).
 
