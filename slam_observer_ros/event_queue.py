@@ -21,8 +21,8 @@ class EventQueue:
     """Holds events back for a reorder window, then gives them out in stamp order.
 
     Of two events with one stamp the velocity comes first, and two observations are ordered by
-    their ids, so the order does not depend on which arrived first. An event that has the stamp,
-    the kind and the ids of another one is a duplicate.
+    their ids and points, so the order does not depend on which arrived first. A second velocity
+    of one stamp is a duplicate; so is an observation that has the ids and points of another one.
 
     Parameters
     ----------
@@ -43,6 +43,7 @@ class EventQueue:
         self._known: set[Key] = set()
         self._most_known = LEAST_KNOWN
         self._strays = 0
+        self._stray_ns = 0
         self.newest_ns: int | None = None
 
     def push(self, event: Event) -> bool:
@@ -77,7 +78,7 @@ class EventQueue:
     def _insert(self, event: Event) -> None:
         stamp_ns = event.stamp_ns
         if isinstance(event, ObservationEvent):
-            key = (stamp_ns, True, event.ids.tobytes())
+            key = (stamp_ns, True, event.ids.tobytes() + event.points.tobytes())
         else:
             key = (stamp_ns, False, b'')
         if key in self._known:
@@ -105,7 +106,9 @@ class EventQueue:
         if not (too_early or too_late):
             self._strays = 0
             return False
-        self._strays += 1
+        agrees = abs(stamp_ns - self._stray_ns) <= self._max_jump_ns
+        self._strays = self._strays + 1 if agrees else 1
+        self._stray_ns = stamp_ns
         if self._strays >= CONFIRMATIONS:
             self._strays = 0
             return True

@@ -115,6 +115,14 @@ def test_stamps_at_the_limits_are_taken(stamp_ns):
     assert not queue.push(observation(stamp_ns))
 
 
+def test_stamps_that_do_not_agree_confirm_no_jump():
+    queue = make_queue(max_jump_ns=1000)
+    queue.push(velocity(START_NS))
+    for far_ns in (10**12, 3, 10**14, 7, 10**13, 10**15, 10**12, 10**14):
+        with pytest.raises(InvalidEventError):
+            queue.push(velocity(START_NS + far_ns if far_ns > 10 else far_ns - START_NS))
+
+
 @pytest.mark.parametrize('jump_ns', [10**15, -(10**15)])
 def test_a_jump_of_the_clock_is_believed_when_enough_events_agree(jump_ns):
     queue = filled(velocity(0))

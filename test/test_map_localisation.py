@@ -408,6 +408,49 @@ def test_a_robot_that_was_carried_away_finds_itself_again(caplog):
     assert np.linalg.norm(error) < 0.1
 
 
+@pytest.mark.parametrize('mode', ['uncertain', 'fixed'])
+def test_a_landmark_that_has_moved_does_not_make_the_robot_lost_when_it_is_alone_in_view(mode):
+    landmarks = np.array([[5, 0, 0], [5, 3, 1], [5, -3, 0.5], [-5, 0, 0], [-5, 2, 1], [-5, -2, 1]])
+    estimator = Estimator(Settings(localization_mode=mode, reorder_window=0.0))
+    ids, moved = np.arange(6), landmarks + np.repeat([[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]], 3, axis=0)
+    estimator.load_map(LandmarkMap(ids, landmarks, None, np.zeros(6, dtype=np.int64)), np.eye(4))
+    for step in range(21):
+        seen = ids[3:4] if step == 20 else ids if step < 10 else ids[:3]
+        estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+        estimator.add(ObservationEvent(step * 10**8, seen, moved[seen]))
+    assert estimator.is_localised
+    assert_allclose(estimator.pose, np.eye(4), atol=0.05)
+
+
+def test_the_landmarks_by_which_the_place_was_found_are_in_the_map():
+    landmarks = np.array([[5, 0, 0], [5, 3, 1], [5, -3, 0.5], [4, 1, 2], [3, 3, -1]])
+    estimator = Estimator(Settings(reorder_window=0.0))
+    estimator.load_map(LandmarkMap(np.arange(5), landmarks, None, np.zeros(5, dtype=np.int64)))
+    estimator.add(ObservationEvent(0, np.arange(3), landmarks[:3]))
+    assert estimator.is_localised
+    assert_array_equal(np.sort(estimator.landmark_ids), np.arange(5))
+
+
+@pytest.mark.parametrize('is_planar', [False, True])
+def test_of_many_landmarks_the_few_that_fit_by_chance_do_not_place_the_robot(is_planar):
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        own, other = rng.uniform(-10.0, 10.0, (2, 20, 3)) * [1.0, 1.0, not is_planar]
+        estimator = Estimator(Settings(two_d_mode=is_planar, reorder_window=0.0))
+        ids = np.arange(20)
+        estimator.load_map(LandmarkMap(ids, other, None, np.zeros(20, dtype=np.int64)))
+        estimator.add(ObservationEvent(0, ids, own))
+        assert not estimator.is_localised
+
+
+def test_a_pose_that_is_set_stays_in_the_plane():
+    estimator = Estimator(Settings(two_d_mode=True, reorder_window=0.0))
+    estimator.add(ObservationEvent(0, np.arange(2), np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]])))
+    estimator.set_pose(se3.exp(np.array([0.1, -0.2, 0.7, 1.0, 2.0, 3.0])))
+    assert_array_equal(estimator.pose[2], [0.0, 0.0, 1.0, 0.0])
+    assert_array_equal(estimator.pose[:2, 2], 0.0)
+
+
 def test_after_a_reset_the_place_in_the_map_is_found_again():
     world = World(15)
     estimator = Estimator(world.settings())
