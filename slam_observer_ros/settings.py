@@ -52,6 +52,7 @@ class Settings:
         'How long a velocity is held; after that the pose is held and flagged as stale',
         unit='s',
         minimum=1e-3,
+        maximum=3600.0,
     )
     reorder_window: float = parameter(
         0.05,
@@ -72,6 +73,7 @@ class Settings:
         'A stamp further ahead of all others than this is refused until others confirm it',
         unit='s',
         minimum=0.1,
+        maximum=1e9,
     )
     on_time_jump: str = parameter(
         'reset',
@@ -221,6 +223,7 @@ class Settings:
         'Points without id: how long a landmark with too few confirmations is kept while unseen',
         unit='s',
         minimum=0.0,
+        maximum=1e6,
     )
     max_hypotheses: int = parameter(
         8,

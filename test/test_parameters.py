@@ -51,6 +51,11 @@ rows_of_all_tables = pytest.mark.parametrize(
 )
 
 
+def test_a_time_in_nanoseconds_is_refused_where_seconds_are_meant():
+    for name in ('velocity_timeout', 'reorder_window', 'late_limit', 'support_timeout'):
+        assert name in error_text({name: 1e10}, Settings)
+
+
 @pytest.mark.parametrize('settings_class', TABLES)
 def test_each_field_is_a_row_of_the_table_and_the_other_way_round(settings_class):
     rows = table(settings_class)
