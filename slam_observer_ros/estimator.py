@@ -150,7 +150,7 @@ class Estimator:
         self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other gains from now on; parameters that are read-only keep their effect."""
+        """Use other gains from now on; only what may change while running may differ."""
         self.settings = settings
         self._frame.change_settings(settings)
 

@@ -62,7 +62,7 @@ class Timeline:
 
         """
         if self.stamp_ns is not None and event.stamp_ns < self.stamp_ns:
-            raise InvalidEventError('too_late', 'a newer velocity was already used')
+            raise InvalidEventError('too_late', 'a newer event was already used')
         self.velocities.append(event)
         self.begin(event.stamp_ns)
         self._pending += 1
