@@ -174,7 +174,7 @@ class Slam:
         moved = self._motion(velocities, start_ns, end_ns)
         self.observer.propagate(moved.path)
         self.observer.move_landmarks(float((moved.dt_s + moved.gap_s).sum()))
-        self.gains.predict(moved)
+        self.gains.predict(self.observer, moved)
         self._end_velocity = moved.at_ends[1]
 
     def _motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
@@ -370,6 +370,8 @@ class Slam:
             self.moved_ids = event.ids[moved]
         if far.any():
             self.observer.relocate_landmarks(rows[far], event.points[far])
+            if self.settings.landmark_velocity_error > 0.0:
+                self.observer.u[rows[far]] = 0.0
             y_ref = self.observer.y_ref[rows[far]]
             self.gains.relocate_landmarks(rows[far], y_ref, innovation.covariances[far])
             self.landmarks.restart(rows[far])

@@ -24,9 +24,11 @@ class Filter:
     def move(self, body_velocities, dt_s, covariances):
         path = self.observer.path(self.gains.calibration.apply(body_velocities), dt_s)
         self.observer.propagate(path)
+        self.observer.move_landmarks(float(np.sum(dt_s)))
         no_gaps = np.zeros(len(dt_s))
         at_ends = np.zeros((2, 6))
-        self.gains.predict(Motion(path, body_velocities, dt_s, no_gaps, covariances, at_ends))
+        motion = Motion(path, body_velocities, dt_s, no_gaps, covariances, at_ends)
+        self.gains.predict(self.observer, motion)
 
     def add(self, points, covariances):
         self.observer.add_landmarks(points)

@@ -90,6 +90,28 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     assert difference < 0.02 * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurely(two_d_mode):
+    velocity = np.array([[1.0, -2.0, 0.0 if two_d_mode else 0.5]])
+    start = np.array([[3.0, 1.0, 0.0]])
+    dt_s, V, Q = np.full(2, 0.5), np.zeros((2, 6)), np.tile(1e-3 * np.eye(6), (2, 1, 1))
+
+    def foretold(point, velocity):
+        """The covariance of the residual after two blind motions of a second each."""
+        settings = replace(PLAIN, two_d_mode=two_d_mode, landmark_velocity_error=1e-9)
+        slam = Filter(RiccatiGains(settings))
+        slam.add(point, np.zeros((1, 3, 3)))
+        slam.observer.set_landmark_velocities(np.array([0]), velocity)
+        slam.move(V, dt_s, Q)
+        slam.move(V, dt_s, Q)
+        indices = np.array([0])
+        innovation = slam.innovation(indices, slam.expected(indices), np.zeros((1, 3, 3)))
+        return slam.gains.foretold(innovation)[1]
+
+    at_rest = foretold(start + 2.0 * velocity, np.zeros((1, 3)))
+    np.testing.assert_allclose(foretold(start, velocity), at_rest, atol=1e-12)
+
+
 def test_prediction_costs_the_same_however_large_the_map():
     def peak_bytes(landmarks):
         slam, rng = Filter(RiccatiGains(PLAIN)), np.random.default_rng(0)

@@ -355,3 +355,25 @@ def test_all_landmarks_moved_together_are_followed_again(gains):
     assert estimator.counts['moved_landmark'] >= 1
     moved = replace(world, world_points=world.world_points + [6.0, 0.0, 0.0])
     assert configuration_error_m(estimator, moved) < 1.0
+
+
+def test_a_landmark_that_is_started_anew_may_move_otherwise_than_before():
+    settings = Settings(
+        landmark_velocity_error=0.1,
+        confirmations=1,
+        observation_model='cartesian',
+        point_noise=0.01,
+        reorder_window=0.0,
+    )
+    estimator = Estimator(settings)
+    estimator.add(VelocityEvent(0, np.zeros(6)))
+    fixed = np.array([[6.0, 2.0, 0.0], [6.0, -2.0, 1.0], [-5.0, 1.0, 0.0]])
+    for number in range(100):
+        driving = [4.0, 0.1 * number - 4.0, 0.0]
+        points = np.vstack([fixed, driving if number < 80 else [-3.0, 5.0, 0.0]])
+        estimator.add(ObservationEvent(number * 10**8, np.arange(4), points))
+        if number == 79:
+            np.testing.assert_allclose(estimator.landmark_velocities[3], [0, 1, 0], atol=0.1)
+        if estimator.counts['moved_landmark']:
+            break
+    np.testing.assert_array_equal(estimator.landmark_velocities[3], np.zeros(3))

@@ -86,8 +86,8 @@ class GainDesign(Protocol):
     def change_settings(self, settings: Settings) -> None:
         """Use the settings that may change while running."""
 
-    def predict(self, motion: Motion) -> None:
-        """Account for the noise of a motion."""
+    def predict(self, observer: Observer, motion: Motion) -> None:
+        """Account for the noise of a motion that has brought ``observer`` to where it is."""
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Account for landmarks (m, 3) whose first observation has ``covariances`` (m, 3, 3)."""

@@ -64,7 +64,7 @@ class ConstantGains:
         self.step_mode = settings.step_mode
         self.max_time_s = settings.max_innovation_time
 
-    def predict(self, motion: Motion) -> None:
+    def predict(self, observer: Observer, motion: Motion) -> None:
         """Do nothing: constant gains know no noise."""
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:

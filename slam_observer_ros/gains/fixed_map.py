@@ -40,7 +40,7 @@ class FixedMapGains(RiccatiGains):
         """(n, 3, 3) covariances of the landmarks, as the map has them."""
         return self._landmark_covariances
 
-    def predict(self, motion: Motion) -> None:
+    def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose's covariance."""
         predict(self._P, self._axes, self.calibration, motion)
 

@@ -104,17 +104,31 @@ class RiccatiGains:
         covariances[:, :k, :k] = self._P[columns[:, :, None], columns[:, None, :]]
         return covariances
 
-    def predict(self, motion: Motion) -> None:
+    def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
+        if self._is_moving:
+            self._predict_moving(observer, motion)
+            return
         noise, F = predict(self._P, self._axes, self.calibration, motion)
         if self.looks_back:
             self._hindsight.history.move(motion.path, noise, F, self.calibration.values)
-        if self._is_moving:
-            everything = np.arange(self._count)
-            a, u = self._columns(everything), self._velocity_columns(everything)
-            duration_s = np.sum(motion.dt_s + motion.gap_s)
-            self._P[a] += duration_s * self._P[u]
-            self._P[:, a] += duration_s * self._P[:, u]
+
+    def _predict_moving(self, observer: Observer, motion: Motion) -> None:
+        """Predict landmarks that move by ũ_i dt, then the robot at their end.
+
+        Its noise turns R_Ã in ã_i = â_i − R_Ã a_i and ũ_i = û_i − R_Ã u_i, and leaves
+        â_i − a_i = ã_i − [â_i]× ω and û_i − u_i = ũ_i − [û_i]× ω alone.
+        """
+        everything = np.arange(self._count)
+        a, u = self._columns(everything), self._velocity_columns(everything)
+        duration_s = np.sum(motion.dt_s + motion.gap_s)
+        self._P[a] += duration_s * self._P[u]
+        self._P[:, a] += duration_s * self._P[:, u]
+        columns = np.append(a, u)
+        vectors = np.concatenate([observer.a, observer.u])
+        self._turn(columns, vectors)
+        predict(self._P, self._axes, self.calibration, motion)
+        self._turn(columns, -vectors)
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks (m, 3) with room for them in P."""
@@ -284,11 +298,14 @@ class RiccatiGains:
         """
         if not observer.a.any():
             return
-        columns = self._map_columns
-        L = self._axes.turn_matrix(observer.a).reshape(-1, self._p)
+        self._turn(self._map_columns, observer.a)
+        observer.rebase(observer.A, observer.y_ref + observer.a)
+
+    def _turn(self, columns: IntArray | slice, vectors: FloatArray) -> None:
+        """Make errors x_i at ``columns`` x_i − [y_i]× ω, for ``vectors`` y (m, 3)."""
+        L = self._axes.turn_matrix(vectors).reshape(-1, self._p)
         self._P[columns] += L @ self._P[: self._p]
         self._P[:, columns] += self._P[:, : self._p] @ L.T
-        observer.rebase(observer.A, observer.y_ref + observer.a)
 
     @property
     def looks_back(self) -> bool:

@@ -88,7 +88,7 @@ class ScheduledGains:
         variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
         return variances
 
-    def predict(self, motion: Motion) -> None:
+    def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the core's covariance."""
         self._core.predict(motion)
 
