@@ -325,6 +325,26 @@ def test_bad_parameter_at_the_start_is_refused_with_the_reason(ros, tmp_path):
     assert 'Traceback' not in node.output
 
 
+def test_misspelt_parameter_is_refused_with_the_one_that_may_be_meant(ros, tmp_path):
+    file = tmp_path / 'robot.yaml'
+    file.write_text('/**: {ros__parameters: {velocity_timeot: 1.0}}')
+    for name in ('observer_node', 'lifecycle_observer_node'):
+        node = NodeProcess(name, tmp_path / name, '--params-file', str(file))
+        assert node.wait() == 2
+        assert "'velocity_timeot'; did you mean 'velocity_timeout'?" in node.output
+        assert 'Traceback' not in node.output
+
+
+def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path):
+    file = tmp_path / 'robot.yaml'
+    file.write_text('/**: {ros__parameters: {base_frame_id: body, wheel: {radius: 0.1}}}')
+    arguments = ('--params-file', str(file), '-r', '__ns:=/shared')
+    with running('observer_node', tmp_path / 'log', *arguments, use_sim_time=False) as node:
+        node.wait_for_output('estimating')
+        assert node.output.count('WARN') == 1
+        assert 'ignored: base_frame_id, wheel.radius\n' in node.output
+
+
 def test_large_ids_are_warned_about(ros, observer):
     maps = ros.collect(PointCloud2, 'map', LATCHED_QOS)
     large_id = 2**32 - 2

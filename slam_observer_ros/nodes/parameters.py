@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+import difflib
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -18,9 +19,18 @@ from slam_observer_ros.parameters import Dataclass, from_parameters, Parameter, 
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
+MISSPELT = 0.9
+"""Likeness from which a name is one of ours misspelt: one letter wrong.
+
+The names of other nodes, which may share the parameter file, come near, too: ``base_frame_id`` is
+0.87 like ``base_frame``.
+"""
+
 
 def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
     """Declare every row of the settings' tables; from then on each change is checked.
+
+    Names that are set but in no table are ignored with a warning: they may be other nodes'.
 
     Parameters
     ----------
@@ -31,10 +41,14 @@ def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
 
     Raises
     ------
+    ParameterError
+        If the command line or a parameter file sets a name that is one of ours misspelt.
     InvalidParameterValueException
         If a value from the command line or a parameter file does not fit its row.
 
     """
+    rows = [row for settings_class in settings_classes for row in table(settings_class)]
+    _check_names(node, [row.name for row in rows])
 
     def check(changes: Sequence[RosParameter]) -> SetParametersResult:
         try:
@@ -45,9 +59,8 @@ def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
-    for settings_class in settings_classes:
-        for row in table(settings_class):
-            node.declare_parameter(row.name, row.default, descriptor(row))
+    for row in rows:
+        node.declare_parameter(row.name, row.default, descriptor(row))
 
 
 def read_settings(node: Node, settings_class: type[SettingsT]) -> SettingsT:
@@ -83,6 +96,21 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
             )
         ]
     return result
+
+
+def _check_names(node: Node, names: Collection[str]) -> None:
+    """Raise ParameterError if a name that is set is misspelt; warn of those that are unlike."""
+    ignored = []
+    # rclpy, unlike rclcpp, has no public name for what the command line and files set.
+    for name in sorted(node._parameter_overrides):
+        is_of_ros = node.has_parameter(name) or name.startswith('qos_overrides.')
+        if is_of_ros or name in names:
+            continue
+        if near := difflib.get_close_matches(name, names, n=1, cutoff=MISSPELT):
+            raise ParameterError(f"unknown parameter '{name}'; did you mean '{near[0]}'?")
+        ignored.append(name)
+    if ignored:
+        node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
 
 
 def _check_changes(
