@@ -103,6 +103,17 @@ def test_what_can_not_be_configured_stays_unconfigured_until_it_can(ros, tmp_pat
         assert manager.state == State.PRIMARY_STATE_INACTIVE
 
 
+def test_a_transition_that_the_state_does_not_allow_is_refused(ros, tmp_path):
+    manager = Manager(ros, '/hasty/observer_node')
+    with running('lifecycle_observer_node', tmp_path / 'log', '-r', '__ns:=/hasty') as node:
+        assert not manager.change(Transition.TRANSITION_ACTIVATE)
+        node.wait_for_output('WARN.*transition.*unconfigured')
+        assert manager.state == State.PRIMARY_STATE_UNCONFIGURED
+        assert manager.change(Transition.TRANSITION_CONFIGURE)
+        assert manager.change(Transition.TRANSITION_ACTIVATE)
+        assert manager.state == State.PRIMARY_STATE_ACTIVE
+
+
 def test_two_robots_on_one_machine_do_not_hear_each_other(ros, tmp_path):
     odometry = {name: ros.collect(Odometry, f'/{name}/odometry') for name in ('left', 'right')}
     transforms = {

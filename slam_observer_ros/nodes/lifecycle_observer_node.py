@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from slam_observer_ros.errors import SlamObserverError
@@ -28,6 +30,7 @@ class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes
         forward_logging(self.get_logger())
         declare_settings(self, Settings, ObserverNodeSettings)
         self._core: ObserverCore | None = None
+        self._refuse_impossible_transitions()
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Create all parts."""
@@ -66,6 +69,21 @@ class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes
         """End, whatever the state."""
         self._close()
         super().destroy_node()
+
+    def _refuse_impossible_transitions(self) -> None:
+        """Answer no to what the state does not allow; rclpy would end with a traceback."""
+        service = next(each for each in self.services if each.srv_type.__name__ == 'ChangeState')
+        change = service.callback
+
+        def change_if_possible(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except rclpy_implementation.RCLError:
+                # rcl itself has logged a warning that names transition and state.
+                response.success = False
+                return response
+
+        service.callback = change_if_possible
 
     def _close(self) -> None:
         core, self._core = self._core, None
