@@ -11,7 +11,6 @@ import sys
 from typing import Any, NoReturn
 
 from slam_observer_ros import __version__
-from slam_observer_ros.commands import convert, replay, simulate
 from slam_observer_ros.commands.console import MessageHandler, PROGRAM, show_message
 from slam_observer_ros.errors import SlamObserverError
 
@@ -53,6 +52,9 @@ class Parser(argparse.ArgumentParser):
 
 def make_parser() -> Parser:
     """Return the parser of the whole command line."""
+    # These take a second to load. Here, Ctrl-C meanwhile is handled as it is at any other time.
+    from slam_observer_ros.commands import convert, replay, simulate
+
     parser = Parser(
         prog=PROGRAM,
         description='The SLAM observer of Mahony and Hamel on simulations and recordings.',
@@ -77,9 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
+        args = make_parser().parse_args(arguments)
         # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
         signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(EXIT_SIGNAL + number))
-        args = make_parser().parse_args(arguments)
         args.run(args)
         sys.stdout.flush()
     except (SlamObserverError, OSError) as error:

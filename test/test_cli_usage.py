@@ -139,6 +139,21 @@ def test_stopped_in_the_middle(tmp_path, stop):
     assert not list(tmp_path.iterdir())
 
 
+def test_interrupted_while_modules_load(tmp_path):
+    (tmp_path / 'numpy.py').write_text('import signal\nsignal.raise_signal(signal.SIGINT)\n')
+    search_path = os.pathsep.join([str(tmp_path), os.environ.get('PYTHONPATH', '')])
+    ended = subprocess.run(
+        [*COMMAND, 'simulate'],
+        cwd=CHECKOUT,
+        env=os.environ | {'PYTHONPATH': search_path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, '', '')
+
+
 def test_reader_that_leaves_early():
     reading, writing = os.pipe()
     os.close(reading)
