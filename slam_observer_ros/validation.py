@@ -49,7 +49,10 @@ def _check_observation(event: ObservationEvent) -> None:
     if known and min(known) < 0:
         raise InvalidEventError('negative_id', f'landmark id {min(known)} is negative')
     if len(set(known)) != len(known):
-        raise InvalidEventError('repeated_id', 'one observation has the same landmark id twice')
+        repeated = next(landmark_id for landmark_id in known if known.count(landmark_id) > 1)
+        raise InvalidEventError(
+            'repeated_id', f'landmark id {repeated} is more than once in one observation'
+        )
     if event.covariances is not None:
         _check_array('landmark covariances', event.covariances, (m, 3, 3))
         _check_definite('landmark covariances', event.covariances)

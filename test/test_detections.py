@@ -46,6 +46,14 @@ def test_detections_have_the_number_in_their_id_or_class():
     assert event.covariances is None, 'not all are known'
 
 
+def test_what_was_not_measured_is_left_out():
+    unmeasured = (np.nan, 0.0, 0.0)
+    event = detections(detector.detection('17', centre=unmeasured), detector.detection('18'))
+    assert_array_equal(event.ids, [18])
+    raw = ros.serialise(detector.pose_array([unmeasured, (1.0, 2.0, 3.0)], 'camera'))
+    assert_array_equal(decode_pose_array(raw).event.points, [[1.0, 2.0, 3.0]])
+
+
 def test_detections_keep_their_covariances():
     covariance = np.array([[3.0, 0.5, 0.1], [0.5, 2.0, 0.2], [0.1, 0.2, 1.0]])
     event = detections(
@@ -60,6 +68,9 @@ def test_apriltag_detections_give_ids_and_families():
     assert decoded.ids == (5, 12)
     assert decoded.families == ('tag36h11', 'tag16h5')
     assert (decoded.frame_id, decoded.stamp_ns) == ('camera', ros.STAMP_NS)
+    negative = detector.apriltags([('tag36h11', 5), ('tag36h11', -3)], 'camera')
+    with pytest.raises(MessageError, match='negative tag id -3'):
+        decode_apriltags(ros.serialise(negative))
 
 
 def test_fiducials_on_tf_are_told_by_their_names():

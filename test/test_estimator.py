@@ -210,6 +210,11 @@ def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason,
     assert_same_state(estimator, untouched)
 
 
+def test_an_id_that_is_repeated_is_named(caplog):
+    Estimator(Settings()).add(observation(0.0, [4, 1, 2, 1]))
+    assert 'repeated_id, 1 so far): landmark id 1 is more than once' in caplog.text
+
+
 def test_one_stray_stamp_is_refused_but_a_clock_that_jumped_is_followed():
     estimator = run(drive())
     jumped = [velocity(5000.0 + 0.05 * step) for step in range(20)]

@@ -325,18 +325,31 @@ class TestPointCloud2:
         points = np.full((1, 2), 0, [*POINT_TYPE.descr[:3], ('id', id_type)])
         points['y'] = signalling_nan
         event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(points))).event
-        assert np.isnan(event.points[:, 1]).all()
+        assert event.points.shape == (0, 3)
         cloud = ros.point_cloud(np.full((1, 3), signalling_nan), {})
-        assert np.isnan(point_clouds.decode_point_cloud(ros.serialise(cloud)).event.points).all()
+        event = point_clouds.decode_point_cloud(ros.serialise(cloud)).event
+        assert event.points.shape == (0, 3)
 
-    def test_unmeasured_points_of_a_cloud_that_is_not_dense_are_left_out(self):
-        cloud = records(POINT_TYPE)
-        cloud['y'][0, 1] = np.nan
-        sparse = ros.serialise(ros.point_cloud2(cloud, is_dense=False))
-        assert messages.decode_point_cloud2(sparse).event.ids.tolist() == [7, 9]
-        # A cloud that claims to be dense is passed on: the estimator refuses it, and counts it.
-        dense = ros.serialise(ros.point_cloud2(cloud))
-        assert np.isnan(messages.decode_point_cloud2(dense).event.points).any()
+    @pytest.mark.parametrize('is_dense', [True, False])
+    @pytest.mark.parametrize('unmeasured', [np.nan, np.inf, -np.inf])
+    def test_unmeasured_points_are_left_out_and_the_others_used(self, is_dense, unmeasured):
+        names = [*point_clouds.COVARIANCE_NAMES, *point_clouds.VELOCITY_NAMES]
+        cloud = records(np.dtype([*POINT_TYPE.descr, *((name, '<f4') for name in names)]))
+        whole = ros.serialise(ros.point_cloud2(cloud))
+        cloud['y'][0, 1] = unmeasured
+        sparse = ros.serialise(ros.point_cloud2(cloud, is_dense=is_dense))
+        event = messages.decode_point_cloud2(sparse).event
+        expected = messages.decode_point_cloud2(whole).event.select(np.array([True, False, True]))
+        assert event.ids.tolist() == [7, 9]
+        for name in ('points', 'covariances', 'velocities'):
+            np.testing.assert_array_equal(getattr(event, name), getattr(expected, name))
+
+    def test_unmeasured_points_of_a_point_cloud_are_left_out(self):
+        points = np.array([[1.0, 2.0, 3.0], [np.nan] * 3, [4.0, 5.0, 6.0]])
+        raw = ros.serialise(ros.point_cloud(points, {'id': np.array([7, 8, 9])}))
+        event = messages.decode_point_cloud(raw).event
+        assert event.ids.tolist() == [7, 9]
+        np.testing.assert_array_equal(event.points, points[[0, 2]])
 
     @pytest.mark.parametrize(
         ('fields', 'reason'),

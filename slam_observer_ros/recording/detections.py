@@ -17,7 +17,7 @@ from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.recording.cdr import Buffer, CdrReader
 from slam_observer_ros.recording.messages import ObservationDecoder, PoseMessage
-from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.recording.point_clouds import measured, ObservationMessage
 from slam_observer_ros.types import FloatArray
 
 APRILTAGS_TYPE = 'apriltag_msgs/msg/AprilTagDetectionArray'
@@ -59,7 +59,7 @@ def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMes
     poses = reader.float64(_POSE * reader.uint32()).reshape(-1, _POSE)
     reader.finish()
     ids = np.full(len(poses), UNKNOWN_ID, dtype=np.int64)
-    return ObservationMessage(frame_id, ObservationEvent(stamp_ns, ids, poses[:, :3]))
+    return ObservationMessage(frame_id, measured(ObservationEvent(stamp_ns, ids, poses[:, :3])))
 
 
 def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
@@ -77,7 +77,8 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMes
     points = np.array([point for _, point, _ in detections]).reshape(-1, 3)
     known = [covariance for _, _, covariance in detections if covariance.any()]
     covariances = np.array(known) if known and len(known) == len(detections) else None
-    return ObservationMessage(frame_id, ObservationEvent(stamp_ns, ids, points, covariances))
+    event = ObservationEvent(stamp_ns, ids, points, covariances)
+    return ObservationMessage(frame_id, measured(event))
 
 
 def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:
@@ -176,5 +177,5 @@ def _read_apriltag(reader: CdrReader) -> tuple[int, str]:
     reader.float32(2)  # goodness, decision margin
     reader.float64(_CORNERS + _HOMOGRAPHY)
     if landmark_id >= 2**31:
-        raise MessageError('negative tag id')
+        raise MessageError(f'negative tag id {landmark_id - 2**32}')
     return landmark_id, family

@@ -25,7 +25,7 @@ from slam_observer_ros.recording.point_cloud_layout import (
     UNKNOWN_UINT32_ID,
     VELOCITY_NAMES,
 )
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 MAX_UNKNOWN_POINTS = 500
 """Most points without id in a message: telling them apart costs their number cubed."""
@@ -87,7 +87,7 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMe
                 raise MessageError(f'{len(values)} ids for {len(points)} points')
             ids = _ids_from_floats(values)
     reader.finish()
-    return ObservationMessage(frame_id, ObservationEvent(stamp_ns, ids, points))
+    return ObservationMessage(frame_id, measured(ObservationEvent(stamp_ns, ids, points)))
 
 
 def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
@@ -95,7 +95,8 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationM
 
     ``id`` gives the landmark ids; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per
     point in the axes of the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s.
-    A cloud that isn't dense marks points that weren't measured by NaN; those are left out.
+    Points that weren't measured, which are NaN or infinite, are left out, whether or not the
+    cloud claims to be dense.
 
     Parameters
     ----------
@@ -120,14 +121,20 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationM
     byte_order = '>' if reader.uint8() else '<'
     point_step, row_step = reader.uint32(), reader.uint32()
     data = reader.data(reader.uint32())
-    is_dense = bool(reader.uint8())
+    reader.uint8()  # is_dense, which many publishers set for clouds that are not.
     reader.finish()
     if height * width == 0:
         nothing = ObservationEvent(stamp_ns, np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
         return ObservationMessage(frame_id, nothing)
     dtype = _record_type(fields, byte_order, point_step)
     records = _records(data, dtype, height, width, row_step)
-    return ObservationMessage(frame_id, _observation(stamp_ns, records, is_dense))
+    return ObservationMessage(frame_id, measured(_observation(stamp_ns, records)))
+
+
+def measured(event: ObservationEvent) -> ObservationEvent:
+    """Return an observation without the points that are NaN or infinite: they weren't measured."""
+    is_measured: BoolArray = np.all(np.isfinite(event.points), axis=1)
+    return event.select(is_measured)
 
 
 def scan_trouble(event: ObservationEvent) -> str:
@@ -243,7 +250,7 @@ def _records(
     return records
 
 
-def _observation(stamp_ns: int, records: Records, is_dense: bool) -> ObservationEvent:
+def _observation(stamp_ns: int, records: Records) -> ObservationEvent:
     points = _columns(records, POINT_NAMES)
     covariances = velocities = None
     if COVARIANCE_NAMES[0] in _names(records):
@@ -252,17 +259,7 @@ def _observation(stamp_ns: int, records: Records, is_dense: bool) -> Observation
             covariances = upper_triangles[:, _UPPER_TRIANGLE_TO_MATRIX].reshape(-1, 3, 3)
     if VELOCITY_NAMES[0] in _names(records):
         velocities = _columns(records, VELOCITY_NAMES)
-    ids = _ids(records)
-    if is_dense:
-        return ObservationEvent(stamp_ns, ids, points, covariances, velocities)
-    measured = ~np.isnan(points).any(axis=1)
-    return ObservationEvent(
-        stamp_ns,
-        ids[measured],
-        points[measured],
-        None if covariances is None else covariances[measured],
-        None if velocities is None else velocities[measured],
-    )
+    return ObservationEvent(stamp_ns, _ids(records), points, covariances, velocities)
 
 
 def _names(records: Records) -> tuple[str, ...]:
