@@ -41,7 +41,10 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
             'with fiducials',
         ),
         ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
-        ('--pose-truth-topic', 'true pose'),
+        (
+            '--pose-truth-topic',
+            'true pose: PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry',
+        ),
         ('--landmark-truth-topic', 'true landmarks'),
     ):
         topics.add_argument(option, metavar='TOPIC', help=what)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+import logging
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.recording.detections import (
@@ -36,6 +37,8 @@ TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
 
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 IMU_TYPE = 'sensor_msgs/msg/Imu'
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +146,30 @@ def select_topics(
         return _required(pick(role, name), role, used)
 
     is_of_poses = inputs.velocity_source == POSE_DIFFERENCES
-    return SelectedTopics(
+    selected = SelectedTopics(
         require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity),
         require(*_landmark_choice(names.landmarks, inputs.landmarks_type)),
         pick(_POSE_TRUTH, names.pose_truth),
         pick(_LANDMARK_TRUTH, names.landmark_truth),
         require(_IMU, names.imu) if inputs.use_imu else None,
     )
+    if selected.pose_truth is None:
+        _warn_of_unread_truth(used)
+    return selected
+
+
+def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:
+    """Say why what looks like true poses is passed over."""
+    read = (*_POSE_TRUTH.message_types, *_LANDMARK_TRUTH.message_types)
+    unread = [
+        topic for topic in topics if _is_truth(topic.name) and topic.message_type not in read
+    ]
+    if unread:
+        _logger.warning(
+            'Named like ground truth, but not of a type that true poses are read of (%s): %s.',
+            _join(_POSE_TRUTH.message_types),
+            _join(unread),
+        )
 
 
 def _velocity_rank(name: str) -> int:
