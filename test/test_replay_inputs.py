@@ -268,6 +268,61 @@ class TestVelocities:
         assert "'velocity_source' takes one of twist, pose_differences" in error
 
 
+class TestZeroStamps:
+    """What publishers leave unstamped has its receive time, as in the live node."""
+
+    @pytest.mark.parametrize('options', [(), ('--imu', '/imu/data')])
+    @pytest.mark.parametrize('source', ['twist', 'pose_differences'])
+    def test_a_drive_without_stamps_replays_as_one_with(
+        self, slam_observer, tmp_path, source, options
+    ):
+        reports = {}
+        for is_stamped in (True, False):
+            path = tmp_path / f'{is_stamped}.mcap'
+            with RecordingWriter(path) as writer:
+                for received_ns in stamps_ns():
+                    self.write(Drive(writer), received_ns, received_ns if is_stamped else 0)
+            ended = slam_observer('replay', path, '--json', '--velocity-source', source, *options)
+            reports[is_stamped] = ended.json
+            del reports[is_stamped]['seconds']
+        assert reports[True]['ate_rmse_m'] < 1e-3
+        assert reports[False] == reports[True]
+        assert ended.errors.count('slam-observer: warning: ') == 1
+        assert 'Stamps are zero on /odom, /landmarks' in ended.errors.replace('/imu/data, ', '')
+
+    def write(self, drive, received_ns, stamp_ns):
+        pose = true_pose(received_ns)
+        odometry = ros.odometry(
+            V, np.zeros((6, 6)), pose[:3, 3], so3.to_quaternion(pose[:3, :3]), stamp_ns=stamp_ns
+        )
+        drive.write('/odom', odometry, received_ns)
+        drive.write('/ground_truth/pose', odometry, received_ns)
+        imu = ros.imu(V[:3], np.zeros((3, 3)), 'base_link', stamp_ns)
+        drive.write('/imu/data', imu, received_ns)
+        seen = ObservationEvent(stamp_ns, IDS, seen_by_base(received_ns))
+        drive.writer.write_observation(seen, receive_stamp_ns=received_ns)
+
+
+@pytest.mark.parametrize('has_pose', [True, False])
+def test_truth_of_a_type_that_is_not_read_is_told(slam_observer, tmp_path, has_pose):
+    path = tmp_path / 'path.mcap'
+    with RecordingWriter(path) as writer:
+        for stamp_ns in stamps_ns():
+            writer.write_velocity(VelocityEvent(stamp_ns, V))
+            Drive(writer).landmarks(stamp_ns)
+            if has_pose:
+                writer.write_pose(PoseTruth(stamp_ns, true_pose(stamp_ns)))
+        true_path = ros.make('nav_msgs/msg/Path', ros.header('world'), [])
+        Drive(writer).write('/ground_truth/path', true_path, ros.STAMP_NS)
+    errors = slam_observer('replay', path).errors
+    if has_pose:
+        assert errors == ''
+    else:
+        assert errors.count('\n') == 1
+        assert 'not of a type that true poses are read of (geometry_msgs/msg/Pose' in errors
+        assert '/ground_truth/path (nav_msgs/msg/Path, 1 messages)' in errors
+
+
 def test_the_base_frame_of_the_nodes_file_counts(slam_observer, tmp_path):
     path, config = tmp_path / 'run.mcap', tmp_path / 'robot.yaml'
     base_in_wheels = pose_from_rpy((0.5, 0.0, 0.0, 0.0, 0.0, 0.0))

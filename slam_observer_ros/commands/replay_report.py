@@ -127,11 +127,20 @@ def outcome_of(
             rotation_rmse_rad=accuracy.pose_errors.rotation_rmse_rad,
             heading_rmse_rad=accuracy.pose_errors.heading_rmse_rad,
         )
-    if result.estimator.newest_stamp_ns == 0:
-        logger.warning('All stamps are zero: the publishers do not fill in header.stamp.')
+    _warn_of_missing_stamps(recording)
     _warn_of_unknown_ids(result)
     _warn_of_unused_poses(recording, selected, result)
     return Outcome(result, truth, accuracy, report, recording.missing_ids(selected.landmarks))
+
+
+def _warn_of_missing_stamps(recording: Recording) -> None:
+    """Say which times were used, if publishers don't fill in header.stamp."""
+    if recording.unstamped:
+        logger.warning(
+            'Stamps are zero on %s; %d messages have the time of their reception instead.',
+            ', '.join(recording.unstamped),
+            recording.unstamped.total(),
+        )
 
 
 def _warn_of_unknown_ids(result: Replay) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
@@ -64,8 +65,9 @@ def decode_landmarks(raw: RawMessage) -> ObservationMessage:
 
 
 def decode_pose(raw: RawMessage) -> PoseMessage:
-    """Decode a pose."""
-    return POSE_DECODERS[raw.topic.message_type](raw.data)
+    """Decode a pose; it has its receive time if its publisher left the stamp out."""
+    message = POSE_DECODERS[raw.topic.message_type](raw.data)
+    return replace(message, stamp_ns=message.stamp_ns or raw.receive_stamp_ns)
 
 
 def decode_transform_message(raw: RawMessage) -> list[PoseMessage]:

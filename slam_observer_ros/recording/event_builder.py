@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import logging
 from typing import TypeAlias
 
@@ -35,6 +35,22 @@ class _Waiting:
 
     deadline_ns: int
     measured: _InFrame
+
+
+def with_receive_time(measured: Measured, receive_stamp_ns: int) -> Measured:
+    """Return a measurement with the time of its reception if its publisher left the stamp out.
+
+    Fiducials keep theirs, which /tf has as well.
+    """
+    if isinstance(measured, TagDetections):
+        return measured
+    if isinstance(measured, ImuMessage | PoseMessage):
+        return measured if measured.stamp_ns else replace(measured, stamp_ns=receive_stamp_ns)
+    if measured.event.stamp_ns:
+        return measured
+    if isinstance(measured, VelocityMessage):
+        return replace(measured, event=replace(measured.event, stamp_ns=receive_stamp_ns))
+    return replace(measured, event=replace(measured.event, stamp_ns=receive_stamp_ns))
 
 
 class EventBuilder:

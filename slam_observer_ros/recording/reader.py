@@ -24,7 +24,12 @@ from slam_observer_ros.recording.decoding import (
     input_decoders,
 )
 from slam_observer_ros.recording.detections import POSE_ARRAY_TYPE
-from slam_observer_ros.recording.event_builder import EventBuilder, NO_TRANSFORM
+from slam_observer_ros.recording.event_builder import (
+    EventBuilder,
+    Measured,
+    NO_TRANSFORM,
+    with_receive_time,
+)
 from slam_observer_ros.recording.frames import BaseFrame, insert_transforms
 from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.messages import LANDMARK_DECODERS
@@ -62,6 +67,8 @@ class Recording:
         Messages that could not be decoded so far, by topic; the first of each is logged.
     dropped : Counter
         Measurements that did not become events so far, by reason; the first is logged.
+    unstamped : Counter
+        Measurements without stamp so far, by topic.
 
     """
 
@@ -71,6 +78,7 @@ class Recording:
         self.topics = self._source.topics
         self.malformed: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.unstamped: Counter[str] = Counter()
         if self.message_count == 0:
             self.close()
             raise RecordingError(f'{path}: the recording is empty')
@@ -134,8 +142,9 @@ class Recording:
 
         They come in the order in which they were received; what waits for a transform on /tf
         comes when that has been received, or is dropped after the timeout. Stamps are those of
-        the messages' headers; an unstamped Twist has its receive time. Malformed messages are
-        left out and counted in :attr:`malformed`, what was dropped in :attr:`dropped`.
+        the messages' headers; an unstamped Twist has its receive time, and so has what leaves its
+        stamp zero, which is counted in :attr:`unstamped`. Malformed messages are left out and
+        counted in :attr:`malformed`, what was dropped in :attr:`dropped`.
 
         Parameters
         ----------
@@ -166,7 +175,7 @@ class Recording:
             yield from builder.retry(raw.receive_stamp_ns)
             if raw.topic in decoders:
                 for measured in self._decoded(raw, decoders[raw.topic]) or ():
-                    yield from builder.add(measured, raw.receive_stamp_ns)
+                    yield from builder.add(self._timed(measured, raw), raw.receive_stamp_ns)
         yield from builder.finish()
 
     def frames(
@@ -226,6 +235,12 @@ class Recording:
                 _logger.warning('%s: malformed message on %s: %s', self.path, raw.topic, error)
             self.malformed[raw.topic.name] += 1
             return None
+
+    def _timed(self, measured: Measured, raw: RawMessage) -> Measured:
+        timed = with_receive_time(measured, raw.receive_stamp_ns)
+        if timed is not measured:
+            self.unstamped[raw.topic.name] += 1
+        return timed
 
     def _all_decoded(
         self, topic: Topic | None, decode: Callable[[RawMessage], _Decoded]
