@@ -290,6 +290,13 @@ class TestZeroStamps:
         assert ended.errors.count('slam-observer: warning: ') == 1
         assert 'Stamps are zero on /odom, /landmarks' in ended.errors.replace('/imu/data, ', '')
 
+    def test_where_time_begins_at_zero_zero_is_a_stamp(self, slam_observer, tmp_path):
+        path = tmp_path / 'simulated.mcap'
+        with RecordingWriter(path) as writer:
+            for stamp_ns in range(0, STEPS * STEP_NS, STEP_NS):
+                self.write(Drive(writer), stamp_ns, stamp_ns)
+        assert slam_observer.succeed('replay', path, '--json').json['dropped'] == {}
+
     def write(self, drive, received_ns, stamp_ns):
         pose = true_pose(received_ns)
         odometry = ros.odometry(
@@ -340,6 +347,24 @@ def test_the_base_frame_of_the_nodes_file_counts(slam_observer, tmp_path):
         trajectory = read_tum(poses)
         expected = se3.inverse(start_in_wheels) @ true_pose(trajectory.stamps_ns[-1])
         assert_allclose(trajectory.poses[-1], expected @ start_in_wheels, atol=1e-3)
+
+
+@pytest.mark.parametrize(('base', 'is_right'), [('base_link', True), ('chassis', False)])
+def test_velocities_without_a_frame_are_those_of_base_link(
+    slam_observer, tmp_path, base, is_right
+):
+    path, poses = tmp_path / 'run.mcap', tmp_path / 'run.tum'
+    with RecordingWriter(path) as writer:
+        drive = Drive(writer)
+        drive.transforms('/tf_static', ros.STAMP_NS, (base, 'camera', CAMERA, ros.STAMP_NS))
+        for stamp_ns in stamps_ns():
+            drive.write('/cmd_vel', ros.twist(V.tolist()), stamp_ns)
+            drive.landmarks(stamp_ns, CAMERA, 'camera')
+    done = slam_observer('replay', path, '--tum', poses)
+    assert ("'camera', the landmarks' frame, is taken for the robot" in done.errors) != is_right
+    trajectory = read_tum(poses)
+    position = true_pose(trajectory.stamps_ns[-1])[:3, 3]
+    assert (np.linalg.norm(trajectory.positions[-1] - position) < 0.01) == is_right
 
 
 def test_velocities_of_the_odometrys_own_frame_do_not_make_it_the_base(tmp_path):

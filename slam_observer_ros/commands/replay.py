@@ -104,6 +104,7 @@ def run(args: argparse.Namespace) -> None:
         selected = recording.find_topics(topic_names(args), inputs)
         inputs = with_base_frame(inputs, recording, selected)
         truth = recording.truth(selected)
+        truth = truth.flattened() if settings.two_d_mode else truth
         events = show_progress(
             recording.events(selected, inputs, settings.velocity_timeout),
             'replaying',

@@ -60,7 +60,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         '--base-frame',
         metavar='FRAME',
         help='frame whose pose is estimated; other sensors are placed in it by /tf and '
-        '/tf_static (default: that of the velocities)',
+        '/tf_static (default: that of the velocities, or base_link if they name none)',
     )
     inputs.add_argument(
         '--tag-frame-prefix',
@@ -122,9 +122,23 @@ def warn_of_unused(args: argparse.Namespace) -> None:
 def with_base_frame(
     inputs: InputSettings, recording: Recording, selected: SelectedTopics
 ) -> InputSettings:
-    """Name the base frame, if the user doesn't: that of the velocities, or of the landmarks."""
+    """Name the base frame, if the user doesn't: that of the velocities.
+
+    If they name none it is the node's, if /tf has that; else, with a warning, the landmarks'.
+    """
     if inputs.base_frame:
         return inputs
-    world = ('', inputs.map_frame, inputs.odom_frame)
-    frames = (name for name in recording.frames(selected, inputs) if name not in world)
-    return dataclasses.replace(inputs, base_frame=next(frames, ''))
+    world, default = ('', inputs.map_frame, inputs.odom_frame), InputSettings().base_frame
+    velocity_frame, base_frame = recording.frames(selected, inputs)
+    if velocity_frame not in world:
+        base_frame = velocity_frame
+    elif base_frame not in (*world, default):
+        if recording.places(default):
+            base_frame = default
+        else:
+            logger.warning(
+                "The velocities don't say whose they are: '%s', the landmarks' frame, is taken "
+                'for the robot; --base-frame names another.',
+                base_frame,
+            )
+    return dataclasses.replace(inputs, base_frame='' if base_frame in world else base_frame)

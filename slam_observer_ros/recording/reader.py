@@ -189,6 +189,17 @@ class Recording:
         velocity_frame = self._frame(selected.velocity, decoders[selected.velocity])
         return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
 
+    def places(self, frame: str) -> bool:
+        """Tell whether /tf_static or /tf has a frame."""
+        topics = [*self._transform_topics('/tf_static'), *self._transform_topics('/tf')]
+        for raw in self._source.messages(topics):
+            with suppress(MessageError):
+                for transform in decode_transform_message(raw):
+                    names = transform.frame_id, transform.child_frame_id
+                    if frame in (name.lstrip('/') for name in names):
+                        return True
+        return False
+
     def missing_ids(self, topic: Topic) -> str:
         """Tell whether a landmark topic's points have no ids, and what they have; else empty."""
         if topic.message_type == POSE_ARRAY_TYPE:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,14 @@ class Truth:
     ) -> Truth:
         """Gather poses of any order, and landmarks of which the last position counts."""
         return cls(*_gathered_poses(list(poses)), _gathered_landmarks(landmarks))
+
+    def flattened(self) -> Truth:
+        """Return it with the landmarks at the robot's height, where a planar map has them."""
+        if self.landmarks is None:
+            return self
+        points = self.landmarks.world_points.copy()
+        points[:, 2] = np.median(self.poses[:, 2, 3]) if len(self.poses) else 0.0
+        return replace(self, landmarks=replace(self.landmarks, world_points=points))
 
 
 def _gathered_poses(messages: Sequence[PoseMessage]) -> tuple[IntArray, FloatArray]:
