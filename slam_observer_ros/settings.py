@@ -176,7 +176,8 @@ class Settings:
     )
     calibration_drift: float = parameter(
         0.0,
-        'How fast what is estimated of these drifts, as a share of its standard deviation',
+        'How fast what is estimated of these drifts, as a share of its standard deviation; '
+        'above 0 Riccati gains do not look back',
         unit='1/√s',
         minimum=0.0,
     )

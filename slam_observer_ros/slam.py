@@ -230,6 +230,9 @@ class Slam:
             self.counts['unknown_id'] += unknown
             self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
         event, rows, covariances = sighting.event, sighting.rows, sighting.covariances
+        if self._must_make_room(rows):
+            # A history without the forgotten landmarks would lose what they have told of the pose.
+            self.gains.restart(self.observer)
         known, used = rows >= 0, np.ones(len(rows), dtype=np.bool_)
         ids = event.ids[known]
         used[known] = self._innovate(event.select(known), sighting.innovation)
@@ -260,6 +263,8 @@ class Slam:
             raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
         if self.settings.landmark_velocity_error > 0.0:
             raise ParameterError("smoothing takes landmarks to rest: 'landmark_velocity_error' 0")
+        if self.gains.calibration.drifts:
+            raise ParameterError("smoothing takes the calibration to stay: 'calibration_drift' 0")
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
         stamps_ns = np.array(self.gains.stamps_ns, dtype=np.int64)
@@ -375,6 +380,12 @@ class Slam:
             y_ref = self.observer.y_ref[rows[far]]
             self.gains.relocate_landmarks(rows[far], y_ref, innovation.covariances[far])
             self.landmarks.restart(rows[far])
+
+    def _must_make_room(self, rows: IntArray) -> bool:
+        """Return whether those of ``rows`` (m,) that are new replace landmarks out of view."""
+        limit, kept = self.settings.max_landmarks, len(self.landmarks)
+        new = int(np.sum(rows < 0))
+        return new > 0 and 0 < limit < kept + new and len(rows) - new < kept
 
     def _make_room(self, event: ObservationEvent) -> ObservationEvent:
         """Forget landmarks out of view, least often seen first; return the new ones that fit."""

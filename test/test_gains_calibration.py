@@ -261,8 +261,8 @@ def test_drift_lets_the_uncertainty_grow_with_time():
     still = Motion(
         np.tile(np.eye(4), (5, 1, 1)),
         np.zeros((4, 6)),
-        np.ones(4),
-        np.zeros(4),
+        np.array([1.0, 1.0, 0.5, 1.0]),
+        np.array([0.0, 0.0, 0.5, 0.0]),  # half a second without a velocity
         np.zeros((4, 6, 6)),
         np.zeros((2, 6)),
     )
@@ -277,3 +277,16 @@ def test_a_bias_that_drifts_is_followed():
     world = drive(settings, 60.0, bias=ramp)
     _, found = scale_and_bias(estimate(world, settings))
     np.testing.assert_allclose(found[:3], GYROSCOPE_BIAS[:3], atol=0.02)
+
+
+def test_looking_back_does_not_undo_that_a_scale_has_changed():
+    settings = Settings(
+        two_d_mode=True,
+        linear_scale_error=(0.1, 0.0, 0.0),
+        calibration_drift=0.2,
+        hindsight_interval=10,
+        hindsight_turn=0.0,
+    )
+    scale = np.where(np.arange(1200) < 600, 1.0, 1.15)[:, None]
+    world = drive(settings, 60.0, scale=scale)
+    np.testing.assert_allclose(scale_and_bias(estimate(world, settings))[0][3], 1.15, atol=0.03)

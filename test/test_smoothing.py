@@ -282,8 +282,9 @@ def test_hindsight_beats_the_online_estimate(two_d_mode):
     assert np.mean(smoothed) < 0.8 * np.mean(online)
 
 
+@pytest.mark.parametrize('max_landmarks', [0, 7])
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode):
+def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode, max_landmarks):
     exact = Settings(
         two_d_mode=two_d_mode,
         angular_velocity_noise=(3e-4,) * 3,
@@ -292,10 +293,12 @@ def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode):
         bearing_noise=3e-4,
         huber_threshold=0.0,
         hindsight_interval=0,
+        max_landmarks=max_landmarks,
     )
-    world = drive(exact, 15.0)
+    world = drive(exact, 20.0)
     plain = estimate(world, exact)
-    often = estimate(world, replace(exact, hindsight_interval=10, hindsight_turn=0.0))
+    assert (plain.counts['forgotten_landmark'] > 0) == (max_landmarks > 0)
+    often = estimate(world, replace(exact, hindsight_interval=4, hindsight_turn=0.0))
     sigma_m = np.sqrt(plain.pose_covariance.diagonal()[3:].max())
     np.testing.assert_allclose(often.pose, plain.pose, atol=0.05 * sigma_m)
     np.testing.assert_allclose(often.world_points, plain.world_points, atol=0.1 * sigma_m)
@@ -327,6 +330,21 @@ def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad
         hindsight.see(nothing, np.eye(4), np.empty((0, 3)))
         due.append(hindsight.is_due)
     assert (due.index(True) + 1 if any(due) else None) == due_after
+
+
+def test_observations_of_nothing_take_no_room_in_the_window_and_tell_nothing():
+    settings = Settings(hindsight_interval=10, hindsight_turn=0.0, hindsight_window=0)
+    world = drive(settings, 15.0)
+    nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    stamps_ns = range(START_NS + STEP_NS // 2, START_NS + 300 * STEP_NS, STEP_NS)
+    events = world.events + [ObservationEvent(stamp_ns, *nothing) for stamp_ns in stamps_ns]
+    events.sort(key=lambda event: event.stamp_ns)
+    without = estimate(world, settings)
+    estimator = estimate(replace(world, events=events), settings)
+    smoothed, expected = estimator.smooth(), without.smooth()
+    np.testing.assert_array_equal(smoothed.stamps_ns, expected.stamps_ns)
+    np.testing.assert_allclose(smoothed.poses, expected.poses, atol=5e-3)
+    np.testing.assert_allclose(estimator.pose, without.pose_at(estimator.stamp_ns), atol=5e-3)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -392,6 +410,7 @@ def test_an_estimator_that_has_seen_nothing_has_nothing_to_smooth():
         {'gains': 'scheduled'},
         {'hindsight_interval': 0},
         {'landmark_velocity_error': 0.1},
+        {'linear_scale_error': (0.1, 0.0, 0.0), 'calibration_drift': 0.1},
     ],
 )
 def test_designs_that_keep_no_history_say_that_they_cannot_smooth(changes):

@@ -44,6 +44,8 @@ class Calibration:
         (c,) variances at the start.
     drift_covariance : FloatArray
         (c, c) by how much their covariance grows per second.
+    drifts : bool
+        Whether any of them grows.
     delay_error_ns : int
         Standard deviation of τ at the start, nanoseconds; 0 where it is not estimated.
 
@@ -62,6 +64,7 @@ class Calibration:
         self.delay_error_ns = round(settings.velocity_delay_error * 1e9)
         self.initial_variances = errors[self._estimated] ** 2
         self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
+        self.drifts = bool(self.drift_covariance.any())
 
     @property
     def values(self) -> FloatArray:

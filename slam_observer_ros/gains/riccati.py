@@ -309,8 +309,9 @@ class RiccatiGains:
 
     @property
     def looks_back(self) -> bool:
-        """Whether there is a history to look back at."""
-        return self._settings.hindsight_interval > 0 and not self._is_moving
+        """Whether there is a history to look back at, of what the smoother takes for constant."""
+        is_constant = not (self._is_moving or self.calibration.drifts)
+        return self._settings.hindsight_interval > 0 and is_constant
 
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise all of it anew.
@@ -318,7 +319,8 @@ class RiccatiGains:
         The smoother's marginal becomes the filter's covariance, and its solution the observer's
         new reference ξ°, with â_i = 0.
         """
-        if not self.looks_back:
+        # An empty frame tells nothing: the motions before and after it add up.
+        if not (self.looks_back and len(seen.indices)):
             return
         hindsight = self._hindsight
         hindsight.see(seen, observer.A, observer.shifts[seen.indices])
