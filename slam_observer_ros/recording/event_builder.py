@@ -40,9 +40,9 @@ class _Waiting:
 def with_receive_time(measured: Measured, receive_stamp_ns: int) -> Measured:
     """Return a measurement with the time of its reception if its publisher left the stamp out.
 
-    Fiducials keep theirs, which /tf has as well.
+    Fiducials keep theirs, which /tf has as well. Where time begins at zero, zero is a stamp.
     """
-    if isinstance(measured, TagDetections):
+    if receive_stamp_ns == 0 or isinstance(measured, TagDetections):
         return measured
     if isinstance(measured, ImuMessage | PoseMessage):
         return measured if measured.stamp_ns else replace(measured, stamp_ns=receive_stamp_ns)
