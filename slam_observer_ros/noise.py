@@ -18,6 +18,9 @@ RELATIVE_RESOLUTION = 1e-6
 LEAST_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
+LARGEST_SPEED_ERROR = 1e4
+"""Standard deviation of a velocity, m/s or rad/s, beyond which a message only says 'unknown'."""
+
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 _IDENTITY_6 = np.eye(6)
@@ -57,7 +60,7 @@ class NoiseModel:
             if given is not None:
                 before_s, dt_s = held.before_s[i], held.dt_s[i]
                 squared = (before_s + dt_s) ** 2 - before_s**2
-                covariances[i] = given * squared + np.diag(in_gaps[i])
+                covariances[i] = _limited(given) * squared + np.diag(in_gaps[i])
         return covariances
 
     def observation(self, event: ObservationEvent) -> FloatArray:
@@ -91,6 +94,14 @@ class NoiseModel:
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2
         return _along_and_across(event.points, range_squared, along, across)
+
+
+def _limited(covariance: FloatArray) -> FloatArray:
+    """Return a covariance (6, 6) without variances that would drown all others in rounding."""
+    deviations = np.sqrt(np.diagonal(covariance))
+    scale = LARGEST_SPEED_ERROR / np.maximum(deviations, LARGEST_SPEED_ERROR)
+    limited: FloatArray = covariance * scale[:, None] * scale
+    return limited
 
 
 def _along_and_across(

@@ -79,7 +79,8 @@ def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
 
 def _check_definite(name: str, covariances: FloatArray) -> None:
     """Check that covariances (…, d, d) are symmetric and have no negative eigenvalue."""
-    allowed = ROUNDING * np.trace(covariances, axis1=-2, axis2=-1)
+    with np.errstate(over='ignore'):  # the largest number there is means 'unknown'
+        allowed = ROUNDING * np.trace(covariances, axis1=-2, axis2=-1)
     skew = np.abs(covariances - covariances.swapaxes(-1, -2)).max(axis=(-2, -1))
     if np.any(skew > allowed) or np.any(np.linalg.eigvalsh(covariances)[..., 0] < -allowed):
         raise InvalidEventError(

@@ -97,6 +97,19 @@ def test_an_error_that_lasts_adds_up_however_often_its_motion_is_cut(cuts):
     np.testing.assert_allclose(total, 4.0 * given, rtol=1e-9)
 
 
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+@pytest.mark.parametrize('variance', [1e15, 1e100, np.finfo(np.float64).max])
+def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(gains, variance):
+    estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 3.0], [2.0, 2.0, 1.0]])
+    for step in range(20):
+        known = np.full(6, 1e-4)
+        known[2:5] = variance
+        assert estimator.add(VelocityEvent(step * 10**8, np.zeros(6), np.diag(known)))
+        assert estimator.add(ObservationEvent(step * 10**8, np.arange(4), points))
+    np.testing.assert_allclose(estimator.pose, np.eye(4), atol=0.2)
+
+
 def test_no_motion_has_no_covariances():
     assert NoiseModel(Settings()).motion(held(np.empty((0, 6)), [])).shape == (0, 6, 6)
 
