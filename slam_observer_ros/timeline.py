@@ -87,7 +87,7 @@ class Timeline:
         self._pending = 0
 
     def motion(self, calibration: Calibration, start_ns: int, end_ns: int) -> FloatArray:
-        """Return how the body moves (4, 4) between two stamps, backwards if the end comes first."""
+        """Return how the body moves (4, 4) between two stamps, backwards if need be."""
         if end_ns < start_ns:
             return se3.inverse(self.motion(calibration, end_ns, start_ns))
         return transition(self.velocities, calibration, start_ns, end_ns)
