@@ -71,9 +71,15 @@ def _compared(run: Run, world: World) -> list[Snapshot]:
     """
     counts: Counter[int] = Counter()
     snapshots = []
-    observations = (event for event in world.events if isinstance(event, ObservationEvent))
-    for event, snapshot in zip(observations, run.snapshots, strict=True):
+    # Smoothing has no pose of an observation none of whose points was believed.
+    by_stamp = {snapshot.stamp_ns: snapshot for snapshot in run.snapshots}
+    for event in world.events:
+        if not isinstance(event, ObservationEvent):
+            continue
         counts.update(event.ids.tolist())
+        if event.stamp_ns not in by_stamp:
+            continue
+        snapshot = by_stamp[event.stamp_ns]
         often = [counts[i] >= world.settings.confirmations for i in snapshot.ids.tolist()]
         kept = np.flatnonzero(often)
         points = snapshot.world_points[kept]
