@@ -181,8 +181,8 @@ class Estimator:
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; the state is not changed.
 
-        They cover the observations since the history began: all of them with the setting
-        ``hindsight_window`` 0.
+        They cover the observations since the history began, all of them with the setting
+        ``hindsight_window`` 0, as far as a point of them was believed.
 
         Raises
         ------
