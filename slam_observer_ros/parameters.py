@@ -6,7 +6,7 @@ parameter descriptors, the check of YAML files, the command-line options and the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 import dataclasses
 from dataclasses import dataclass
 import difflib
@@ -171,8 +171,25 @@ def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object
     rows = {row.name: row for row in table(settings_class)}
     unknown = sorted(set(values) - set(rows))
     if unknown:
-        raise ParameterError(f"unknown parameter '{unknown[0]}'{_suggestion(unknown[0], rows)}")
+        raise ParameterError(f"unknown parameter '{unknown[0]}'{suggestion(unknown[0], rows)}")
     return settings_class(**{name: rows[name].check(value) for name, value in values.items()})
+
+
+def suggestion(name: str, names: Collection[str], likeness: float = 0.6) -> str:
+    """Return the end of a message that asks for the nearest of ``names``; empty if none is near.
+
+    Parameters
+    ----------
+    name : str
+        What was written.
+    names : Collection of str
+        What may be meant.
+    likeness : float
+        What :mod:`difflib` has to find at least, from 0 to 1.
+
+    """
+    near = difflib.get_close_matches(name, names, n=1, cutoff=likeness)
+    return f"; did you mean '{near[0]}'?" if near else ''
 
 
 def read_parameter_file(path: Path) -> dict[str, object]:
@@ -226,8 +243,3 @@ def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:
         else:
             flat[f'{prefix}{name}'] = value
     return flat
-
-
-def _suggestion(name: str, rows: Mapping[str, Parameter]) -> str:
-    near = difflib.get_close_matches(name, rows, n=1)
-    return f"; did you mean '{near[0]}'?" if near else ''

@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> None:
         check_observations(args, result, result.estimator.dropped + unused)
         if landmark_map is not None:
             check_place(args, result, landmark_map)
-        outcome = outcome_of(recording, selected, result, truth)
+        outcome = outcome_of(recording, selected, result, truth, unused)
     if args.smooth:
         outcome = with_smoothed(outcome)
     map_frame = landmark_map.frame_id if landmark_map else inputs.map_frame

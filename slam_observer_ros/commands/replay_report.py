@@ -102,10 +102,13 @@ def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[s
 
 
 def outcome_of(
-    recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
+    recording: Recording,
+    selected: SelectedTopics,
+    result: Replay,
+    truth: Truth,
+    unused: Counter[str],
 ) -> Outcome:
-    """Measure a replay, and count what of the recording was dropped on the way."""
-    unused = unused_messages(recording, selected)
+    """Measure a replay; ``unused`` is what :func:`unused_messages` has counted."""
     accuracy = measure(result, truth)
     report = Report(
         events=result.events + unused.total(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-import difflib
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -15,7 +14,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.parameters import Dataclass, from_parameters, Parameter, SettingsT, table
+from slam_observer_ros.parameters import (
+    Dataclass,
+    from_parameters,
+    Parameter,
+    SettingsT,
+    suggestion,
+    table,
+)
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
@@ -106,8 +112,8 @@ def _check_names(node: Node, names: Collection[str]) -> None:
         is_of_ros = node.has_parameter(name) or name.startswith('qos_overrides.')
         if is_of_ros or name in names:
             continue
-        if near := difflib.get_close_matches(name, names, n=1, cutoff=MISSPELT):
-            raise ParameterError(f"unknown parameter '{name}'; did you mean '{near[0]}'?")
+        if near := suggestion(name, names, MISSPELT):
+            raise ParameterError(f"unknown parameter '{name}'{near}")
         ignored.append(name)
     if ignored:
         node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
