@@ -21,6 +21,9 @@ LEAST_SHARE = 1e-6
 LARGEST_SPEED_ERROR = 1e4
 """Standard deviation of a velocity, m/s or rad/s, beyond which a message only says 'unknown'."""
 
+SPEED_WINDOW_S = 1.0
+"""Time over which a velocity is averaged to tell how large an error in proportion to it is."""
+
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 _IDENTITY_6 = np.eye(6)
@@ -48,12 +51,14 @@ class NoiseModel:
         """Return the covariances (k, 6, 6) of k body-frame motions, rad² and m².
 
         While a velocity is in force its error is white noise: of the stated density and
-        proportional to speed. Where the message has a covariance its error is the same as long
-        as it is held, and another one in the next message: what was held for t has moved the
-        robot by t times the error, however many motions that was cut into. In a gap the robot
-        may do anything that ``unknown_*_motion`` allows.
+        proportional to speed. The speed is that of a second's motion: in a single message it is
+        noisy itself, and its square the larger the more messages there are. Where the message has
+        a covariance its error is the same as long as it is held, and another one in the next
+        message: what was held for t has moved the robot by t times the error, however many
+        motions that was cut into. In a gap the robot may do anything that ``unknown_*_motion``
+        allows.
         """
-        rates = self._density_squared + (self._scale * held.body_velocities) ** 2
+        rates = self._density_squared + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
         in_gaps = self._unknown_squared * held.gap_s[:, None]
         covariances = (rates * held.dt_s[:, None] + in_gaps)[:, :, None] * _IDENTITY_6
         for i, given in enumerate(held.covariances):

@@ -66,6 +66,33 @@ def test_scale_noise_grows_with_speed_and_is_none_at_rest():
     np.testing.assert_array_equal(still, 0.0)
 
 
+@given(generators(), st.sampled_from([10, 50, 200, 1000]))
+def test_noise_of_the_messages_does_not_pass_for_speed_however_many_there_are(rng, rate_hz):
+    settings = Settings(linear_velocity_noise=(0.0,) * 3, linear_scale_noise=(0.1, 0.0, 0.0))
+    duration_s, k = 30.0, 30 * rate_hz
+    velocities = np.zeros((k, 6))
+    velocities[:, 3] = 0.5 + 0.05 * np.sqrt(rate_hz) * rng.standard_normal(k)
+    total = NoiseModel(settings).motion(held(velocities, np.full(k, 1.0 / rate_hz))).sum(axis=0)
+    np.testing.assert_allclose(np.sqrt(total[3, 3]), 0.1 * 0.5 * np.sqrt(duration_s), rtol=0.15)
+
+
+def test_speed_that_changes_within_a_long_motion_counts_as_it_changes():
+    settings = Settings(angular_velocity_noise=(0.0,) * 3, angular_scale_noise=(0.0, 0.0, 0.1))
+    velocities = np.zeros((40, 6))
+    velocities[:20, 2], velocities[20:, 2] = 1.0, -1.0  # turns, and turns back
+    total = NoiseModel(settings).motion(held(velocities, np.full(40, 0.5))).sum(axis=0)
+    np.testing.assert_allclose(np.sqrt(total[2, 2]), 0.1 * np.sqrt(20.0), rtol=0.03)
+
+
+def test_a_velocity_held_for_longer_than_a_second_counts_alone():
+    settings = Settings(linear_velocity_noise=(0.0,) * 3, linear_scale_noise=(0.1, 0.0, 0.0))
+    velocities = np.zeros((3, 6))
+    velocities[:, 3] = [1.0, -2.0, 3.0]
+    covariances = NoiseModel(settings).motion(held(velocities, [2.0, 3.0, 4.0]))
+    expected = 0.01 * np.array([1.0, 4.0, 9.0]) * [2.0, 3.0, 4.0]
+    np.testing.assert_allclose(covariances[:, 3, 3], expected)
+
+
 def test_in_a_gap_the_robot_may_do_what_the_settings_allow():
     settings = Settings(unknown_angular_motion=0.3, unknown_linear_motion=0.7)
     covariance = NoiseModel(settings).motion(held(np.zeros((1, 6)), [0.0], [4.0]))[0]
