@@ -30,7 +30,7 @@ from slam_observer_ros.types import FloatArray
 DOCS = worlds.CHECKOUT / 'docs'
 QUICK_S = 60.0
 QUICK_RUNS = 4
-RUNS = 50
+RUNS = 4 * monte_carlo.BATCH
 
 ResultT = TypeVar('ResultT')
 

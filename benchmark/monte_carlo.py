@@ -20,6 +20,9 @@ from slam_observer_ros.types import FloatArray
 
 CHECKPOINT_S = 5
 
+BATCH = 50
+"""Runs of which a band is told as well; over all runs it is narrower."""
+
 LOOPS = {
     '3D stereo': Loop('stereo_inertial', 60.0, 100.0, 20, 6.0, 5),
     'wheeled': Loop('wheeled_bearing_range', 60.0, 100.0, 20, 6.0, 5),
@@ -42,6 +45,8 @@ class Consistency:
         its degrees of freedom.
     band : tuple of float
         95 % of an honest estimator's pose ANEES lie in it.
+    batches : list of Consistency
+        That of each :data:`BATCH` runs on their own; empty if there are no more than that.
 
     """
 
@@ -49,6 +54,7 @@ class Consistency:
     pose: FloatArray
     landmarks: FloatArray
     band: tuple[float, float]
+    batches: list[Consistency]
 
     @property
     def inside(self) -> int:
@@ -87,7 +93,9 @@ def summarise(loop_name: str, nees: FloatArray) -> Consistency:
     degrees_of_freedom = 3 if shipped_settings(loop.config).two_d_mode else 6
     mean = nees.mean(axis=0)
     band = average_nees_band(degrees_of_freedom, len(nees))
-    return Consistency(checkpoints_s(loop), mean[:, 0], mean[:, 1], band)
+    starts = range(0, len(nees), BATCH) if len(nees) > BATCH else ()
+    batches = [summarise(loop_name, nees[start : start + BATCH]) for start in starts]
+    return Consistency(checkpoints_s(loop), mean[:, 0], mean[:, 1], band, batches)
 
 
 def _nees(estimator: EkfSlam | Estimator, world: World, stamp_ns: int) -> tuple[float, float]:

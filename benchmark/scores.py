@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 from estimators import Run, Snapshot
 import numpy as np
@@ -61,6 +61,11 @@ def score(run: Run, world: World, has_ids: bool = True) -> Scores:
         else float('nan'),
         run.cpu_s,
     )
+
+
+def mean_scores(scores: list[Scores]) -> Scores:
+    """Return the mean of each score over several runs."""
+    return Scores(*np.mean([astuple(one) for one in scores], axis=0).tolist())
 
 
 def _compared(run: Run, world: World) -> list[Snapshot]:

@@ -233,7 +233,7 @@ class Settings:
         minimum=1,
     )
     hindsight_interval: int = parameter(
-        50,
+        20,
         'Riccati gains: least observations between looking back over all of them, or a tenth of '
         'these if that is more; 0 for never',
         minimum=0,
