@@ -58,7 +58,9 @@ class NoiseModel:
         motions that was cut into. In a gap the robot may do anything that ``unknown_*_motion``
         allows.
         """
-        rates = self._density_squared + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
+        rates = self._density_squared
+        if self._scale.any():
+            rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
         in_gaps = self._unknown_squared * held.gap_s[:, None]
         covariances = (rates * held.dt_s[:, None] + in_gaps)[:, :, None] * _IDENTITY_6
         for i, given in enumerate(held.covariances):
