@@ -16,6 +16,7 @@ from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.threads import use_one_thread
 
 MAP_SIZES = (10, 30, 100, 300, 1000)
 SEEN = (1, 3, 10)
@@ -25,6 +26,7 @@ REPEATS = 12
 
 def main() -> None:
     """Measure all designs and print one table a design."""
+    use_one_thread()  # as the nodes do
     measured = {
         (design, n, m): update_s(design, n, m)
         for design in DESIGNS

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 from slam_observer_ros import __version__
 from slam_observer_ros.commands.console import MessageHandler, PROGRAM, show_message
 from slam_observer_ros.errors import SlamObserverError
+from slam_observer_ros.threads import use_one_thread
 
 EXIT_ERROR = 2
 EXIT_SIGNAL = 128
@@ -80,6 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
         args = make_parser().parse_args(arguments)
+        use_one_thread()
         # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
         signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(EXIT_SIGNAL + number))
         args.run(args)

@@ -36,11 +36,14 @@ class TrajectorySampler:
     ----------
     estimator : Estimator
         What is watched.
+    with_covariances : bool
+        Whether to collect their covariances, too, which take longer to compute.
 
     """
 
-    def __init__(self, estimator: Estimator) -> None:
+    def __init__(self, estimator: Estimator, with_covariances: bool) -> None:
         self._estimator = estimator
+        self._with_covariances = with_covariances
         self._stamps_ns: list[int] = []
         self._poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
@@ -61,7 +64,7 @@ class TrajectorySampler:
             return
         self._stamps_ns.append(stamp_ns)
         self._poses.append(self._estimator.pose)
-        covariance = self._estimator.pose_covariance
+        covariance = self._estimator.pose_covariance if self._with_covariances else None
         if covariance is not None:
             self._covariances.append(covariance)
 
@@ -184,9 +187,9 @@ class _Run:
         self._start()
 
     def _start(self) -> None:
-        self._sampler = TrajectorySampler(self._estimator)
+        self._sampler = TrajectorySampler(self._estimator, with_covariances=True)
         self._blind = Estimator(self._settings)
-        self._blind_sampler = TrajectorySampler(self._blind)
+        self._blind_sampler = TrajectorySampler(self._blind, with_covariances=False)
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING
 from hypothesis import settings
 import pytest
 
+from slam_observer_ros import estimator  # noqa: F401  # loads what computes in threads
+from slam_observer_ros.threads import use_one_thread
+
 if TYPE_CHECKING:
     from node_processes import Client
 
@@ -36,6 +39,9 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['ROS_LOG_DIR'] = str(SCRATCH)
 os.environ['HYPOTHESIS_STORAGE_DIRECTORY'] = str(SCRATCH)
 os.environ['MPLBACKEND'] = 'Agg'
+
+# As the programs do: tests on a busy machine take ten times longer otherwise.
+use_one_thread()
 
 # The same examples everywhere, so that a failure can be repeated by whoever reads of it; and no
 # deadline: no test may depend on how busy the machine is.

@@ -41,7 +41,7 @@ def _summary(output, name):
 
 def test_demo_converges_and_leaves_figures_and_a_recording(tmp_path):
     (tmp_path / 'run_1').mkdir()
-    done = run_demo(tmp_path, '--real-time-factor', '10', '--duration', '60')
+    done = run_demo(tmp_path, '--real-time-factor', '10', '--duration', '70')
 
     assert done.returncode == 0, done.stdout + done.stderr
     assert _summary(done.stdout, 'log10 L at 60 s') < -10.0
@@ -52,7 +52,7 @@ def test_demo_converges_and_leaves_figures_and_a_recording(tmp_path):
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with AnyReader([folder / 'recording.mcap'], default_typestore=typestore) as recording:
         counts = {topic: info.msgcount for topic, info in recording.topics.items()}
-    assert counts['/twist'] == counts['/landmarks'] == counts['/ground_truth/pose'] == 1201
+    assert counts['/twist'] == counts['/landmarks'] == counts['/ground_truth/pose'] == 1401
     assert counts['/odometry'] == counts['/lyapunov'] > 100
     assert {'/map', '/markers', '/path', '/diagnostics', '/landmark_estimates'} <= set(counts)
 

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from slam_observer_ros.errors import SlamObserverError
+from slam_observer_ros.threads import use_one_thread
 
 STOP_LATENCY_S = 0.1
 """Longest time that an idle node takes to notice a signal."""
@@ -51,6 +52,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int
         Exit code: 0 after a clean stop, 2 where the node refused to start.
 
     """
+    use_one_thread()
     stop = StopSignal()
     rclpy.init(
         args=list(args) if args is not None else None,
