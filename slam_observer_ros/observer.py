@@ -63,8 +63,8 @@ class Observer:
         (n, 3) y_i° = P°⁻¹ p_i°, metres, reference frame.
     u : FloatArray
         (n, 3) velocities R_Â v_i of landmarks that move, m/s, reference frame; else zero.
-    shifts : FloatArray
-        (n, 3) how far the landmarks' own motion has moved them so far, metres.
+    have_moved : bool
+        Whether any landmark has had a velocity so far.
     reference_pose : FloatArray
         (4, 4) P°.
 
@@ -76,8 +76,7 @@ class Observer:
         self.a: FloatArray = np.empty((0, 3))
         self.y_ref: FloatArray = np.empty((0, 3))
         self.u: FloatArray = np.empty((0, 3))
-        self._some_move = False
-        self.shifts: FloatArray = np.empty((0, 3))
+        self.have_moved = False
 
     @property
     def pose(self) -> FloatArray:
@@ -115,7 +114,6 @@ class Observer:
         self.y_ref = np.concatenate([self.y_ref, y_ref])
         self.a = np.concatenate([self.a, np.zeros_like(y_ref)])
         self.u = np.concatenate([self.u, np.zeros_like(y_ref)])
-        self.shifts = np.concatenate([self.shifts, np.zeros_like(y_ref)])
 
     def relocate_landmarks(self, indices: IntArray, points: FloatArray) -> None:
         """Give landmarks a new reference y_i° = Â y_i where seen now, ``points`` (m, 3)."""
@@ -133,7 +131,6 @@ class Observer:
         self.y_ref = np.delete(self.y_ref, indices, axis=0)
         self.a = np.delete(self.a, indices, axis=0)
         self.u = np.delete(self.u, indices, axis=0)
-        self.shifts = np.delete(self.shifts, indices, axis=0)
 
     def errors(
         self, indices: IntArray | slice, points: FloatArray
@@ -199,13 +196,12 @@ class Observer:
 
         """
         self.u[indices] = se3.rotate(self.A, velocities)
-        self._some_move = True
+        self.have_moved = self.have_moved or bool(velocities.any())
 
     def move_landmarks(self, duration_s: float) -> None:
         """Add R_Â v_i dt to â_i: the lift of the landmarks' own velocities (19)."""
-        if self._some_move:  # else this would cost O(n) at every step
+        if self.have_moved:  # else this would cost O(n) at every step
             self.a += self.u * duration_s
-            self.shifts += self.u * duration_s
 
     def correct(self, correction: Correction) -> None:
         """Move the state from the left by (D, d_i); see the module's text."""
@@ -214,7 +210,7 @@ class Observer:
         self.a[indices] = self.a[indices] @ D[:3, :3].T + correction.d
         if correction.u is not None:
             self.u[indices] = self.u[indices] @ D[:3, :3].T + correction.u
-            self._some_move = True
+            self.have_moved = True
 
 
 def lyapunov(gain_k: FloatArray | float, r: FloatArray) -> float:

@@ -152,6 +152,9 @@ class Slam:
 
         """
         observer = self.observer
+        if not len(self.landmarks):
+            # Else ε would turn about an origin that may be kilometres away.
+            observer.reference_pose = pose
         observer.A = se3.inverse(observer.reference_pose) @ pose
         back = np.linalg.inv(self._turn_to_world(observer.A))
         given = np.zeros((6, 6)) if covariance is None else covariance
@@ -265,11 +268,12 @@ class Slam:
             raise ParameterError("smoothing takes landmarks to rest: 'landmark_velocity_error' 0")
         if self.gains.calibration.drifts:
             raise ParameterError("smoothing takes the calibration to stay: 'calibration_drift' 0")
+        if self.observer.have_moved:
+            raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
         stamps_ns = np.array(self.gains.stamps_ns, dtype=np.int64)
-        points = se3.transform(P, solution.points + self.observer.shifts)
-        return stamps_ns, P @ solution.poses[1:], points
+        return stamps_ns, P @ solution.poses[1:], se3.transform(P, solution.points)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""

@@ -67,8 +67,6 @@ class Frames:
         (M,) which landmark it is.
     points : FloatArray
         (M, 3) where it was seen, metres, body frame.
-    shifts : FloatArray
-        (M, 3) how far it had moved by itself by then, metres.
     information : FloatArray
         (M, k, k) inverse covariance of it, body frame, 1/m².
 
@@ -81,7 +79,6 @@ class Frames:
     frames: IntArray
     landmarks: IntArray
     points: FloatArray
-    shifts: FloatArray
     information: FloatArray
 
 
@@ -96,7 +93,6 @@ def no_frames(d: int, c: int, k: int) -> Frames:
         frames=none,
         landmarks=none,
         points=np.empty((0, 3)),
-        shifts=np.empty((0, 3)),
         information=np.empty((0, k, k)),
     )
 
@@ -276,7 +272,7 @@ class Smoother:
         frames, k = self._frames, self._axes.point
         poses = solution.poses[frames.frames + 1]
         R = poses[:, :3, :3]
-        arms = solution.points[frames.landmarks] + frames.shifts - poses[:, :3, 3]
+        arms = solution.points[frames.landmarks] - poses[:, :3, 3]
         predicted = (so3.transpose(R) @ arms[:, :, None])[:, :, 0]
         error = (predicted - frames.points)[:, :k]
         J_point = so3.transpose(R)[:, :k, :k]

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.event_queue import CONFIRMATIONS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
@@ -275,6 +276,35 @@ def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains)
     estimator.flush()
     np.testing.assert_allclose(estimator.world_points, LANDMARKS + speed * 9.95, atol=1e-6)
     np.testing.assert_allclose(estimator.pose, true_pose(9.95), atol=1e-6)
+
+
+def with_velocities(event, noise):
+    if not isinstance(event, ObservationEvent):
+        return event
+    return replace(event, velocities=noise.normal(scale=0.1, size=event.points.shape))
+
+
+def test_where_landmarks_move_what_was_seen_is_not_looked_back_at():
+    noise = np.random.default_rng(1)
+    events = [with_velocities(event, noise) for event in drive()]
+    often = run(events, gains='riccati', hindsight_interval=5, hindsight_turn=0.0)
+    assert_same_state(often, run(events, gains='riccati', hindsight_interval=0))
+    with pytest.raises(ParameterError, match='came with velocities'):
+        often.smooth()
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+def test_a_pose_set_far_from_the_origin_serves_as_well_as_one_that_is_near(gains):
+    far = np.eye(4)
+    far[:3, 3] = [5e5, 4e6, 100.0]  # a UTM grid's
+    near = Estimator(Settings(gains=gains))
+    near.set_pose(np.eye(4), 0.01 * np.eye(6))
+    distant = Estimator(Settings(gains=gains))
+    distant.set_pose(far, 0.01 * np.eye(6))
+    for event in drive():
+        assert near.add(event) == distant.add(event)
+    np.testing.assert_allclose(se3.inverse(far) @ distant.pose, near.pose, atol=1e-6)
+    np.testing.assert_allclose(distant.world_points - far[:3, 3], near.world_points, atol=1e-6)
 
 
 def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():

@@ -78,7 +78,6 @@ class Problem:
             frames,
             landmarks,
             seen,
-            np.zeros((len(frames), 3)),
             np.linalg.inv(random_covariances(rng, len(frames), k, 0.1)),
         )
         eta = self._tangents(0.1 * rng.normal(size=(FRAMES + 1, d)))
@@ -199,7 +198,7 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
             P = initial_covariance(axes, calibration)
             history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
         nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-        history.see(nothing, path[-1], np.empty((0, 3)))
+        history.see(nothing, path[-1])
         return history.frames()
 
     whole, parts = frames(), frames(1, 3)
@@ -327,7 +326,7 @@ def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad
     due = []
     for turn_rad in turns_rad:
         hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))
-        hindsight.see(nothing, np.eye(4), np.empty((0, 3)))
+        hindsight.see(nothing, np.eye(4))
         due.append(hindsight.is_due)
     assert (due.index(True) + 1 if any(due) else None) == due_after
 

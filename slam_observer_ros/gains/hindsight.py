@@ -94,9 +94,9 @@ class Hindsight:
         self._turn_squared += turn_squared
         self._largest_turn = max(self._largest_turn, math.sqrt(turn_squared))
 
-    def see(self, seen: Seen, pose: FloatArray, shifts: FloatArray) -> None:
+    def see(self, seen: Seen, pose: FloatArray) -> None:
         """Add a frame to the history; see :meth:`History.see`."""
-        self.history.see(seen, pose, shifts)
+        self.history.see(seen, pose)
         self._observations += 1
 
     def linearise_anew(self, start: Solution) -> tuple[Step, FloatArray] | None:

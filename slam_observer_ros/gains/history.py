@@ -29,8 +29,6 @@ class _Frame:
         As :meth:`History.move` is given them, of the whole motion.
     seen : Seen
         The observation.
-    shifts : FloatArray
-        (m, 3) how far the landmarks seen had moved by themselves, metres.
 
     """
 
@@ -40,7 +38,6 @@ class _Frame:
     sensitivity: FloatArray
     calibration: FloatArray
     seen: Seen
-    shifts: FloatArray
 
 
 class History:
@@ -105,18 +102,13 @@ class History:
         self._sensitivity = self._sensitivity + sensitivity
         self._calibration = calibration
 
-    def see(self, seen: Seen, pose: FloatArray, shifts: FloatArray) -> None:
-        """Close a frame: the observation ``seen``, made at ``pose`` (4, 4).
-
-        ``shifts`` (m, 3) is how far the landmarks had moved by themselves, metres.
-        """
+    def see(self, seen: Seen, pose: FloatArray) -> None:
+        """Close a frame: the observation ``seen``, made at ``pose`` (4, 4)."""
         self.stamps_ns.append(seen.stamp_ns)
         self.poses.append(pose)
         start = self._end if self._start is None else self._start
         self._new.append(
-            _Frame(
-                start, self._end, self._noise, self._sensitivity, self._calibration, seen, shifts
-            )
+            _Frame(start, self._end, self._noise, self._sensitivity, self._calibration, seen)
         )
         self._start = None
         self._noise, self._sensitivity = self._at_rest()
@@ -174,7 +166,6 @@ class History:
             frames=np.repeat(numbers, [len(part.indices) for part in seen]),
             landmarks=np.concatenate([part.indices for part in seen]),
             points=np.concatenate([part.points for part in seen]),
-            shifts=np.concatenate([frame.shifts for frame in frames]),
             information=np.asarray(np.linalg.inv(covariances)),
         )
 
@@ -186,7 +177,6 @@ class History:
             frames=frames.frames[kept],
             landmarks=frames.landmarks[kept],
             points=frames.points[kept],
-            shifts=frames.shifts[kept],
             information=frames.information[kept],
         )
 

@@ -110,7 +110,12 @@ class RiccatiGains:
             self._predict_moving(observer, motion)
             return
         noise, F = predict(self._P, self._axes, self.calibration, motion)
-        if self.looks_back:
+        if not self.looks_back:
+            return
+        if observer.u.any():
+            # How far they went depends on how the robot was turned, which no smoother here knows.
+            self.restart(observer)
+        else:
             self._hindsight.history.move(motion.path, noise, F, self.calibration.values)
 
     def _predict_moving(self, observer: Observer, motion: Motion) -> None:
@@ -323,7 +328,7 @@ class RiccatiGains:
         if not (self.looks_back and len(seen.indices)):
             return
         hindsight = self._hindsight
-        hindsight.see(seen, observer.A, observer.shifts[seen.indices])
+        hindsight.see(seen, observer.A)
         if in_doubt or hindsight.window_is_full or hindsight.is_due:
             self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
@@ -341,16 +346,13 @@ class RiccatiGains:
 
     def restart(self, observer: Observer) -> None:
         """Forget the past: what is known now is all that is known when looking back."""
-        J = np.eye(len(self._P))
-        pose = self._axes.pose
-        J[: self._p, : self._p] = se3.adjoint(se3.inverse(observer.A))[np.ix_(pose, pose)]
-        points = observer.y_ref + observer.a - observer.shifts
-        prior = Prior(observer.A, self.calibration.values, points, J @ self._P @ J.T)
-        self._hindsight.restart(prior)
+        points = observer.y_ref + observer.a
+        covariance = self._with_pose_error_by(se3.inverse(observer.A), self._P)
+        self._hindsight.restart(Prior(observer.A, self.calibration.values, points, covariance))
 
     def _as_solution(self, observer: Observer) -> Solution:
         """Return the estimates as they are, for the smoother to start from."""
-        points = observer.y_ref + observer.a - observer.shifts
+        points = observer.y_ref + observer.a
         poses = np.array(self._hindsight.history.poses)
         return Solution(poses, self.calibration.values, points)
 
@@ -365,15 +367,22 @@ class RiccatiGains:
         ``covariance`` belongs to the step's start. Taken for that of its end it would tell
         something of the gauge, of which nothing is known; settling carries it over.
         """
-        start, end, pose = step.start, step.end, self._axes.pose
-        observer.rebase(start.poses[-1], start.points + observer.shifts)
-        J = np.eye(len(covariance))
-        J[: self._p, : self._p] = se3.adjoint(observer.A)[np.ix_(pose, pose)]
-        self._P = J @ covariance @ J.T
+        start, end = step.start, step.end
+        observer.rebase(start.poses[-1], start.points)
+        self._P = self._with_pose_error_by(observer.A, covariance)
         self.calibration.shift(end.calibration - self.calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(Correction(D, slice(None), end.points - start.points))
         self.settle(observer)
+
+    def _with_pose_error_by(self, A: FloatArray, covariance: FloatArray) -> FloatArray:
+        """Return a covariance of Ad_A ε and all else, for one of ε and all else."""
+        p, pose = self._p, self._axes.pose
+        Ad = se3.adjoint(A)[np.ix_(pose, pose)]
+        changed: FloatArray = covariance.copy()
+        changed[:p] = Ad @ changed[:p]
+        changed[:, :p] = changed[:, :p] @ Ad.T
+        return changed
 
     @property
     def _count(self) -> int:
