@@ -22,6 +22,11 @@ from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
+NEWS = 0.1
+"""Share of the observations that is new when the same landmarks are compared with a map again:
+with many of them that takes long, and one observation more seldom decides it.
+"""
+
 
 class MapFrame:
     """States, and where they are in a loaded map, as far as that is known.
@@ -50,6 +55,7 @@ class MapFrame:
         self.is_localised = True
         self.states = Hypotheses(Slam(settings, np.eye(4)), settings)
         self._counts: Counter[str] = Counter()
+        self._begin_search()
 
     @property
     def slam(self) -> Slam:
@@ -92,6 +98,7 @@ class MapFrame:
         self._counts += self.slam.counts
         slam = Slam(self.settings, np.eye(4) if pose is None else self._allowed(pose))
         self.states = Hypotheses(slam, self.settings)
+        self._begin_search()
         self.is_localised = self.loaded is None or pose is not None
         if self.loaded is not None and pose is not None:
             start_in_map(self.slam, self.loaded, covariance)
@@ -100,6 +107,7 @@ class MapFrame:
         """Take a map in the place of one loaded before; the place in it is not known yet."""
         self.loaded = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
         self.is_localised = False
+        self._begin_search()
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the place in a loaded map was not known, it is now."""
@@ -117,8 +125,21 @@ class MapFrame:
             self._counts['lost'] += 1
             self.start(None)
         if not self.is_localised:
-            self.enter()
+            if self._is_news(self.loaded):
+                self.enter()
             self._counts['not_localised'] += not self.is_localised
+
+    def _begin_search(self) -> None:
+        self._shared = self._searched = self._compared = 0
+
+    def _is_news(self, known: LandmarkMap) -> bool:
+        """Return whether another of the map's landmarks was seen, or all for much longer."""
+        shared = int(np.sum(self.slam.landmarks.indices_of(known.ids) >= 0))
+        self._searched += 1
+        if shared == self._shared and self._searched < (1.0 + NEWS) * self._compared:
+            return False
+        self._shared, self._compared = shared, self._searched
+        return True
 
     def enter(self) -> None:
         """Move the states into the frame of the loaded map, if the landmarks seen suffice."""

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.stats import chi2
 
+from slam_observer_ros import map_frame
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
@@ -170,6 +171,20 @@ def test_landmarks_may_be_seen_one_after_another():
     assert estimator.is_localised
     assert estimator.counts['not_localised'] >= 2
     assert world.nees(estimator, 2.9) < chi2.ppf(0.9973, 6)
+
+
+def test_a_place_that_is_not_found_is_looked_for_again_when_there_is_news(monkeypatch):
+    tries = []
+    monkeypatch.setattr(map_frame, 'enter_map', lambda *_: tries.append(1))
+    world = World(4)
+    estimator = Estimator(world.settings())
+    estimator.load_map(world.map())
+    add(estimator, [world.see(0.1 * step, range(3)) for step in range(200)])
+    once = len(tries)
+    assert 20 < once < 60
+    add(estimator, [world.see(20.0 + 0.1 * step, range(4 + step)) for step in range(3)])
+    assert len(tries) == once + 3
+    assert estimator.counts['not_localised'] == 203
 
 
 @pytest.mark.parametrize('axes', [SPATIAL, PLANAR])
