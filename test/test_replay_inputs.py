@@ -144,6 +144,44 @@ class TestMovingMounts:
         assert ended.json['dropped'] == {'no_transform': 1}
         assert "'camera' and 'base_link' are not connected" in ended.errors
 
+    @pytest.fixture
+    def camera_on(self, tmp_path):
+        """Writes one observation of a camera that trees of transforms place, each 1 m apart."""
+
+        def write(trees, topics=('/robot1/odom', '/robot1/tags')):
+            with RecordingWriter(tmp_path / 'trees.mcap') as writer:
+                drive = Drive(writer)
+                for x, tree in enumerate(trees, start=1):
+                    mount = se3.pose(np.eye(3), np.array([x, 0.0, 0.0]))
+                    transform = ('base_link', 'camera', mount, ros.STAMP_NS)
+                    drive.transforms(tree, ros.STAMP_NS, transform)
+                velocity, landmarks = topics
+                writer.write_velocity(VelocityEvent(ros.STAMP_NS, V), topic=velocity)
+                event = ObservationEvent(ros.STAMP_NS, np.array([3]), np.zeros((1, 3)))
+                writer.write_observation(event, topic=landmarks, frame_id='camera')
+            with open_recording(tmp_path / 'trees.mcap') as recording:
+                selected = recording.find_topics(TopicNames(velocity, landmarks))
+                events = list(recording.events(selected))
+            return [event.points[0, 0] for event in events if isinstance(event, ObservationEvent)]
+
+        return write
+
+    @pytest.mark.parametrize('name', ['tf_static', 'tf'])
+    def test_each_robots_sensors_are_placed_by_its_own_transforms(self, camera_on, name):
+        assert camera_on([f'/robot1/{name}', f'/robot2/{name}', f'/{name}']) == [1.0]
+
+    @pytest.mark.parametrize('trees', [['/robot2/tf_static'], ['/tf_static', '/robot2/tf_static']])
+    def test_without_transforms_of_their_own_those_of_all_or_the_only_ones_count(
+        self, camera_on, trees
+    ):
+        assert camera_on(trees) == [1.0]
+
+    def test_transforms_of_several_robots_that_are_not_the_sensors_are_not_used(
+        self, camera_on, caplog
+    ):
+        assert camera_on(['/robot2/tf_static', '/robot3/tf_static']) == []
+        assert '/robot2/tf_static, /robot3/tf_static' in caplog.text
+
     def test_a_sensor_that_is_not_on_tf_is_placed_by_parameter(self, slam_observer, tmp_path):
         path = tmp_path / 'placed.mcap'
         with RecordingWriter(path) as writer:

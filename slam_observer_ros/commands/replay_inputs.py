@@ -133,7 +133,7 @@ def with_base_frame(
     if velocity_frame not in world:
         base_frame = velocity_frame
     elif base_frame not in (*world, default):
-        if recording.places(default):
+        if recording.places(default, selected):
             base_frame = default
         else:
             logger.warning(

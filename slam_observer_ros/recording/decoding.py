@@ -30,7 +30,8 @@ from slam_observer_ros.recording.messages import (
 )
 from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
 from slam_observer_ros.recording.sources import RawMessage, Topic
-from slam_observer_ros.recording.topics import SelectedTopics, TRANSFORMS_TYPE
+from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.recording.transform_topics import TRANSFORMS_TYPE
 
 Decode: TypeAlias = Callable[[RawMessage], Sequence[Measured]]
 """From a message to what it measures.

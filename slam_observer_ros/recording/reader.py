@@ -41,7 +41,6 @@ from slam_observer_ros.recording.topics import (
     select_topics,
     SelectedTopics,
     TopicNames,
-    TRANSFORMS_TYPE,
 )
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.settings import Settings
@@ -162,13 +161,13 @@ class Recording:
 
         """
         transforms = TransformBuffer()
-        for raw in self._source.messages(self._transform_topics('/tf_static')):
+        for raw in self._source.messages(selected.transforms.static):
             self._insert(transforms, raw, is_static=True)
         builder = EventBuilder(
             BaseFrame(inputs, transforms), inputs.transform_timeout, velocity_timeout_s, self._drop
         )
         decoders = input_decoders(selected, inputs)
-        moving = self._transform_topics('/tf')
+        moving = selected.transforms.moving
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:
                 self._insert(transforms, raw, is_static=False)
@@ -189,10 +188,10 @@ class Recording:
         velocity_frame = self._frame(selected.velocity, decoders[selected.velocity])
         return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
 
-    def places(self, frame: str) -> bool:
+    def places(self, frame: str, selected: SelectedTopics) -> bool:
         """Tell whether /tf_static or /tf has a frame."""
-        topics = [*self._transform_topics('/tf_static'), *self._transform_topics('/tf')]
-        for raw in self._source.messages(topics):
+        transforms = selected.transforms
+        for raw in self._source.messages((*transforms.static, *transforms.moving)):
             with suppress(MessageError):
                 for transform in decode_transform_message(raw):
                     names = transform.frame_id, transform.child_frame_id
@@ -276,14 +275,6 @@ class Recording:
                 for measured in decode(raw):
                     return measured.frame_id
         return ''
-
-    def _transform_topics(self, name: str) -> list[Topic]:
-        """List the topics of transforms of that name, with or without a namespace."""
-        return [
-            topic
-            for topic in self.topics
-            if topic.message_type == TRANSFORMS_TYPE and topic.name.endswith(name)
-        ]
 
     def _insert(self, transforms: TransformBuffer, raw: RawMessage, *, is_static: bool) -> None:
         messages = self._decoded(raw, decode_transform_message)

@@ -24,16 +24,17 @@ from slam_observer_ros.recording.messages import (
     VELOCITY_DECODERS,
 )
 from slam_observer_ros.recording.sources import Topic
+from slam_observer_ros.recording.transform_topics import (
+    transform_topics,
+    TRANSFORMS_TYPE,
+    TransformTopics,
+)
 
 TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
 """Topics with one of these between the slashes of their name hold truth, not measurements."""
 
 ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
 """Landmarks that an observer publishes, and does not measure."""
-
-
-TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
-"""Type of /tf, which holds landmarks if they are fiducials."""
 
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 IMU_TYPE = 'sensor_msgs/msg/Imu'
@@ -69,6 +70,8 @@ class SelectedTopics:
         What the estimator takes in.
     pose_truth, landmark_truth : Topic or None
         What its estimate is compared with, where the recording has it.
+    transforms : TransformTopics
+        What places the sensors.
     imu : Topic or None
         Where the angular velocity comes from; None if it comes with the velocity.
 
@@ -78,6 +81,7 @@ class SelectedTopics:
     landmarks: Topic
     pose_truth: Topic | None
     landmark_truth: Topic | None
+    transforms: TransformTopics
     imu: Topic | None = None
 
     @property
@@ -146,11 +150,14 @@ def select_topics(
         return _required(pick(role, name), role, used)
 
     is_of_poses = inputs.velocity_source == POSE_DIFFERENCES
+    velocity = require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity)
+    landmarks = require(*_landmark_choice(names.landmarks, inputs.landmarks_type))
     selected = SelectedTopics(
-        require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity),
-        require(*_landmark_choice(names.landmarks, inputs.landmarks_type)),
+        velocity,
+        landmarks,
         pick(_POSE_TRUTH, names.pose_truth),
         pick(_LANDMARK_TRUTH, names.landmark_truth),
+        transform_topics(topics, (velocity, landmarks)),
         require(_IMU, names.imu) if inputs.use_imu else None,
     )
     if selected.pose_truth is None:
