@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 from slam_observer_ros.types import FloatArray, IntArray
+
+UNUSED_POINTS = ('rejected_landmark', 'unknown_id', 'unmapped_landmark')
+"""Names under which points are counted that were observed and are not used."""
+
+
+def used_points(counts: Counter[str]) -> int:
+    """Return how many points were used, from :attr:`.Estimator.counts`."""
+    return counts['observed_point'] - sum(counts[name] for name in UNUSED_POINTS)
 
 
 @dataclass(frozen=True, slots=True)

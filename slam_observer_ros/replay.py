@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimates import Update, used_points
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -112,8 +112,10 @@ class Replay:
         Stamp of the first event that was used, nanoseconds; 0 if none was.
     history_since : str
         Since when it is possible to look back, in words.
+    observations : int
+        Observations of which points were used, also before the last start.
     observations_since : int
-        Observations used since then.
+        Those of them since it is possible to look back.
 
     """
 
@@ -129,6 +131,7 @@ class Replay:
     in_known_map: bool
     start_ns: int
     history_since: str
+    observations: int
     observations_since: int
 
     @property
@@ -181,7 +184,8 @@ class _Run:
             self._estimator.load_map(landmark_map)
         self._landmark_truth = truth.landmarks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
-        self._history_since, self._observations_since = 'the start', 0
+        self._history_since = 'the start'
+        self._observations = self._observations_since = self._used_points = 0
         self._jumps = self._events = 0
         self._seconds = 0.0
         self._start()
@@ -227,6 +231,7 @@ class _Run:
             self._in_known_map,
             self._start_ns or 0,
             self._history_since,
+            self._observations,
             self._observations_since,
         )
 
@@ -259,7 +264,10 @@ class _Run:
 
     def _note_observation(self) -> None:
         """Count an observation, unless with it what was seen until then became the prior."""
-        self._observations_since += 1
+        used = used_points(self._estimator.counts)
+        self._observations += used > self._used_points
+        self._observations_since += used > self._used_points
+        self._used_points = used
         is_localised = self._estimator.is_localised
         if is_localised and not self._was_localised:
             self._history_since = 'the place in the loaded map was found'

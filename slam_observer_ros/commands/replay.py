@@ -19,7 +19,7 @@ from slam_observer_ros.commands.outputs import (
     check_plots,
     filled_directory,
 )
-from slam_observer_ros.commands.replay_checks import check_observations, check_place, tell_restart
+from slam_observer_ros.commands.replay_checks import check_place, check_used, tell_restart
 from slam_observer_ros.commands.replay_inputs import (
     add_input_options,
     INPUT_NAMES,
@@ -47,6 +47,7 @@ from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.sources import files_of
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import replay
+from slam_observer_ros.settings import Settings
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +114,7 @@ def run(args: argparse.Namespace) -> None:
         result = replay(events, settings, truth, landmark_map)
         tell_restart(result)
         unused = unused_messages(recording, selected)
-        check_observations(args, result, result.estimator.dropped + unused)
+        check_used(args, result, result.estimator.dropped + unused)
         if landmark_map is not None:
             check_place(args, result, landmark_map)
         outcome = outcome_of(recording, selected, result, truth, unused)
@@ -161,7 +162,7 @@ def _write_files(
         trajectory = trajectory_of(smoothed)
     outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
         ('trajectory', args.tum, lambda path: write_tum(trajectory, path)),
-        ('map', args.map, lambda path: write_map(path, landmark_map, estimator.settings)),
+        ('map', args.map, lambda path: _save(path, landmark_map, estimator.settings)),
         ('figures', args.plot, lambda path: _draw(outcome, trajectory, landmark_map, path)),
     )
     written: dict[str, Path] = {}
@@ -175,6 +176,13 @@ def _write_files(
         except (SlamObserverError, OSError) as error:
             errors.append(str(error))
     return written, errors
+
+
+def _save(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
+    """Write the map, unless it is empty and would replace one, as at the end of the node."""
+    if not len(landmark_map.ids) and path.exists():
+        raise OutputError(f'{path} is left as it is: the map is empty')
+    write_map(path, landmark_map, settings)
 
 
 def _draw(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Mapping
 import logging
 from pathlib import Path
@@ -29,10 +30,8 @@ def tell_restart(result: Replay) -> None:
     )
 
 
-def check_observations(
-    args: argparse.Namespace, result: Replay, dropped: Mapping[str, int]
-) -> None:
-    """Warn if no observation was used.
+def check_used(args: argparse.Namespace, result: Replay, dropped: Mapping[str, int]) -> None:
+    """Warn if no velocity was used, or no observation.
 
     Parameters
     ----------
@@ -46,12 +45,20 @@ def check_observations(
     Raises
     ------
     UsageError
-        If none was used though ``--smooth`` or ``--load-map`` needs some.
+        If no observation was used though ``--smooth`` or ``--load-map`` needs some.
 
     """
-    if result.estimator.counts['observation']:
+    counts = result.estimator.counts
+    if not counts['velocity']:
+        logger.warning(
+            'No velocity was used (dropped: %s); the landmarks alone move the robot.',
+            list_dropped(dropped),
+        )
+    # In a map that was loaded there may be none because the place was not found: told elsewhere.
+    if result.observations or (args.load_map is not None and counts['observed_point']):
         return
-    why = f'observation was used (dropped: {list_dropped(dropped)})'
+    unused = Counter({'without a point that is used': counts['observation']})
+    why = f'observation was used (dropped: {list_dropped(unused + Counter(dropped))})'
     if args.smooth or args.load_map is not None:
         raise UsageError(f'no {why}; --smooth and --load-map need some')
     logger.warning('No %s; the trajectory is that of the velocities alone.', why)

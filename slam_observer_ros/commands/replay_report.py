@@ -11,7 +11,7 @@ from pathlib import Path
 from slam_observer_ros.accuracy import Accuracy, measure, measure_smoothed
 from slam_observer_ros.commands.console import print_table
 from slam_observer_ros.commands.replay_checks import list_dropped
-from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.estimates import Smoothed, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -21,11 +21,7 @@ from slam_observer_ros.replay import Replay
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
 
-UNUSED_POINTS = {
-    'rejected_landmark': 'rejected',
-    'unknown_id': 'without id',
-    'unmapped_landmark': 'not mapped',
-}
+POINT_FATES = dict(zip(UNUSED_POINTS, ('rejected', 'without id', 'not mapped'), strict=True))
 """What befalls points that were observed and are not used, and how it is told."""
 
 LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
@@ -169,9 +165,8 @@ def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result
 
 def with_smoothed(outcome: Outcome) -> Outcome:
     """Add what the whole recording tells in hindsight."""
-    estimator = outcome.result.estimator
-    smoothed = estimator.smooth()
-    if len(smoothed.stamps_ns) < estimator.counts['observation']:
+    smoothed = outcome.result.estimator.smooth()
+    if len(smoothed.stamps_ns) < outcome.result.observations:
         _warn_of_cut(outcome.result, len(smoothed.stamps_ns))
     errors, landmark_rmse_m = measure_smoothed(smoothed, outcome.truth)
     return replace(
@@ -242,12 +237,11 @@ def _told_landmarks(landmarks: int, counts: Counter[str]) -> str:
 
 def _told_points(counts: Counter[str]) -> str:
     """Tell how many points were used, and what befell the others."""
-    seen, unused = counts['observed_point'], {name: counts[name] for name in UNUSED_POINTS}
-    told = [f'{seen - sum(unused.values())} used']
+    told = [f'{used_points(counts)} used']
     told += [
-        f'{count} {UNUSED_POINTS[name]} ({100.0 * count / seen:.1f} %)'
-        for name, count in unused.items()
-        if count
+        f'{counts[name]} {fate} ({100.0 * counts[name] / counts["observed_point"]:.1f} %)'
+        for name, fate in POINT_FATES.items()
+        if counts[name]
     ]
     return ', '.join(told)
 
