@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import ros_messages as ros
 from rosbags import rosbag1, rosbag2
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.events import (
@@ -79,9 +79,13 @@ def messages() -> Iterator[tuple[str, int, object]]:
             yield '/landmarks', event.stamp_ns, cloud
 
 
-def write_rosbag2(directory: Path, storage: StoragePlugin) -> Path:
+def write_rosbag2(
+    directory: Path, storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE
+) -> Path:
     """Write the run as a rosbag2 directory."""
-    with rosbag2.Writer(directory, version=9, storage_plugin=storage) as bag:
+    bag = rosbag2.Writer(directory, version=9, storage_plugin=storage)
+    bag.set_compression(compression, CompressionFormat.ZSTD)
+    with bag:
         connections = {}
         for topic, stamp_ns, message in messages():
             if topic not in connections:

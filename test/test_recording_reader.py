@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import recordings
 import ros_messages as ros
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
@@ -133,6 +133,38 @@ class TestDamage:
         with pytest.raises(RecordingError, match='ros2 bag reindex'):
             open_recording(tmp_path)
 
+    @pytest.fixture
+    def split(self, tmp_path):
+        """A directory of two files, of which the second is cut off, and the message count."""
+        directory = tmp_path / 'split'
+        directory.mkdir()
+        for index in range(2):
+            write_big_mcap(directory / f'{index}.mcap')
+        cut_off = directory / '1.mcap'
+        cut_off.write_bytes(cut_off.read_bytes()[: cut_off.stat().st_size * 2 // 3])
+        (directory / 'metadata.yaml').write_text(
+            'rosbag2_bagfile_information: {relative_file_paths: [0.mcap, 1.mcap]}'
+        )
+        with open_recording(directory / '0.mcap') as recording:
+            return directory, recording.message_count
+
+    def test_of_a_split_recording_the_whole_files_are_read_and_the_truncated_one_up_to_the_damage(
+        self, split
+    ):
+        directory, count = split
+        with open_recording(directory) as recording:
+            assert f'{directory / "1.mcap"}: cut off or damaged' in recording.warning
+            assert '0.mcap' not in recording.warning
+            events = list(recording.events(recording.find_topics()))
+            assert len(events) == recording.message_count
+        assert count < len(events) < 2 * count
+
+    def test_of_a_split_recording_a_file_that_is_missing_is_named(self, split):
+        directory, _ = split
+        (directory / '1.mcap').unlink()
+        with pytest.raises(RecordingError, match=r'incomplete; metadata\.yaml lists 1\.mcap'):
+            open_recording(directory)
+
     @pytest.mark.parametrize('name', ['mcap file', 'sqlite3 file', 'ROS 1 bag', 'own mcap'])
     def test_damaged_file_is_read_or_refused_in_one_line(self, tmp_path, paths, name):
         whole = paths[name].read_bytes()
@@ -216,6 +248,32 @@ class TestNothingToRead:
             pass
         with pytest.raises(RecordingError, match='the recording is empty'):
             open_recording(tmp_path / 'empty.mcap')
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+class TestCompression:
+    @pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
+    def test_with_metadata_it_is_read(self, tmp_path, storage, mode):
+        with open_recording(recordings.write_rosbag2(tmp_path / 'run', storage, mode)) as run:
+            assert len(list(run.events(run.find_topics()))) == 150
+
+    def test_without_metadata_a_compressed_file_is_refused_with_what_to_do(
+        self, tmp_path, storage
+    ):
+        directory = recordings.write_rosbag2(tmp_path / 'run', storage, CompressionMode.FILE)
+        (directory / 'metadata.yaml').unlink()
+        (file,) = directory.iterdir()
+        for path in (directory, file):
+            with pytest.raises(RecordingError, match=f"{file}: compressed; run 'zstd -d'"):
+                open_recording(path)
+
+    def test_without_metadata_compressed_messages_are_refused_with_what_to_do(
+        self, tmp_path, storage
+    ):
+        directory = recordings.write_rosbag2(tmp_path / 'run', storage, CompressionMode.MESSAGE)
+        (directory / 'metadata.yaml').unlink()
+        with pytest.raises(RecordingError, match='its messages are compressed, which'):
+            open_recording(directory)
 
 
 class TestTopics:

@@ -33,9 +33,10 @@ from slam_observer_ros.recording.event_builder import (
 from slam_observer_ros.recording.frames import BaseFrame, insert_transforms
 from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.messages import LANDMARK_DECODERS
+from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.point_cloud_layout import ID_NAME
 from slam_observer_ros.recording.point_clouds import field_names
-from slam_observer_ros.recording.sources import open_source, RawMessage, Topic
+from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import (
     ODOMETRY_TYPE,
     select_topics,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,6 @@ from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.recording.cdr import Buffer
-
-FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,80 +173,39 @@ class SalvagedMcap:
                     yield *channels[record.channel_id], record
 
 
-def open_source(path: Path) -> tuple[MessageSource, str | None]:
-    """Open a recording of any of the formats, damaged or not.
+class SplitSource:
+    """Several files that one recording was split into.
 
     Parameters
     ----------
-    path : Path
-        A .mcap, .db3 or .bag file, or a rosbag2 directory.
-
-    Returns
-    -------
-    MessageSource
-        The open recording.
-    str or None
-        A warning, if only a part of it could be read.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing to read; one line that says what to do.
+    parts : sequence of MessageSource
+        The open files.
 
     """
-    if not path.exists():
-        raise RecordingError(f'{path}: no such file or directory')
-    if path.is_dir():
-        return _open_directory(path)
-    if path.suffix not in FILE_SUFFIXES:
-        raise RecordingError(
-            f'{path}: not a recording; give a {", ".join(FILE_SUFFIXES)} file '
-            'or a rosbag2 directory'
-        )
-    try:
-        return BagSource(path), None
-    except RecordingError as error:
-        if path.suffix != '.mcap':
-            raise
-        return _salvage(path, error)
 
+    def __init__(self, parts: Sequence[MessageSource]) -> None:
+        self._parts = sorted(parts, key=lambda part: part.start_ns)
+        counts: Counter[tuple[str, str]] = Counter()
+        for part in parts:
+            for topic in part.topics:
+                counts[topic.name, topic.message_type] += topic.count
+        self._topics = {key: Topic(*key, count) for key, count in counts.items()}
+        self.topics = tuple(self._topics.values())
+        self.start_ns = min(part.start_ns for part in parts)
+        self.end_ns = max(part.end_ns for part in parts)
 
-def files_of(path: Path) -> list[Path]:
-    """List the files that a recording consists of, compressed ones as well."""
-    if not path.is_dir():
-        return [path]
-    parts = (*FILE_SUFFIXES, 'metadata.yaml')
-    return [file for file in sorted(path.iterdir()) if any(part in file.name for part in parts)]
+    def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
+        """Yield the messages of these topics in the order in which they were received."""
+        for part in self._parts:
+            whole = {topic: self._topics[topic.name, topic.message_type] for topic in part.topics}
+            wanted = [topic for topic in part.topics if whole[topic] in topics]
+            for raw in part.messages(wanted):
+                yield raw._replace(topic=whole[raw.topic])
 
-
-def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
-    if (path / 'metadata.yaml').exists():
-        try:
-            return BagSource(path), None
-        except RecordingError:
-            # A recorder that was killed leaves a truncated file, which its metadata calls whole.
-            if len(_storage_files(path)) != 1:
-                raise
-    files = _storage_files(path)
-    if not files:
-        raise RecordingError(f'{path}: no rosbag2 directory (no metadata.yaml, .mcap or .db3)')
-    if len(files) > 1:
-        raise RecordingError(
-            f"{path}: {len(files)} files without metadata.yaml; run 'ros2 bag reindex' on it"
-        )
-    return open_source(files[0])
-
-
-def _storage_files(path: Path) -> list[Path]:
-    return [file for file in sorted(path.iterdir()) if file.suffix in ('.mcap', '.db3')]
-
-
-def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str]:
-    source = SalvagedMcap(path)
-    count = sum(topic.count for topic in source.topics)
-    if count == 0:
-        raise RecordingError(f'{error}; no whole message is left') from error
-    return source, f'{path}: cut off or damaged; only the {count} messages before that are used'
+    def close(self) -> None:
+        """Close the files."""
+        for part in self._parts:
+            part.close()
 
 
 @contextmanager

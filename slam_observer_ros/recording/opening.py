@@ -1,0 +1,158 @@
+"""Opens recordings of every format: whole, split, truncated, compressed or of no use."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+
+import yaml
+
+from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.recording.sources import (
+    BagSource,
+    MessageSource,
+    SalvagedMcap,
+    SplitSource,
+)
+
+FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
+
+_ZSTD_SUFFIX = '.zstd'
+_ZSTD_MAGIC = bytes.fromhex('28b52ffd')
+
+
+def open_source(path: Path) -> tuple[MessageSource, str | None]:
+    """Open a recording of any of the formats, damaged or not.
+
+    Parameters
+    ----------
+    path : Path
+        A .mcap, .db3 or .bag file, or a rosbag2 directory.
+
+    Returns
+    -------
+    MessageSource
+        The open recording.
+    str or None
+        A warning, if only a part of it could be read.
+
+    Raises
+    ------
+    RecordingError
+        If there is nothing to read; one line that says what to do.
+
+    """
+    if not path.exists():
+        raise RecordingError(f'{path}: no such file or directory')
+    if path.is_dir():
+        return _open_directory(path)
+    if path.suffix == _ZSTD_SUFFIX:
+        raise RecordingError(_how_to_decompress(path))
+    if path.suffix not in FILE_SUFFIXES:
+        raise RecordingError(
+            f'{path}: not a recording; give a {", ".join(FILE_SUFFIXES)} file '
+            'or a rosbag2 directory'
+        )
+    source, warning = _open_file(path)
+    _refuse_compressed_messages(path, source)
+    return source, warning
+
+
+def files_of(path: Path) -> list[Path]:
+    """List the files that a recording consists of, compressed ones as well."""
+    if not path.is_dir():
+        return [path]
+    parts = (*FILE_SUFFIXES, 'metadata.yaml')
+    return [file for file in sorted(path.iterdir()) if any(part in file.name for part in parts)]
+
+
+def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
+    if not (path / 'metadata.yaml').exists():
+        return open_source(_only_file(path))
+    listed, files = _listed_files(path), _storage_files(path)
+    missing = [file.name for file in listed if not file.exists()]
+    if missing and len(listed) > 1:
+        raise RecordingError(
+            f'{path}: incomplete; metadata.yaml lists {", ".join(missing)} as well: add what is '
+            'missing, or replay the files that are there one by one'
+        )
+    try:
+        return BagSource(path), None
+    except RecordingError:
+        # A recorder that was killed leaves a truncated file, which its metadata calls whole.
+        parts = files if len(files) == 1 else [file for file in listed if file in files]
+        if len(parts) < max(len(listed), 1):
+            raise
+        return _open_parts(parts)
+
+
+def _open_parts(files: Sequence[Path]) -> tuple[MessageSource, str | None]:
+    opened = [open_source(file) for file in files]
+    if len(opened) == 1:
+        return opened[0]
+    warnings = [warning for _, warning in opened if warning]
+    return SplitSource([source for source, _ in opened]), '; '.join(warnings) or None
+
+
+def _listed_files(directory: Path) -> list[Path]:
+    """List the files that metadata.yaml names; none if it is damaged, which rosbags tells of."""
+    try:
+        metadata = yaml.safe_load((directory / 'metadata.yaml').read_text(encoding='utf-8'))
+        names = metadata['rosbag2_bagfile_information']['relative_file_paths']
+        return [directory / PurePath(name).name for name in names]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError, yaml.YAMLError):
+        return []
+
+
+def _only_file(directory: Path) -> Path:
+    """Return the one file of a directory without metadata.yaml."""
+    files = _storage_files(directory)
+    if len(files) == 1:
+        return files[0]
+    if files:
+        raise RecordingError(
+            f"{directory}: {len(files)} files without metadata.yaml; run 'ros2 bag reindex' on it"
+        )
+    compressed = sorted(directory.glob(f'*{_ZSTD_SUFFIX}'))
+    if compressed:
+        raise RecordingError(_how_to_decompress(compressed[0]))
+    raise RecordingError(f'{directory}: no rosbag2 directory (no metadata.yaml, .mcap or .db3)')
+
+
+def _how_to_decompress(file: Path) -> str:
+    return (
+        f"{file}: compressed; run 'zstd -d' on it, or keep its metadata.yaml beside it and give "
+        'the directory'
+    )
+
+
+def _storage_files(path: Path) -> list[Path]:
+    return [file for file in sorted(path.iterdir()) if file.suffix in ('.mcap', '.db3')]
+
+
+def _refuse_compressed_messages(path: Path, source: MessageSource) -> None:
+    """Refuse a file whose messages are compressed one by one: only metadata.yaml tells so."""
+    first = next(iter(source.messages(source.topics)), None)
+    if first is not None and bytes(first.data[: len(_ZSTD_MAGIC)]) == _ZSTD_MAGIC:
+        source.close()
+        raise RecordingError(
+            f'{path}: its messages are compressed, which are read of a whole rosbag2 directory '
+            'only: keep its metadata.yaml beside it and give the directory'
+        )
+
+
+def _open_file(path: Path) -> tuple[MessageSource, str | None]:
+    try:
+        return BagSource(path), None
+    except RecordingError as error:
+        if path.suffix != '.mcap':
+            raise
+        return _salvage(path, error)
+
+
+def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str]:
+    source = SalvagedMcap(path)
+    count = sum(topic.count for topic in source.topics)
+    if count == 0:
+        raise RecordingError(f'{error}; no whole message is left') from error
+    return source, f'{path}: cut off or damaged; only the {count} messages before that are used'
