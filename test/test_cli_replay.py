@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import os
+from pathlib import Path
 
 from command_line import CommandLine
 import numpy as np
@@ -339,6 +341,46 @@ class TestOutputs:
         assert landmarks.exists()
         assert '(ATE)' in ended.output
         assert 'trajectory' not in ended.output
+
+    def test_links_stay_links_to_what_is_written(self, slam_observer, simulated, tmp_path):
+        elsewhere = tmp_path / 'elsewhere'
+        elsewhere.mkdir()
+        names = 'a.tum', 'map.yaml', 'figures/map.png'
+        (tmp_path / 'figures').mkdir()
+        for name in names:
+            (elsewhere / Path(name).name).write_text('older')
+            (tmp_path / name).symlink_to(elsewhere / Path(name).name)
+        slam_observer.succeed(
+            'replay', simulated, '--force', '--tum', tmp_path / 'a.tum',
+            '--map', tmp_path / 'map.yaml', '--plot', tmp_path / 'figures',
+        )  # fmt: skip
+        for name in names:
+            assert (tmp_path / name).is_symlink()
+            assert b'older' not in (elsewhere / Path(name).name).read_bytes()
+        assert len(list(elsewhere.iterdir())) == 3
+
+    @pytest.mark.parametrize('option', ['--tum', '--map', '--plot'])
+    def test_what_is_no_file_is_not_replaced_even_by_force(
+        self, slam_observer, simulated, tmp_path, option
+    ):
+        pipe = tmp_path / 'map.png'
+        os.mkfifo(pipe)
+        path = tmp_path if option == '--plot' else pipe
+        error = slam_observer.fail('replay', simulated, '--force', option, path)
+        assert f'{pipe} is there, and no regular file' in error
+        assert pipe.is_fifo()
+
+    def test_two_names_of_one_file_are_not_two_outputs(self, slam_observer, simulated, tmp_path):
+        (tmp_path / 'link').symlink_to(tmp_path / 'map.yaml')
+        outputs = ('--tum', tmp_path / 'link', '--map', tmp_path / 'map.yaml')
+        assert 'two outputs' in slam_observer.fail('replay', simulated, *outputs)
+
+    def test_figures_that_can_not_be_written_are_named_as_asked_for(
+        self, slam_observer, simulated
+    ):
+        errors = slam_observer('replay', simulated, '--plot', '/proc/figures').errors
+        assert "can't write figures to /proc/figures: " in errors
+        assert '.writing-' not in errors
 
     def test_figures_leave_other_files_alone(self, slam_observer, simulated, tmp_path):
         (tmp_path / 'notes.txt').write_text('mine')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from hypothesis import given
@@ -110,6 +111,18 @@ def test_a_map_that_cannot_be_written_leaves_the_older_one_alone(tmp_path, monke
         write_map(path, a_map(4), Settings())
     assert len(read_map(path).ids) == 3
     assert [file.name for file in tmp_path.iterdir()] == ['map.yaml']
+
+
+def test_a_map_is_written_where_a_link_leads_and_never_over_a_pipe(tmp_path):
+    (tmp_path / 'link.yaml').symlink_to('map.yaml')
+    write_map(tmp_path / 'link.yaml', a_map(4), Settings())
+    assert (tmp_path / 'link.yaml').is_symlink()
+    assert len(read_map(tmp_path / 'map.yaml').ids) == 4
+    os.mkfifo(tmp_path / 'pipe')
+    with pytest.raises(MapError, match=r"can't write map .*pipe: it is there, and no regular"):
+        write_map(tmp_path / 'pipe', a_map(4), Settings())
+    assert (tmp_path / 'pipe').is_fifo()
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_a_folder_that_is_missing_is_named(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 
 from mcap.reader import make_reader
@@ -117,6 +118,19 @@ def test_existing_file_is_overwritten_only_when_told(tmp_path):
         writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
     with open_recording(path) as recording:
         assert recording.message_count == 1
+
+
+def test_a_link_stays_and_a_pipe_is_not_overwritten(tmp_path):
+    (tmp_path / 'elsewhere').mkdir()
+    (tmp_path / 'link.mcap').symlink_to(tmp_path / 'elsewhere' / 'run.mcap')
+    recordings.write_mcap(tmp_path / 'link.mcap')
+    assert (tmp_path / 'link.mcap').is_symlink()
+    with open_recording(tmp_path / 'elsewhere' / 'run.mcap') as recording:
+        assert recording.message_count > 0
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    with pytest.raises(RecordingError, match='no regular file'):
+        RecordingWriter(tmp_path / 'pipe.mcap', overwrite=True)
+    assert (tmp_path / 'pipe.mcap').is_fifo()
 
 
 def test_file_that_appears_while_writing_is_not_overwritten(tmp_path):

@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 import tempfile
 
-from slam_observer_ros.commands.errors import UsageError
+from slam_observer_ros.commands.errors import OutputError, UsageError
+from slam_observer_ros.output_files import destination
 
 
 def add_force_option(parser: argparse.ArgumentParser) -> None:
@@ -37,19 +38,21 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
     Raises
     ------
     UsageError
-        If a file exists and may not be replaced, is a directory, or would lie in none, or two
-        are the same.
+        If a file exists and may not be replaced, is a directory, a pipe or a device, or would
+        lie in no directory, or two are the same.
 
     """
     wanted = [file for file in files if file is not None]
     for number, file in enumerate(wanted):
         if file.is_dir():
             raise UsageError(f'{file} is a directory; give the name of a file')
+        if file.exists() and not file.is_file():
+            raise UsageError(f'{file} is there, and no regular file; give another name')
         if file.exists() and not force:
             raise UsageError(f'{file} exists already; give another name, or --force to replace it')
         if not file.parent.is_dir():
             raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
-        if file in wanted[:number]:
+        if file.resolve() in [other.resolve() for other in wanted[:number]]:
             raise UsageError(f'{file} is named for two outputs')
 
 
@@ -108,9 +111,21 @@ def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> No
 
 @contextmanager
 def filled_directory(directory: Path) -> Iterator[Path]:
-    """Give a directory to write in, whose files go to ``directory`` when all are written."""
-    with tempfile.TemporaryDirectory(dir=directory.parent, prefix='.writing-') as unfinished:
-        yield Path(unfinished)
-        directory.mkdir(exist_ok=True)
-        for file in sorted(Path(unfinished).iterdir()):
-            file.replace(directory / file.name)
+    """Give a directory to write in, whose files go to ``directory`` when all are written.
+
+    Raises
+    ------
+    OutputError
+        If that fails.
+
+    """
+    beside = directory if directory.is_dir() else directory.parent
+    try:
+        with tempfile.TemporaryDirectory(dir=beside, prefix='.writing-') as unfinished:
+            yield Path(unfinished)
+            directory.mkdir(exist_ok=True)
+            for file in sorted(Path(unfinished).iterdir()):
+                file.replace(destination(directory / file.name))
+    except OSError as error:
+        reason = error.strerror or error  # its whole text names a directory that is gone by now
+        raise OutputError(f"can't write figures to {directory}: {reason}") from error

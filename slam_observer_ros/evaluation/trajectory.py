@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-import os
 from pathlib import Path
 
 import numpy as np
 
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.output_files import unfinished_file
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
@@ -216,14 +216,11 @@ def write_tum(trajectory: Trajectory, path: Path) -> Path:
         f'{_seconds_text(stamp_ns)} {" ".join(map(repr, row))}\n'
         for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), numbers, strict=True)
     )
-    unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
-        with unfinished.open('w', encoding='ascii') as file:
+        with unfinished_file(path) as unfinished, unfinished.open('w', encoding='ascii') as file:
             file.write(_TUM_HEADER)
             file.writelines(lines)
-        unfinished.replace(path)
     except OSError as error:
-        unfinished.unlink(missing_ok=True)
         raise EvaluationError(f"can't write {path}: {error.strerror}") from error
     return path
 

@@ -28,6 +28,7 @@ import yaml
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError
 from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.output_files import unfinished_file
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 
@@ -76,19 +77,15 @@ def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None
         },
     }
     lines = [_on_one_line(landmark) for landmark in _as_mappings(landmark_map)]
-    unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
-        with unfinished.open('w', encoding='utf-8') as file:
+        with unfinished_file(path) as unfinished, unfinished.open('w', encoding='utf-8') as file:
             yaml.safe_dump(head, file, sort_keys=False)
             file.write('landmarks:\n' if lines else 'landmarks: []\n')
             file.writelines(f'- {line}' for line in lines)
             file.flush()
             os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file
-        unfinished.replace(path)
     except OSError as error:
         raise MapError(f"can't write map {path}: {error.strerror}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def read_map(path: Path) -> LandmarkMap:

@@ -27,6 +27,7 @@ from rosbags.rosbag2 import (
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.output_files import destination
 from slam_observer_ros.recording.cdr import Buffer
 from slam_observer_ros.recording.message_factory import MessageFactory
 from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
@@ -81,7 +82,8 @@ class RecordingWriter:
         self._refuse_to_overwrite()
         try:
             # Beside its destination, so that the file can be moved there in one step.
-            self._directory = tempfile.TemporaryDirectory(dir=self.path.parent, prefix='.writing-')
+            directory = destination(self.path).parent
+            self._directory = tempfile.TemporaryDirectory(dir=directory, prefix='.writing-')
         except OSError as error:
             raise RecordingError(f'{self.path}: {error.strerror}') from error
         self._bag = Writer(
@@ -112,7 +114,7 @@ class RecordingWriter:
             try:
                 self._bag.close()
                 self._refuse_to_overwrite()
-                (self._bag.path / self.path.name).replace(self.path)
+                (self._bag.path / self.path.name).replace(destination(self.path))
             except WriterError as error:
                 raise RecordingError(f'{self.path}: {error}') from error
             except OSError as error:

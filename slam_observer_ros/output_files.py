@@ -1,0 +1,43 @@
+"""Files that are put where their name leads: whole or not at all, and over files only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import errno
+import os
+from pathlib import Path
+
+
+def destination(path: Path) -> Path:
+    """Return which file to replace so that ``path`` has new content; links stay what they are.
+
+    Raises
+    ------
+    OSError
+        If there is something, and it is no file: a pipe or a device is not to be replaced.
+
+    """
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        raise FileExistsError(errno.EEXIST, 'it is there, and no regular file', str(path))
+    return target
+
+
+@contextmanager
+def unfinished_file(path: Path) -> Iterator[Path]:
+    """Give a file to write, which becomes ``path`` at the end, or goes if there is an error.
+
+    Raises
+    ------
+    OSError
+        If ``path`` can't be replaced.
+
+    """
+    target = destination(path)
+    unfinished = target.with_name(f'.{target.name}.{os.getpid()}')
+    try:
+        yield unfinished
+        unfinished.replace(target)
+    finally:
+        unfinished.unlink(missing_ok=True)
