@@ -70,6 +70,14 @@ def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path
     assert (len(after.ids) > len(known.ids)) == (mode == 'off')
 
 
+def test_a_mode_of_localising_without_a_map_is_told_to_have_no_effect(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    ended = slam_observer('replay', path, '--set', 'localization_mode=fixed', *SETTINGS)
+    assert ended.code == 0
+    assert "No map is loaded, so localization_mode 'fixed' has no effect" in ended.errors
+    assert '--load-map' in ended.errors
+
+
 def test_a_map_keeps_the_name_of_its_frame(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'

@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> None:
     if args.smooth and settings.gains != 'riccati':
         raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
     _check_files(args)
-    warn_of_unused(args)
+    warn_of_unused(args, settings)
     landmark_map = None if args.load_map is None else read_map(args.load_map)
     with open_recording(args.recording) as recording:
         if recording.warning:

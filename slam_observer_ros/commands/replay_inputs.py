@@ -12,6 +12,7 @@ from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics, TopicNames
+from slam_observer_ros.settings import Settings
 
 _ROWS = {row.name: row for row in table(InputSettings)}
 INPUT_NAMES = frozenset(_ROWS)
@@ -105,8 +106,13 @@ def read_inputs(args: argparse.Namespace) -> InputSettings:
     return from_parameters(InputSettings, values)
 
 
-def warn_of_unused(args: argparse.Namespace) -> None:
-    """Warn of parameters in ``--config`` for which a replay has options, if these aren't given."""
+def warn_of_unused(args: argparse.Namespace, settings: Settings) -> None:
+    """Warn of what is set but has no effect, as it takes an option that isn't given."""
+    if settings.localization_mode != 'off' and args.load_map is None:
+        logger.warning(
+            "No map is loaded, so localization_mode '%s' has no effect (use --load-map).",
+            settings.localization_mode,
+        )
     defaults = {row.name: row.default for row in table(ObserverNodeSettings)}
     unused = [
         f'{name} (use {INSTEAD[name]})'
