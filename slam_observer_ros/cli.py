@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+import io
 import logging
 import os
 import signal
@@ -78,6 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Default: those that the program was started with.
 
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors='replace')  # a terminal without ± is no reason to end
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
         args = make_parser().parse_args(arguments)

@@ -201,7 +201,8 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     Raises
     ------
     ParameterError
-        If the file can't be read, is not YAML, or holds no parameters for this package.
+        If the file can't be read, is not YAML, or holds no parameters for this package, or those
+        of several robots.
 
     """
     try:
@@ -212,12 +213,18 @@ def read_parameter_file(path: Path) -> dict[str, object]:
         reason = str(error).splitlines()[0]
         raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
     values: dict[str, object] = {}
-    found = False
+    found: list[str] = []
     for section, body in content.items() if isinstance(content, dict) else ():
         is_ours = section == '/**' or str(section).rsplit('/', 1)[-1] == OBSERVER_NODE
         if is_ours and isinstance(body, dict) and isinstance(body.get('ros__parameters'), dict):
-            found = True
+            found.append(str(section))
             values.update(_flatten(body['ros__parameters']))
+    robots = [section for section in found if '*' not in section]
+    if len({section.strip('/') for section in robots}) > 1:
+        raise ParameterError(
+            f'parameter file {path} is of several robots: it has sections {" and ".join(robots)}; '
+            'leave one'
+        )
     if not found:
         raise ParameterError(
             f"parameter file {path} has no '/**: ros__parameters:' or "

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import io
 import os
 from pathlib import Path
+import sys
 
 from command_line import CommandLine
 import numpy as np
@@ -13,6 +15,7 @@ import recordings
 import ros_messages as ros
 import yaml
 
+from slam_observer_ros.cli import main
 from slam_observer_ros.evaluation.trajectory import read_tum
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
@@ -173,6 +176,14 @@ class TestReport:
         output = slam_observer.succeed('replay', simulated, *options).output
         assert 'velocity_delay' in output
         assert '±' in output
+
+    def test_what_an_output_has_no_letters_for_is_replaced(
+        self, slam_observer, simulated, monkeypatch
+    ):
+        output = io.TextIOWrapper(io.BytesIO(), encoding='ascii')
+        monkeypatch.setattr(sys, 'stdout', output)
+        assert main(['replay', str(simulated), '--set', 'velocity_delay_error=0.1']) == 0
+        assert b'velocity_delay' in output.buffer.getvalue()
 
     def test_without_an_unknown_calibration_none_is_told(self, slam_observer, simulated):
         assert slam_observer.succeed('replay', simulated, '--json').json['calibration'] == {}

@@ -221,6 +221,11 @@ def test_later_sections_win(tmp_path):
 @pytest.mark.parametrize(
     ('text', 'expected'),
     [
+        (
+            'observer_node: {ros__parameters: {a: 1}}\n'
+            '/robot1/observer_node: {ros__parameters: {a: 2}}\n',
+            'sections observer_node and /robot1/observer_node',
+        ),
         ('', 'ros__parameters'),
         ('just a word', 'ros__parameters'),
         ('- a\n- b\n', 'ros__parameters'),
