@@ -57,7 +57,7 @@ class EventBuilder:
     """Makes events in the base frame of measurements, in the order in which these come.
 
     What needs a transform that is not known yet waits for it. After the timeout velocities are
-    taken to be those of the base, and all else is dropped.
+    taken to be those of the base until their transform is known, and all else is dropped.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class EventBuilder:
         self._poses = PoseDifferences(velocity_timeout_ns)
         self._joined = AngularReplacement(velocity_timeout_ns)
         self._waiting: deque[_Waiting] = deque(maxlen=MAX_WAITING)
-        self._frames_taken_as_base: set[str] = set()
+        self._taken_as_base: dict[str, tuple[int, VelocityMessage]] = {}
 
     def add(self, measured: Measured, now_ns: int) -> list[Event]:
         """Take a measurement; return the event that comes of it, unless it has to wait.
@@ -124,17 +124,17 @@ class EventBuilder:
 
     def _attempt(self, item: _Waiting, now_ns: int) -> list[Event]:
         try:
-            event = self._event(item.measured)
+            event = self._event(item.measured, now_ns)
         except TransformError as error:
             if now_ns < item.deadline_ns:
                 self._waiting.append(item)
                 return []
-            event = self._give_up(item.measured, error)
+            event = self._give_up(item, error)
         return [] if event is None else [event]
 
-    def _event(self, measured: _InFrame) -> Event | None:
+    def _event(self, measured: _InFrame, now_ns: int) -> Event | None:
         if isinstance(measured, VelocityMessage):
-            return self._joined.add_velocity(self._velocity(measured))
+            return self._joined.add_velocity(self._velocity(measured, now_ns))
         if isinstance(measured, ImuMessage):
             turned = self._base_frame.angular_velocity(measured)
             return self._joined.add_angular(
@@ -144,18 +144,45 @@ class EventBuilder:
             return self._base_frame.tags(measured)
         return self._base_frame.observation(measured)
 
-    def _velocity(self, message: VelocityMessage) -> VelocityEvent:
-        if message.frame_id in self._frames_taken_as_base:
+    def _velocity(self, message: VelocityMessage, now_ns: int) -> VelocityEvent:
+        if self._is_taken_as_base(message, now_ns):
             return message.event
         return self._base_frame.velocity(message)
 
-    def _give_up(self, measured: _InFrame, error: TransformError) -> Event | None:
+    def _is_taken_as_base(self, message: VelocityMessage, now_ns: int) -> bool:
+        """Return whether velocities of this frame still do not wait for their transform.
+
+        As one that moves comes after the velocities of its time, it is one of these that is looked
+        up, for as long as it would have waited, and then the next one.
+        """
+        frame_id = message.frame_id
+        if frame_id not in self._taken_as_base:
+            return False
+        deadline_ns, looked_up = self._taken_as_base[frame_id]
+        if now_ns >= deadline_ns:
+            deadline_ns, looked_up = now_ns + self._transform_timeout_ns, message
+            self._taken_as_base[frame_id] = deadline_ns, looked_up
+        try:
+            self._base_frame.velocity(looked_up)
+        except TransformError:
+            return True
+        del self._taken_as_base[frame_id]
+        _logger.info(
+            "Velocities in frame '%s' are brought into '%s' from now on: its transform is known.",
+            frame_id,
+            self._base_frame.name,
+        )
+        return False
+
+    def _give_up(self, item: _Waiting, error: TransformError) -> Event | None:
+        measured = item.measured
         if not isinstance(measured, VelocityMessage):
             self._on_drop(error)
             return None
-        self._frames_taken_as_base.add(measured.frame_id)
+        self._taken_as_base[measured.frame_id] = item.deadline_ns, measured
         _logger.warning(
-            "Velocities in frame '%s' are taken to be those of '%s': %s",
+            "Velocities in frame '%s' are taken to be those of '%s' until their transform is "
+            'known: %s',
             measured.frame_id,
             self._base_frame.name,
             error,

@@ -1,0 +1,93 @@
+"""Velocities whose frame /tf does not know yet, and what waits for its transform."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.testing import assert_array_equal
+import pytest
+
+from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.extrinsics import move_velocity, pose_from_rpy
+from slam_observer_ros.recording.event_builder import EventBuilder
+from slam_observer_ros.recording.frames import BaseFrame
+from slam_observer_ros.recording.input_settings import InputSettings
+from slam_observer_ros.recording.messages import VelocityMessage
+from slam_observer_ros.transform_buffer import TransformBuffer
+
+MS = 1_000_000
+V = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])
+WHEEL = pose_from_rpy((0.3, 0.1, 0.0, 0.0, 0.0, np.pi))
+
+
+class Wheel:
+    """Sends a velocity every 20 ms; its transform goes into ``transforms``."""
+
+    def __init__(self, transform_timeout):
+        self.transforms = TransformBuffer()
+        frame = BaseFrame(InputSettings(), self.transforms)
+        self.builder = EventBuilder(frame, transform_timeout, 0.5, on_drop=None)
+        self.now_ns = 0
+
+    def send(self, count):
+        """Return the events of the next messages."""
+        events = []
+        for _ in range(count):
+            self.now_ns += 20 * MS
+            events += self.builder.retry(self.now_ns)
+            message = VelocityMessage('wheel', VelocityEvent(self.now_ns, V))
+            events += self.builder.add(message, self.now_ns)
+        return events
+
+    def place(self, stamp_ns):
+        self.transforms.insert('base_link', 'wheel', stamp_ns, WHEEL)
+
+
+def of_base(stamp_ns):
+    return move_velocity(VelocityEvent(stamp_ns, V), WHEEL).body_velocity
+
+
+@pytest.fixture
+def log(caplog):
+    caplog.set_level(logging.INFO, 'slam_observer_ros')
+    return caplog
+
+
+@pytest.mark.parametrize('timeout_s', [0.0, 0.1])
+def test_a_velocitys_frame_that_was_taken_for_the_base_is_used_once_tf_has_it(timeout_s, log):
+    wheel = Wheel(timeout_s)
+    events = wheel.send(20)
+    assert len(events) == 20
+    assert_array_equal([event.body_velocity for event in events], [V] * 20)
+    wheel.transforms.insert('base_link', 'wheel', 0, WHEEL, is_static=True)
+    events = wheel.send(3)
+    assert [event.stamp_ns for event in events] == [420 * MS, 440 * MS, 460 * MS]
+    assert_array_equal(events[0].body_velocity, of_base(420 * MS))
+    assert_array_equal([event.body_velocity for event in events], [of_base(0)] * 3)
+    assert [record.levelname for record in log.records] == ['WARNING', 'INFO']
+    assert "frame 'wheel' are brought into 'base_link' from now on" in log.text
+
+
+def test_velocities_wait_again_for_a_late_transform_that_has_begun_to_come(log):
+    wheel = Wheel(0.1)
+    events = wheel.send(20)
+    for _ in range(20):
+        wheel.place(wheel.now_ns - 30 * MS)
+        events += wheel.send(1)
+    stamps_ns = [event.stamp_ns for event in events]
+    assert stamps_ns == list(range(20 * MS, 20 * MS * (len(events) + 1), 20 * MS))
+    assert len(events) >= 37
+    assert_array_equal(events[20].body_velocity, V)
+    assert_array_equal(events[-1].body_velocity, of_base(0))
+    assert [record.levelname for record in log.records] == ['WARNING', 'INFO']
+
+
+def test_a_transform_that_always_comes_too_late_changes_nothing(log):
+    wheel = Wheel(0.1)
+    events = []
+    for _ in range(40):
+        wheel.place(wheel.now_ns - 150 * MS)
+        events += wheel.send(1)
+    assert_array_equal([event.body_velocity for event in events], [V] * len(events))
+    assert [record.levelname for record in log.records] == ['WARNING']
