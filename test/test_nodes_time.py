@@ -8,18 +8,20 @@ import time
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
+from nav_msgs.msg import Path
 from node_processes import running
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 from rclpy.serialization import serialize_message
-from robots import Robot, stamp_ns
+from robots import own_topics, Robot, stamp_ns, TransformSender
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.nodes.conversions import time_message
 from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.transforms import TFMessage
 from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 from slam_observer_ros.simulation import Scenario, Simulation
 
@@ -193,3 +195,34 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
     assert_array_equal(outcome['ordered'].ids, outcome['shuffled'].ids)
     assert_array_equal(outcome['ordered'].points, outcome['shuffled'].points)
     assert_array_equal(outcome['ordered'].covariances, outcome['shuffled'].covariances)
+
+
+@pytest.mark.parametrize('choice', ['reset', 'hold'])
+def test_looped_recording_without_simulated_time_begins_path_and_tf_anew(ros, tmp_path, choice):
+    if TFMessage is None:
+        pytest.skip('tf2_msgs is not installed')
+    namespace = f'/looped_{choice}'
+    paths = ros.collect(Path, f'{namespace}/path')
+    transforms = ros.collect(TFMessage, f'{namespace}/tf')
+    sender = TransformSender(ros, namespace)
+    arguments = own_topics(namespace)
+    with (
+        running('observer_node', tmp_path / 'log', *arguments, on_time_jump=choice) as node,
+        Robot(ros, namespace=namespace) as robot,
+    ):
+        ros.wait_for_subscriber(sender.dynamic)
+        for start_ns in (100 * SECOND, 50 * SECOND):
+            for step in range(40):
+                stamp = start_ns + step * SECOND // 20
+                sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=stamp)
+                robot.send(VelocityEvent(stamp, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
+                ros.spin_for(0.01)
+        ros.spin_until(lambda: paths and stamp_ns(paths[-1]) < 60 * SECOND, 'the second run')
+        ros.spin_until(lambda: stamp_ns(corrections(transforms)[-1]) < 60 * SECOND, 'its /tf')
+    stamps = [stamp_ns(pose) for pose in paths[-1].poses]
+    assert max(stamps) < 60 * SECOND, 'the path still has poses of the first run'
+    assert node.output.count('The clock has jumped') == 1
+
+
+def corrections(transforms):
+    return [t for m in transforms for t in m.transforms if t.header.frame_id == 'map']

@@ -122,7 +122,7 @@ class Outputs:
             self._broadcaster.repeat(self._node.get_clock().now().nanoseconds)
 
     def begin_anew(self) -> None:
-        """Forget the path and what waits: the estimate is at another place or in another frame."""
+        """Forget the path and what waits: the estimate is at another place, frame or time."""
         self._path.clear()
         self._path_stamp_ns = None
         if self._broadcaster is not None:
