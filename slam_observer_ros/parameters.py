@@ -175,7 +175,7 @@ def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object
     return settings_class(**{name: rows[name].check(value) for name, value in values.items()})
 
 
-def suggestion(name: str, names: Collection[str], likeness: float = 0.6) -> str:
+def suggestion(name: str, names: Collection[str]) -> str:
     """Return the end of a message that asks for the nearest of ``names``; empty if none is near.
 
     Parameters
@@ -184,11 +184,9 @@ def suggestion(name: str, names: Collection[str], likeness: float = 0.6) -> str:
         What was written.
     names : Collection of str
         What may be meant.
-    likeness : float
-        What :mod:`difflib` has to find at least, from 0 to 1.
 
     """
-    near = difflib.get_close_matches(name, names, n=1, cutoff=likeness)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     return f"; did you mean '{near[0]}'?" if near else ''
 
 

@@ -244,6 +244,17 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
     [
         ({'map_file': '/no/such/map.yaml'}, "can't read map /no/such/map.yaml"),
         ({'autosave_map': True}, "'autosave_map' needs a file in 'map_path'"),
+        (
+            {'autosave_map': True, 'map_path': '/no/such/map.yaml'},
+            "can't write map /no/such/map.yaml: the directory /no/such takes no file: No such",
+        ),
+        ({'autosave_map': True, 'map_path': '/'}, "can't write map /: it is a directory"),
+        (
+            {'map_frame': 'odom'},
+            "'map_frame' and 'odom_frame' are both 'odom': give each a name of its own, or set "
+            "'odom_frame' to '' to have 'odom' to the base published",
+        ),
+        ({'base_frame': '/map'}, "'map_frame' and 'base_frame' are both 'map': give each a name"),
     ],
 )
 def test_with_wrong_parameters_the_node_says_why_and_does_not_start(tmp_path, parameters, reason):

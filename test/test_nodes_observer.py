@@ -325,14 +325,23 @@ def test_bad_parameter_at_the_start_is_refused_with_the_reason(ros, tmp_path):
     assert 'Traceback' not in node.output
 
 
-def test_misspelt_parameter_is_refused_with_the_one_that_may_be_meant(ros, tmp_path):
+@pytest.mark.parametrize(
+    ('name', 'written', 'meant'),
+    [
+        ('observer_node', 'gans', 'gains'),
+        ('observer_node', 'point_niose', 'point_noise'),
+        ('lifecycle_observer_node', 'velocity_timeot', 'velocity_timeout'),
+    ],
+)
+def test_parameter_misspelt_by_a_letter_is_refused_with_the_one_that_may_be_meant(
+    ros, tmp_path, name, written, meant
+):
     file = tmp_path / 'robot.yaml'
-    file.write_text('/**: {ros__parameters: {velocity_timeot: 1.0}}')
-    for name in ('observer_node', 'lifecycle_observer_node'):
-        node = NodeProcess(name, tmp_path / name, '--params-file', str(file))
-        assert node.wait() == 2
-        assert "'velocity_timeot'; did you mean 'velocity_timeout'?" in node.output
-        assert 'Traceback' not in node.output
+    file.write_text(f'/**: {{ros__parameters: {{{written}: 1.0}}}}')
+    node = NodeProcess(name, tmp_path / name, '--params-file', str(file))
+    assert node.wait() == 2
+    assert f"'{written}'; did you mean '{meant}'?" in node.output
+    assert 'Traceback' not in node.output
 
 
 def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path):

@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 from slam_observer_ros.errors import MapError, ParameterError, SlamObserverError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.recording.map_file import read_map, write_map
+from slam_observer_ros.recording.map_file import check_writable, read_map, write_map
 
 
 class Maps:
@@ -32,7 +32,7 @@ class Maps:
     Raises
     ------
     MapError
-        If the map of the start can't be read.
+        If the map of the start can't be read, or that of the end could not be written.
     ParameterError
         If the map is to be saved at the end, but not where.
 
@@ -50,10 +50,12 @@ class Maps:
         self._autosave = settings.autosave_map
         self._estimator = estimator
         self._on_load = on_load
-        if settings.autosave_map and not settings.map_path:
-            raise ParameterError("'autosave_map' needs a file in 'map_path'")
+        if settings.autosave_map:
+            if not settings.map_path:
+                raise ParameterError("'autosave_map' needs a file in 'map_path'")
+            check_writable(_absolute(settings.map_path))
         if settings.map_file:
-            node.get_logger().info(self._load(Path(settings.map_file)))
+            node.get_logger().info(self._load(_absolute(settings.map_file)))
         elif estimator.settings.localization_mode != 'off':
             node.get_logger().warning("no 'map_file': mapping until a map comes by ~/load_map")
         node.create_service(Trigger, '~/save_map', self._answer_save)
@@ -94,7 +96,7 @@ class Maps:
         path: str = self._node.get_parameter('map_path').value
         if not path:
             raise ParameterError("no file is named: set the parameter 'map_path'")
-        return Path(path)
+        return _absolute(path)
 
     def _save(self, path: Path) -> str:
         estimator = self._estimator
@@ -102,12 +104,10 @@ class Maps:
         if not estimator.is_localised:
             raise MapError('the place in the loaded map is not known yet: nothing is saved')
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
-        path = path.expanduser().absolute()
         write_map(path, landmark_map, estimator.settings)
         return f"saved {len(landmark_map.ids)} landmarks in frame '{self._map_frame}' to {path}"
 
     def _load(self, path: Path) -> str:
-        path = path.expanduser().absolute()
         landmark_map = read_map(path)
         if landmark_map.frame_id != self._map_frame:
             raise MapError(
@@ -122,3 +122,7 @@ class Maps:
             count = 'two' if self._estimator.settings.two_d_mode else 'three'
             place = f'the pose is unknown until {count} of them are seen or it is given'
         return f'loaded {len(landmark_map.ids)} landmarks from {path}; {place}'
+
+
+def _absolute(path: str) -> Path:
+    return Path(path).expanduser().absolute()

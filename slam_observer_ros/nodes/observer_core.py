@@ -48,6 +48,7 @@ class ObserverCore:
         self._node = node
         self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings)
+        settings.check_frames()
         estimator_settings = read_settings(node, Settings)
         self._estimator = Estimator(estimator_settings)
         self._jumps_followed = 0

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import parameter
 from slam_observer_ros.recording.input_settings import AUTO, InputSettings
 
@@ -69,6 +71,24 @@ class ObserverNodeSettings(InputSettings):
         '', 'File of ~/save_map, ~/load_map and autosave_map', read_only=False
     )
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
+
+    def check_frames(self) -> None:
+        """Check that map, odometry and base have frames of their own.
+
+        Raises
+        ------
+        ParameterError
+            If two of them are the same; it says what to do.
+
+        """
+        for one, other in combinations(('map_frame', 'odom_frame', 'base_frame'), 2):
+            frame = getattr(self, one).lstrip('/')
+            if frame != getattr(self, other).lstrip('/'):
+                continue
+            advice = 'give each a name of its own'
+            if other == 'odom_frame':
+                advice += f", or set 'odom_frame' to '' to have '{frame}' to the base published"
+            raise ParameterError(f"'{one}' and '{other}' are both '{frame}': {advice}")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 import dataclasses
 import os
 from pathlib import Path
+import tempfile
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,25 @@ def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None
             os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file
     except OSError as error:
         raise MapError(f"can't write map {path}: {error.strerror}") from error
+
+
+def check_writable(path: Path) -> None:
+    """Check that a map could be written, as long before there is one as may be.
+
+    Raises
+    ------
+    MapError
+        If its directory takes no file, or it is a directory itself.
+
+    """
+    if path.is_dir():
+        raise MapError(f"can't write map {path}: it is a directory")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        reason = f'the directory {path.parent} takes no file: {error.strerror}'
+        raise MapError(f"can't write map {path}: {reason}") from error
 
 
 def read_map(path: Path) -> LandmarkMap:
