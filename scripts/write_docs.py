@@ -54,7 +54,7 @@ TYPE_PARAMETERS = {'twist': 'velocity_type', 'landmarks': 'landmarks_type'}
 """Inputs of several types, and the parameters that list these."""
 
 OUTPUTS = {
-    'odometry': "pose in the map, velocity in the robot's frame",
+    'odometry': "pose in the map, calibrated velocity in the robot's frame",
     'pose': 'pose in the map with its covariance',
     'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
     'map': 'landmarks seen `confirmations` times or more, with ids; with covariances where the '

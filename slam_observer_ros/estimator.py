@@ -256,9 +256,12 @@ class Estimator:
 
     @property
     def body_velocity(self) -> FloatArray:
-        """(6,) velocity (Ω, v) in force at ``stamp_ns``; zero when it has timed out."""
+        """(6,) newest velocity (Ω, v) as it is calibrated; zero when it has timed out.
+
+        It is that of ``stamp_ns``, unless a delay is calibrated: then a little before or after.
+        """
         velocity = self._timeline.body_velocity
-        return np.zeros(6) if velocity is None else velocity
+        return np.zeros(6) if velocity is None else self._slam.gains.calibration.apply(velocity)
 
     @property
     def velocity_is_stale(self) -> bool:

@@ -146,6 +146,15 @@ def test_a_delay_stays_within_what_is_made_up_for():
         assert calibration.delay_ns == np.sign(change_s) * round(MAX_DELAY_S * 1e9)
 
 
+def test_the_velocity_that_is_told_is_the_one_that_moves_the_pose():
+    step_ns = 10_000_000
+    for settings in (WHEELS, replace(EVERYTHING, velocity_delay_error=0.0)):
+        estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
+        after = estimator.pose_at(estimator.stamp_ns + step_ns)
+        moved = estimator.pose @ se3.exp(estimator.body_velocity * step_ns * 1e-9)
+        np.testing.assert_allclose(after, moved, atol=1e-9)
+
+
 def test_at_constant_velocity_nobody_can_tell_the_delay():
     """Not even at the start, where no velocity is known yet."""
     settings = Settings(two_d_mode=True, velocity_delay_error=0.2)
