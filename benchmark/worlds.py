@@ -245,7 +245,14 @@ def _measured_velocities(
     dt_s = 1.0 / VELOCITY_RATE_HZ
     velocities = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / dt_s
     k = len(velocities)
-    held = HeldVelocities(velocities, [None] * k, np.full(k, dt_s), np.zeros(k), np.zeros(k))
+    held = HeldVelocities(
+        velocities,
+        np.zeros((k, 6, 6)),
+        np.zeros((k, 2), dtype=bool),
+        np.full(k, dt_s),
+        np.zeros(k),
+        np.zeros((k, 2)),
+    )
     variances = np.diagonal(NoiseModel(settings).motion(held), axis1=1, axis2=2) / dt_s**2
     return velocities + np.sqrt(variances) * rng.standard_normal(velocities.shape)
 

@@ -11,7 +11,13 @@ import numpy as np
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
 from slam_observer_ros.event_queue import EventQueue
-from slam_observer_ros.events import Event, flatten, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    flatten,
+    ObservationEvent,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.map_frame import MapFrame
@@ -327,18 +333,18 @@ class Estimator:
             )
 
     def _process(self, event: Event) -> None:
-        if isinstance(event, VelocityEvent):
-            self._process_velocity(event)
-        else:
+        if isinstance(event, ObservationEvent):
             self._process_observation(event)
+        else:
+            self._process_velocity(event)
 
-    def _process_velocity(self, event: VelocityEvent) -> None:
+    def _process_velocity(self, event: VelocityEvent | AngularVelocityEvent) -> None:
         try:
-            self._timeline.append(event)
+            is_used = self._timeline.append(event)
         except InvalidEventError as error:
             self._drop(error)
             return
-        self._counts['velocity'] += 1
+        self._counts['velocity'] += is_used
         if self._timeline.is_full:
             self._timeline.advance(self._frame.states, event.stamp_ns)
 

@@ -22,7 +22,8 @@ class EventQueue:
 
     Of two events with one stamp the velocity comes first, and two observations are ordered by
     their ids and points, so the order does not depend on which arrived first. A second velocity
-    of one stamp is a duplicate; so is an observation that has the ids and points of another one.
+    of one kind and stamp is a duplicate; so is an observation that has the ids and points of
+    another one.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ class EventQueue:
         if isinstance(event, ObservationEvent):
             key = (stamp_ns, True, event.ids.tobytes() + event.points.tobytes())
         else:
-            key = (stamp_ns, False, b'')
+            key = (stamp_ns, False, type(event).__name__.encode())
         if key in self._known:
             raise InvalidEventError('duplicate', 'an event with this stamp is already known')
         self._known.add(key)

@@ -38,6 +38,29 @@ class VelocityEvent:
 
 
 @dataclass(frozen=True, slots=True)
+class AngularVelocityEvent:
+    """Angular velocity that takes the place of other velocities' angular part, as of an IMU.
+
+    It does so from its stamp until the next one, for the settings' ``velocity_timeout`` at most.
+    Where no :class:`VelocityEvent` is in force it says nothing.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of validity, nanoseconds.
+    angular_velocity : FloatArray
+        (3,) in the base frame, rad/s.
+    covariance : FloatArray or None
+        (3, 3) its covariance, rad²/s²; None if unknown.
+
+    """
+
+    stamp_ns: int
+    angular_velocity: FloatArray
+    covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class ObservationEvent:
     """Landmarks seen at one instant.
 
@@ -76,7 +99,7 @@ class ObservationEvent:
         )
 
 
-Event: TypeAlias = VelocityEvent | ObservationEvent
+Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
 """Anything that :meth:`slam_observer_ros.estimator.Estimator.add` takes."""
 
 

@@ -55,19 +55,22 @@ class NoiseModel:
         noisy itself, and its square the larger the more messages there are. Where the message has
         a covariance its error is the same as long as it is held, and another one in the next
         message: what was held for t has moved the robot by t times the error, however many
-        motions that was cut into. In a gap the robot may do anything that ``unknown_*_motion``
-        allows.
+        motions that was cut into. The angular and the linear part may be of two messages, of
+        which one is held for longer, or has no covariance. In a gap the robot may do anything
+        that ``unknown_*_motion`` allows.
         """
         rates = self._density_squared
         if self._scale.any():
             rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
+        dt_s = held.dt_s[:, None]
+        white = rates * dt_s * np.repeat(~held.is_stated, 3, axis=1)
         in_gaps = self._unknown_squared * held.gap_s[:, None]
-        covariances = (rates * held.dt_s[:, None] + in_gaps)[:, :, None] * _IDENTITY_6
-        for i, given in enumerate(held.covariances):
-            if given is not None:
-                before_s, dt_s = held.before_s[i], held.dt_s[i]
-                squared = (before_s + dt_s) ** 2 - before_s**2
-                covariances[i] = _limited(given) * squared + np.diag(in_gaps[i])
+        covariances: FloatArray = (white + in_gaps)[:, :, None] * _IDENTITY_6
+        if held.is_stated.any():
+            squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
+            grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
+            stated = _limited(held.covariances)
+            covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
 
     def observation(self, event: ObservationEvent) -> FloatArray:
@@ -103,11 +106,11 @@ class NoiseModel:
         return _along_and_across(event.points, range_squared, along, across)
 
 
-def _limited(covariance: FloatArray) -> FloatArray:
-    """Return a covariance (6, 6) without variances that would drown all others in rounding."""
-    deviations = np.sqrt(np.diagonal(covariance))
-    scale = LARGEST_SPEED_ERROR / np.maximum(deviations, LARGEST_SPEED_ERROR)
-    limited: FloatArray = covariance * scale[:, None] * scale
+def _limited(covariances: FloatArray) -> FloatArray:
+    """Return covariances (k, 6, 6) without variances that would drown all others in rounding."""
+    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    scales = LARGEST_SPEED_ERROR / np.maximum(deviations, LARGEST_SPEED_ERROR)
+    limited: FloatArray = covariances * scales[:, :, None] * scales[:, None, :]
     return limited
 
 

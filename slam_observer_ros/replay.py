@@ -18,7 +18,7 @@ from slam_observer_ros.estimates import Update, used_points
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.events import Event, ObservationEvent
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.settings import Settings
@@ -206,7 +206,7 @@ class _Run:
         self._seconds += time.thread_time() - start_s
         self._note_jump()
         self._sample()
-        if accepted and isinstance(event, VelocityEvent):
+        if accepted and not isinstance(event, ObservationEvent):
             self._blind.add(event)
             self._blind_sampler.sample()
 

@@ -15,7 +15,6 @@ from typing import TypeAlias
 import numpy as np
 
 from slam_observer_ros.events import (
-    Event,
     LandmarkTruth,
     ObservationEvent,
     PoseTruth,
@@ -112,7 +111,7 @@ class Scenario:
         return min((end for end in ends if end > 0.0), default=math.inf)
 
 
-SimulatedEvent: TypeAlias = Event | PoseTruth
+SimulatedEvent: TypeAlias = VelocityEvent | ObservationEvent | PoseTruth
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -208,7 +207,7 @@ class Simulation:
                 continue
             if rng.random() < self.scenario.drop_fraction:
                 continue
-            event: Event = (
+            event: VelocityEvent | ObservationEvent = (
                 self._velocity(stamp_ns, rng)
                 if kind == 'velocity'
                 else self._observation(stamp_ns, rng, is_new)

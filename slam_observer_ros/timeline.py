@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.hypotheses import Hypotheses
@@ -52,8 +52,8 @@ class Timeline:
         if self.state_ns is None:
             self.state_ns = stamp_ns
 
-    def append(self, event: VelocityEvent) -> None:
-        """Add a velocity.
+    def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
+        """Add a velocity; return whether it leads on from its stamp, or waits for its linear part.
 
         Raises
         ------
@@ -63,9 +63,11 @@ class Timeline:
         """
         if self.stamp_ns is not None and event.stamp_ns < self.stamp_ns:
             raise InvalidEventError('too_late', 'a newer event was already used')
-        self.velocities.append(event)
+        if not self.velocities.append(event):
+            return False
         self.begin(event.stamp_ns)
         self._pending += 1
+        return True
 
     @property
     def is_full(self) -> bool:

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
 from slam_observer_ros.types import FloatArray
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
@@ -28,16 +34,18 @@ def check_event(event: Event) -> None:
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
     if isinstance(event, VelocityEvent):
-        _check_velocity(event)
+        _check_velocity(event.body_velocity, event.covariance, 6)
+    elif isinstance(event, AngularVelocityEvent):
+        _check_velocity(event.angular_velocity, event.covariance, 3)
     else:
         _check_observation(event)
 
 
-def _check_velocity(event: VelocityEvent) -> None:
-    _check_coordinates('body velocity', event.body_velocity, (6,))
-    if event.covariance is not None:
-        _check_array('velocity covariance', event.covariance, (6, 6))
-        _check_definite('velocity covariance', event.covariance)
+def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: int) -> None:
+    _check_coordinates('velocity', velocity, (size,))
+    if covariance is not None:
+        _check_array('velocity covariance', covariance, (size, size))
+        _check_definite('velocity covariance', covariance)
 
 
 def _check_observation(event: ObservationEvent) -> None:

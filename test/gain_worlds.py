@@ -127,7 +127,8 @@ def position_error_m(estimator: Estimator, world: World) -> float:
 
 def _velocity_noise(model: NoiseModel, V: FloatArray, rng: np.random.Generator) -> FloatArray:
     zero, dt_s = np.zeros(len(V)), np.full(len(V), STEP_S)
-    held = HeldVelocities(V, [None] * len(V), dt_s, zero, zero)
+    unknown = np.zeros((len(V), 6, 6)), np.zeros((len(V), 2), dtype=bool)
+    held = HeldVelocities(V, *unknown, dt_s, zero, np.zeros((len(V), 2)))
     variances = np.diagonal(model.motion(held), axis1=1, axis2=2)
     return np.sqrt(variances) / STEP_S * rng.standard_normal(V.shape)
 

@@ -20,12 +20,15 @@ from slam_observer_ros.velocity_history import HeldVelocities
 
 def held(velocities, dt_s, gap_s=None, covariances=None):
     velocities = np.array(velocities, dtype=float)
+    k = len(velocities)
+    known = covariances or [None] * k
     return HeldVelocities(
         velocities,
-        covariances or [None] * len(velocities),
+        np.array([np.zeros((6, 6)) if c is None else c for c in known]).reshape(-1, 6, 6),
+        np.array([[c is not None] * 2 for c in known], dtype=bool).reshape(-1, 2),
         np.array(dt_s, dtype=float),
-        np.zeros(len(velocities)) if gap_s is None else np.array(gap_s, dtype=float),
-        np.zeros(len(velocities)),
+        np.zeros(k) if gap_s is None else np.array(gap_s, dtype=float),
+        np.zeros((k, 2)),
     )
 
 
@@ -119,7 +122,7 @@ def test_an_error_that_lasts_adds_up_however_often_its_motion_is_cut(cuts):
     given = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     dt_s = np.full(cuts, 2.0 / cuts)
     whole = held(np.zeros((cuts, 6)), dt_s, covariances=[given] * cuts)
-    whole = replace(whole, before_s=np.cumsum(dt_s) - dt_s)
+    whole = replace(whole, before_s=np.repeat((np.cumsum(dt_s) - dt_s)[:, None], 2, axis=1))
     total = NoiseModel(Settings()).motion(whole).sum(axis=0)
     np.testing.assert_allclose(total, 4.0 * given, rtol=1e-9)
 

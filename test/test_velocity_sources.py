@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from strategies import poses
 
 from slam_observer_ros.clock_offset import ClockOffset, SAMPLES
+from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.event_queue import EventQueue
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.settings import Settings
 from slam_observer_ros.velocity_history import VelocityHistory
-from slam_observer_ros.velocity_sources import AngularReplacement, PoseDifferences
+from slam_observer_ros.velocity_sources import PoseDifferences
 
 SECOND = 1_000_000_000
+START_NS = 100 * SECOND
+V = np.array([0.0, 0.0, 0.9, 1.0, 0.0, 0.0])
 
 
 @given(poses())
@@ -35,43 +46,110 @@ def test_poses_far_apart_or_in_wrong_order_give_no_velocity():
         assert differences.add(stamp_ns, np.eye(4)) is None
 
 
+def wheels(time_s, velocity, covariance=None):
+    stamp_ns = START_NS + round(time_s * SECOND)
+    return VelocityEvent(stamp_ns, np.array(velocity, dtype=float), covariance)
+
+
+def imu(time_s, turn, covariance=None):
+    stamp_ns = START_NS + round(time_s * SECOND)
+    return AngularVelocityEvent(stamp_ns, np.array(turn, dtype=float), covariance)
+
+
+def history_of(events):
+    """Return the history of events that were received in this order."""
+    queue, history = EventQueue(10 * SECOND, 10 * SECOND, SECOND), VelocityHistory(SECOND)
+    for event in events:
+        queue.push(event)  # raises if it is a duplicate
+    for event in queue.pop_all():
+        history.append(event)
+    return history
+
+
+def held_for(history, *times_s):
+    return history.held(*(START_NS + round(time_s * SECOND) for time_s in times_s))
+
+
 def test_imu_replaces_the_angular_part_while_it_is_in_time():
-    joined = AngularReplacement(SECOND)
-    wheels = VelocityEvent(SECOND, np.array([0.0, 0.0, 0.9, 1.0, 0.0, 0.0]), np.eye(6))
-    assert joined.add_angular(SECOND - 1, np.array([0.0, 0.0, 0.5]), np.eye(3) * 0.1) is None
-    event = joined.add_velocity(wheels)
-    assert_array_equal(event.body_velocity, [0.0, 0.0, 0.5, 1.0, 0.0, 0.0])
-    assert_array_equal(np.diag(event.covariance), [0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+    events = [imu(0.0, [0.0, 0.0, 0.5]), wheels(0.5, V), imu(0.6, [0.1, 0.0, 0.6])]
+    history = history_of([*events, wheels(1.4, V), wheels(1.7, V)])
+    held = held_for(history, 0.0, 2.0)
+    assert_allclose(held.dt_s, [0.0, 0.1, 0.8, 0.3, 0.3], atol=1e-9)
+    assert_allclose(held.gap_s, [0.5, 0.0, 0.0, 0.0, 0.0], atol=1e-9)
+    assert_array_equal(held.body_velocities[1], [0.0, 0.0, 0.5, 1.0, 0.0, 0.0])
+    assert_array_equal(held.body_velocities[2:4], [[0.1, 0.0, 0.6, 1.0, 0.0, 0.0]] * 2)
+    assert_array_equal(held.body_velocities[4], V, 'the IMU has timed out')
 
-    event = joined.add_angular(SECOND + 5, np.array([0.1, 0.0, 0.6]), None)
-    assert event.stamp_ns == SECOND + 5
-    assert_array_equal(event.body_velocity, [0.1, 0.0, 0.6, 1.0, 0.0, 0.0])
-    assert event.covariance is None, 'half a covariance is none'
 
-    late = VelocityEvent(3 * SECOND, wheels.body_velocity)
-    assert joined.add_velocity(late) is late, 'the IMU has timed out'
-    assert joined.add_angular(5 * SECOND, np.zeros(3), None) is None, 'the wheels have'
+def test_an_imu_alone_is_no_velocity():
+    history = VelocityHistory(SECOND)
+    assert not history.append(imu(0.0, [0.0, 0.0, 1.0])), 'the wheels have not begun'
+    assert history.append(wheels(0.1, V))
+    for time_s in (0.5, 1.0, 1.5):
+        history.append(imu(time_s, [0.0, 0.0, 1.0]))
+    assert history.latest(START_NS + SECOND) is not None
+    assert history.latest(START_NS + SECOND * 3 // 2) is None, 'the wheels have timed out'
+    held = held_for(history, 0.1, 2.0)
+    assert_allclose([held.dt_s.sum(), held.gap_s.sum()], [1.0, 0.9])
 
 
 @pytest.mark.parametrize('is_imu_first', [False, True])
 def test_both_parts_count_if_wheels_and_imu_have_the_same_stamps(is_imu_first):
-    joined, history = AngularReplacement(SECOND), VelocityHistory(SECOND)
-    queue = EventQueue(SECOND, 10 * SECOND, SECOND)
-    stamps_ns = [SECOND, SECOND + SECOND // 10, SECOND + SECOND // 5]
-    for number, stamp_ns in enumerate(stamps_ns):
-        wheels = VelocityEvent(stamp_ns, np.array([9.0, 9.0, 9.0, number, 0.0, 0.0]))
-        turn = np.array([0.0, 0.0, -number])
-        for is_imu in (is_imu_first, not is_imu_first):
-            event = (
-                joined.add_angular(stamp_ns, turn, None) if is_imu else joined.add_velocity(wheels)
-            )
-            if event is not None:
-                queue.push(event)  # raises if it is a duplicate
-    for event in queue.pop_all():
-        history.append(event)
-    for number, stamp_ns in enumerate(stamps_ns):
-        expected = [0.0, 0.0, -number, number, 0.0, 0.0]
-        assert_array_equal(history.latest(stamp_ns + 1), expected)
+    events = []
+    for number, time_s in enumerate([0.0, 0.1, 0.2]):
+        both = [imu(time_s, [0.0, 0.0, -number]), wheels(time_s, [9, 9, 9, number, 0, 0])]
+        events += both if is_imu_first else both[::-1]
+    held = held_for(history_of(events), 0.0, 0.3)
+    moved = held.dt_s[:, None] * held.body_velocities
+    expected = 0.1 * np.array([0.0, 0.0, -3.0, 3.0, 0.0, 0.0])
+    assert_allclose(moved.sum(axis=0), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize('imu_rate_hz', [1, 10, 100])
+def test_the_error_of_each_sensor_lasts_as_long_as_its_own_message_is_held(imu_rate_hz):
+    of_wheels, of_imu = np.diag([9.0, 9.0, 9.0, 1.0, 2.0, 3.0]), np.diag([4.0, 5.0, 6.0])
+    events: list[Event] = [wheels(n / 10, V, of_wheels) for n in range(10)]
+    events += [imu(n / imu_rate_hz, [0.0, 0.0, 1.0], of_imu) for n in range(imu_rate_hz)]
+    covariances = NoiseModel(Settings()).motion(held_for(history_of(events), 0.0, 1.0))
+    expected = [4 / imu_rate_hz, 5 / imu_rate_hz, 6 / imu_rate_hz, 0.1, 0.2, 0.3]
+    assert_allclose(covariances.sum(axis=0), np.diag(expected), atol=1e-12)
+
+
+@pytest.mark.parametrize('imu_knows', [False, True])
+@pytest.mark.parametrize('wheels_know', [False, True])
+def test_each_sensor_brings_its_own_covariance_or_has_the_parameters_noise(imu_knows, wheels_know):
+    settings = Settings(angular_velocity_noise=(0.1,) * 3, linear_velocity_noise=(0.2,) * 3)
+    events = [
+        wheels(0.0, V, np.diag([9.0, 9.0, 9.0, 1.0, 1.0, 1.0]) if wheels_know else None),
+        imu(0.0, [0.0, 0.0, 1.0], 0.25 * np.eye(3) if imu_knows else None),
+    ]
+    held = held_for(history_of(events), 0.0, 0.5)
+    covariance = NoiseModel(settings).motion(held).sum(axis=0)
+    angular = 0.25 * 0.5**2 if imu_knows else 0.1**2 * 0.5
+    linear = 1.0 * 0.5**2 if wheels_know else 0.2**2 * 0.5
+    assert_allclose(covariance, np.diag([angular] * 3 + [linear] * 3), atol=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_message_that_is_late_within_the_window_changes_not_a_bit(seed):
+    rng = np.random.default_rng(seed)
+    events: list[Event] = [wheels(n / 20, rng.normal(size=6)) for n in range(20)]
+    events += [imu(n / 50, rng.normal(size=3)) for n in range(50)]
+    points = rng.normal(size=(4, 3))
+    events += [ObservationEvent(START_NS + n * SECOND // 4, np.arange(4), points) for n in (1, 2)]
+    delays_s = 0.049 * rng.random(len(events))
+    received = sorted(
+        zip(events, delays_s, strict=True), key=lambda e: e[0].stamp_ns * 1e-9 + e[1]
+    )
+    in_order, late = (Estimator(Settings(reorder_window=0.05)) for _ in range(2))
+    for event in sorted(events, key=lambda event: event.stamp_ns):
+        assert in_order.add(event)
+    for event, _ in received:
+        assert late.add(event)
+    in_order.flush()
+    late.flush()
+    assert_array_equal(late.pose, in_order.pose)
+    assert_array_equal(late.pose_covariance, in_order.pose_covariance)
 
 
 def test_another_clock_is_found_and_corrected_once():

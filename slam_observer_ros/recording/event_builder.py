@@ -9,13 +9,13 @@ import logging
 from typing import TypeAlias
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityEvent
 from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
-from slam_observer_ros.velocity_sources import AngularReplacement, PoseDifferences
+from slam_observer_ros.velocity_sources import PoseDifferences
 
 MAX_WAITING = 1000
 """Most measurements that wait for a transform; the oldest go first."""
@@ -66,8 +66,7 @@ class EventBuilder:
     transform_timeout_s : float
         How long a measurement waits, seconds.
     velocity_timeout_s : float
-        How long a velocity holds, seconds: poses further apart give none, and an angular one
-        joins no linear one that is older.
+        How long a velocity holds, seconds: poses further apart give none.
     on_drop : callable
         Called with why a measurement is dropped.
 
@@ -80,12 +79,10 @@ class EventBuilder:
         velocity_timeout_s: float,
         on_drop: Callable[[TransformError], None],
     ) -> None:
-        velocity_timeout_ns = round(velocity_timeout_s * NANOSECONDS_PER_SECOND)
         self._base_frame = base_frame
         self._transform_timeout_ns = round(transform_timeout_s * NANOSECONDS_PER_SECOND)
         self._on_drop = on_drop
-        self._poses = PoseDifferences(velocity_timeout_ns)
-        self._joined = AngularReplacement(velocity_timeout_ns)
+        self._poses = PoseDifferences(round(velocity_timeout_s * NANOSECONDS_PER_SECOND))
         self._waiting: deque[_Waiting] = deque(maxlen=MAX_WAITING)
         self._taken_as_base: dict[str, tuple[int, VelocityMessage]] = {}
 
@@ -124,7 +121,7 @@ class EventBuilder:
 
     def _attempt(self, item: _Waiting, now_ns: int) -> list[Event]:
         try:
-            event = self._event(item.measured, now_ns)
+            event: Event | None = self._event(item.measured, now_ns)
         except TransformError as error:
             if now_ns < item.deadline_ns:
                 self._waiting.append(item)
@@ -132,12 +129,12 @@ class EventBuilder:
             event = self._give_up(item, error)
         return [] if event is None else [event]
 
-    def _event(self, measured: _InFrame, now_ns: int) -> Event | None:
+    def _event(self, measured: _InFrame, now_ns: int) -> Event:
         if isinstance(measured, VelocityMessage):
-            return self._joined.add_velocity(self._velocity(measured, now_ns))
+            return self._velocity(measured, now_ns)
         if isinstance(measured, ImuMessage):
             turned = self._base_frame.angular_velocity(measured)
-            return self._joined.add_angular(
+            return AngularVelocityEvent(
                 turned.stamp_ns, turned.angular_velocity, turned.covariance
             )
         if isinstance(measured, TagDetections):
@@ -187,4 +184,4 @@ class EventBuilder:
             self._base_frame.name,
             error,
         )
-        return self._joined.add_velocity(measured.event)
+        return measured.event
