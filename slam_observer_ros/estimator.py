@@ -49,12 +49,12 @@ class Estimator:
     Attributes
     ----------
     counts : Counter
-        Events used, by kind (``'velocity'``, ``'observation'``, ``'late_observation'``), points
-        in these observations (``'observed_point'``), observations made before the place in a
-        loaded map was found (``'not_localised'``), how often it was lost again (``'lost'``), and
-        what became of landmarks (``'rejected_landmark'``, ``'moved_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``, which are not
-        used).
+        Events used, by kind (``'velocity'``, ``'observation'``), those of them that came late
+        (``'late_velocity'``, ``'late_observation'``), points in observations
+        (``'observed_point'``), observations made before the place in a loaded map was found
+        (``'not_localised'``), how often it was lost again (``'lost'``), and what became of
+        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``,
+        ``'unsupported_landmark'``, and ``'unknown_id'``, which are not used).
     dropped : Counter
         Events refused, by reason.
     jumps : int
@@ -339,12 +339,15 @@ class Estimator:
             self._process_velocity(event)
 
     def _process_velocity(self, event: VelocityEvent | AngularVelocityEvent) -> None:
+        is_late = self._timeline.is_late(event)
         try:
             is_used = self._timeline.append(event)
         except InvalidEventError as error:
             self._drop(error)
             return
         self._counts['velocity'] += is_used
+        if is_late:
+            self._tell_of_late()
         if self._timeline.is_full:
             self._timeline.advance(self._frame.states, event.stamp_ns)
 
@@ -368,6 +371,15 @@ class Estimator:
         self._last = Update(event.stamp_ns, observer.pose, ids, residuals, level)
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _tell_of_late(self) -> None:
+        self._counts['late_velocity'] += 1
+        if _is_power_of_ten(self._counts['late_velocity']):
+            logger.warning(
+                'A velocity came later than reorder_window allows and counts only from then on '
+                '(%d so far).',
+                self._counts['late_velocity'],
+            )
 
     def _tell_of_moved(self, ids: IntArray) -> None:
         if not len(ids):

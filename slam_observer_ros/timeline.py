@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.hypotheses import Hypotheses
@@ -45,6 +45,11 @@ class Timeline:
         # A delay, and beyond it half of what velocities are averaged over to estimate it.
         self._kept_ns = round((settings.late_limit + 2.0 * MAX_DELAY_S) * 1e9)
         self._pending = 0
+        self._newest_ns: dict[type, int] = {}
+
+    def is_late(self, event: Event) -> bool:
+        """Return whether a newer event was used already."""
+        return event.stamp_ns < (self.stamp_ns or 0)
 
     def begin(self, stamp_ns: int) -> None:
         """Note the stamp of an event that is about to be used."""
@@ -55,14 +60,20 @@ class Timeline:
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
         """Add a velocity; return whether it leads on from its stamp, or waits for its linear part.
 
+        Where a newer event was used before it, it leads on from there.
+
         Raises
         ------
         InvalidEventError
-            If a newer event was used before it (``'too_late'``).
+            If a newer velocity of its kind was used before it (``'too_late'``).
 
         """
-        if self.stamp_ns is not None and event.stamp_ns < self.stamp_ns:
-            raise InvalidEventError('too_late', 'a newer event was already used')
+        kind = type(event)
+        if event.stamp_ns < self._newest_ns.get(kind, 0):
+            raise InvalidEventError('too_late', 'a newer velocity was already used')
+        self._newest_ns[kind] = event.stamp_ns
+        if self.is_late(event):
+            event = replace(event, stamp_ns=self.stamp_ns or 0)
         if not self.velocities.append(event):
             return False
         self.begin(event.stamp_ns)

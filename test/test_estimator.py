@@ -130,6 +130,15 @@ def test_an_observation_later_than_the_window_is_carried_forward():
     np.testing.assert_allclose(estimator.world_points, LANDMARKS, atol=1e-9)
 
 
+def test_a_velocity_later_than_the_window_counts_from_then_on():
+    fast, faster = np.array([0.0, 0, 0, 1, 0, 0]), np.array([0.0, 0, 0, 2, 0, 0])
+    events = [velocity(0.0, 0 * fast), observation(1.0), velocity(0.9, faster)]
+    estimator = run([*events, velocity(0.8, fast), observation(1.5, [])], reorder_window=0.0)
+    np.testing.assert_allclose(estimator.pose[:3, 3], [1.0, 0.0, 0.0], atol=1e-9)
+    assert estimator.counts['late_velocity'] == 1
+    assert estimator.dropped == {'too_late': 1}, 'a newer velocity was known before it'
+
+
 def test_an_event_later_than_the_limit_is_refused():
     events = [velocity(0.05 * step) for step in range(100)] + [observation(1.0)]
     estimator = run(events, reorder_window=0.1, late_limit=1.0)

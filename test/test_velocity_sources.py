@@ -152,6 +152,20 @@ def test_a_message_that_is_late_within_the_window_changes_not_a_bit(seed):
     assert_array_equal(late.pose_covariance, in_order.pose_covariance)
 
 
+def test_wheels_later_than_the_window_still_move_the_robot_beside_an_imu():
+    received = [
+        (event.stamp_ns, event) for event in (imu(n / 50, np.zeros(3)) for n in range(100))
+    ]
+    straight = [wheels(n / 20, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]) for n in range(40)]
+    received += [(event.stamp_ns + SECOND // 10 + 1, event) for event in straight]
+    estimator = Estimator(Settings(reorder_window=0.05))
+    for _, event in sorted(received, key=lambda pair: pair[0]):
+        assert estimator.add(event)
+    estimator.flush()
+    assert_allclose(estimator.pose[0, 3], 1.98, atol=1e-6)
+    assert estimator.dropped.total() == 0
+
+
 def test_another_clock_is_found_and_corrected_once():
     clock = ClockOffset(SECOND)
     for index in range(SAMPLES):
