@@ -331,6 +331,18 @@ def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad
     assert (due.index(True) + 1 if any(due) else None) == due_after
 
 
+def test_what_odometry_leaves_open_in_space_is_told_once_with_what_to_do(caplog):
+    world = drive(Settings(two_d_mode=True), 10.0, seen=1)
+    covariance = np.diag([1e12, 1e12, 1e-3, 1e-3, 1e-3, 1e12])
+    estimator = Estimator(Settings(hindsight_turn=0.01))
+    for event in world.events:
+        is_velocity = isinstance(event, VelocityEvent)
+        estimator.add(replace(event, covariance=covariance) if is_velocity else event)
+    (warning,) = caplog.messages
+    assert warning.startswith('Could not look back')
+    assert warning.endswith('set two_d_mode: true for a robot on a floor.')
+
+
 def test_observations_of_nothing_take_no_room_in_the_window_and_tell_nothing():
     settings = Settings(hindsight_interval=10, hindsight_turn=0.0, hindsight_window=0)
     world = drive(settings, 15.0)

@@ -63,6 +63,7 @@ class Hindsight:
     def __init__(self, axes: Axes, settings: Settings, prior: Prior) -> None:
         self.settings = settings
         self._axes = axes
+        self._warning = _Warning()
         self.restart(prior)
 
     def restart(self, prior: Prior) -> None:
@@ -102,14 +103,14 @@ class Hindsight:
     def linearise_anew(self, start: Solution) -> tuple[Step, FloatArray] | None:
         """Return the last step from ``start``, and the covariance where all was linearised.
 
-        None, after a warning, if the observations don't determine everything.
+        None, the first time after a warning, if the observations don't determine everything.
         """
         self._rest()
         try:
             step = self._smoother().smooth(start, ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
-            logger.warning('Could not look back: the observations so far leave something open.')
+            self._warning.give()
             return None
         self.history.poses = list(step.end.poses)
         return step, covariance
@@ -134,3 +135,23 @@ class Hindsight:
     def _smoother(self) -> Smoother:
         history = self.history
         return Smoother(self._axes, history.prior, history.frames(), self.settings)
+
+
+class _Warning:
+    """Says once what may be amiss, for all copies of its owner: hypotheses are copies."""
+
+    def __init__(self) -> None:
+        self._is_given = False
+
+    def __deepcopy__(self, _memo: object) -> _Warning:
+        return self
+
+    def give(self) -> None:
+        if self._is_given:
+            return
+        self._is_given = True
+        logger.warning(
+            'Could not look back (told only once): the observations so far leave something open, '
+            'as where covariances are so large that they say nothing. Odometry often has such for '
+            'z, roll and pitch: set two_d_mode: true for a robot on a floor.'
+        )
