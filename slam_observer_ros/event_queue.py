@@ -11,7 +11,10 @@ from slam_observer_ros.events import Event, ObservationEvent
 Key: TypeAlias = tuple[int, bool, bytes]
 
 CONFIRMATIONS = 5
-"""How many events in a row must agree before a jump of the clock is believed."""
+"""How many stamps in a row must agree before a pause or a jump of the clock is believed."""
+
+NEAR_NS = 1_000_000_000
+"""Stamps nearer than this to the newest one tell of no pause or jump, nanoseconds."""
 
 LEAST_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
@@ -25,26 +28,38 @@ class EventQueue:
     of one kind and stamp is a duplicate; so is an observation that has the ids and points of
     another one.
 
+    A stamp ahead by more than events may be late would make all that follow too late if it were
+    wrong. Unless events come that seldom, it waits until time has come there, or until others
+    say that there was a pause.
+
     Parameters
     ----------
     window_ns : int
         How far behind the newest stamp an event is given out, nanoseconds.
     max_jump_ns : int
-        How far ahead of the newest stamp an event may be, nanoseconds.
+        How long a pause may be, nanoseconds: what is further ahead is refused.
     late_limit_ns : int
         How far behind the window an event may be, nanoseconds.
+
+    Attributes
+    ----------
+    newest_ns : int or None
+        Newest stamp that is believed, nanoseconds.
 
     """
 
     def __init__(self, window_ns: int, max_jump_ns: int, late_limit_ns: int) -> None:
         self._window_ns = window_ns
         self._max_jump_ns = max_jump_ns
-        self._late_limit_ns = late_limit_ns
+        self._reach_ns = window_ns + late_limit_ns
+        self._near_ns = max(self._reach_ns, NEAR_NS)
         self._heap: list[tuple[Key, Event]] = []
         self._known: set[Key] = set()
         self._most_known = LEAST_KNOWN
         self._strays = 0
         self._stray_ns = 0
+        # The newest stamp that is taken, believed or not; how far the believed one moved last.
+        self._lead_ns = self._step_ns = 0
         self.newest_ns: int | None = None
 
     def push(self, event: Event) -> bool:
@@ -57,10 +72,27 @@ class EventQueue:
             is already known (``'duplicate'``).
 
         """
-        jumped = self._check(event.stamp_ns)
-        if not jumped:
-            self._insert(event)
-        return jumped
+        stamp_ns = event.stamp_ns
+        if self.newest_ns is None:
+            self.newest_ns = self._lead_ns = stamp_ns
+        ahead_ns = stamp_ns - self.newest_ns
+        usual_ns = min(max(self._near_ns, 2 * self._step_ns), self._max_jump_ns)
+        is_near = -self._near_ns <= ahead_ns <= usual_ns
+        too_late = ahead_ns < -self._reach_ns
+        too_early = stamp_ns > self._lead_ns + self._max_jump_ns
+        if too_late or too_early:
+            if not is_near and self._is_confirmed(stamp_ns):
+                return True
+            raise _refusal(ahead_ns)
+        self._insert(event)
+        if is_near:
+            self._strays = 0
+            self._believe(max(self.newest_ns, stamp_ns))
+            return False
+        self._lead_ns = max(self._lead_ns, stamp_ns)
+        if self._is_confirmed(stamp_ns):
+            self._believe(self._lead_ns)
+        return False
 
     def pop_ready(self) -> list[Event]:
         """Give out, in order, the events that have left the window."""
@@ -86,35 +118,38 @@ class EventQueue:
             raise InvalidEventError('duplicate', 'an event with this stamp is already known')
         self._known.add(key)
         heapq.heappush(self._heap, (key, event))
-        if self.newest_ns is None or stamp_ns > self.newest_ns:
-            self.newest_ns = stamp_ns
         if len(self._known) > self._most_known:
             self._forget_old()
 
     def _forget_old(self) -> None:
         """Forget events so old that they would be refused as too late; O(1) for each event."""
-        oldest_ns = (self.newest_ns or 0) - self._window_ns - self._late_limit_ns
+        oldest_ns = (self.newest_ns or 0) - self._reach_ns
         self._known = {key for key in self._known if key[0] >= oldest_ns}
         self._most_known = max(2 * len(self._known), LEAST_KNOWN)
 
-    def _check(self, stamp_ns: int) -> bool:
-        """Return whether ``stamp_ns`` confirms a jump; raise if it is the first to claim one."""
-        if self.newest_ns is None:
-            return False
-        ahead_ns = stamp_ns - self.newest_ns
-        too_early = ahead_ns > self._max_jump_ns
-        too_late = ahead_ns < -(self._window_ns + self._late_limit_ns)
-        if not (too_early or too_late):
-            self._strays = 0
-            return False
-        agrees = abs(stamp_ns - self._stray_ns) <= self._max_jump_ns
-        self._strays = self._strays + 1 if agrees else 1
+    def _believe(self, newest_ns: int) -> None:
+        step_ns = newest_ns - (self.newest_ns or 0)
+        if step_ns > 0:
+            self._step_ns = step_ns
+        self.newest_ns = self._lead_ns = newest_ns
+
+    def _is_confirmed(self, stamp_ns: int) -> bool:
+        """Count a stamp far from the newest one; return whether enough have agreed on it now.
+
+        Events of one stamp count once: they may be of one message.
+        """
+        newest_ns = self.newest_ns or 0
+        same_side = (stamp_ns > newest_ns) == (self._stray_ns > newest_ns)
+        agrees = same_side and abs(stamp_ns - self._stray_ns) <= self._max_jump_ns
+        self._strays = self._strays + (stamp_ns != self._stray_ns) if agrees else 1
         self._stray_ns = stamp_ns
-        if self._strays >= CONFIRMATIONS:
-            self._strays = 0
-            return True
-        reason = 'stamp_jump' if too_early else 'too_late'
-        side = 'ahead of' if too_early else 'behind'
-        raise InvalidEventError(
-            reason, f"stamp is {abs(ahead_ns) / 1e9:.3f} s {side} the newest event's"
-        )
+        if self._strays < CONFIRMATIONS:
+            return False
+        self._strays = 0
+        return True
+
+
+def _refusal(ahead_ns: int) -> InvalidEventError:
+    reason, side = ('stamp_jump', 'ahead of') if ahead_ns > 0 else ('too_late', 'behind')
+    message = f"stamp is {abs(ahead_ns) / 1e9:.3f} s {side} the newest event's"
+    return InvalidEventError(reason, message)

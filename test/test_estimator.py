@@ -233,6 +233,18 @@ def test_one_stray_stamp_is_refused_but_a_clock_that_jumped_is_followed():
     assert estimator.newest_stamp_ns == jumped[-1].stamp_ns
 
 
+@pytest.mark.parametrize('ahead_s', [2.5, 9.0])
+@pytest.mark.parametrize('reorder_window', [0.0, 0.05])
+def test_one_stamp_ahead_does_not_cost_the_map(ahead_s, reorder_window):
+    events = drive()
+    ahead = VelocityEvent(events[60].stamp_ns + round(ahead_s * 1e9) + 1, BODY_VELOCITY)
+    settings = {'reorder_window': reorder_window}
+    right, wrong = run(events, **settings), run([*events[:60], ahead, *events[60:]], **settings)
+    assert wrong.jumps == 0
+    assert wrong.counts['observation'] == right.counts['observation']
+    np.testing.assert_allclose(wrong.world_points, right.world_points, atol=0.02)
+
+
 def test_an_empty_observation_moves_the_state_on_and_nothing_else():
     empty = ObservationEvent(START_NS + 10**9, np.empty(0, dtype=np.int64), np.empty((0, 3)))
     estimator = run([velocity(0.0), empty], velocity_timeout=2.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -23,8 +25,12 @@ def observation(stamp_ns, ids=(1,)):
     return ObservationEvent(START_NS + stamp_ns, np.array(ids), np.zeros((len(ids), 3)))
 
 
-def make_queue(window_ns=100, max_jump_ns=1000, late_limit_ns=500):
+def make_queue(window_ns=100, max_jump_ns=10 * SECOND, late_limit_ns=2 * SECOND):
     return EventQueue(window_ns, max_jump_ns, late_limit_ns)
+
+
+def dense(stop_ns, step_ns=SECOND // 50):
+    return [velocity(stamp_ns) for stamp_ns in range(0, stop_ns, step_ns)]
 
 
 def filled(*events, **limits):
@@ -91,39 +97,95 @@ def test_two_sensors_may_see_different_landmarks_at_one_instant():
 def test_keys_of_old_events_are_forgotten():
     queue = make_queue()
     for k in range(2000):
-        queue.push(velocity(100 * k))
+        queue.push(velocity(SECOND // 100 * k))
         queue.pop_ready()
     assert len(queue._known) <= LEAST_KNOWN
 
 
 @pytest.mark.parametrize(
-    ('stamp_ns', 'reason'), [(1601, 'stamp_jump'), (-1, 'too_late'), (-START_NS, 'too_late')]
+    ('stamp_ns', 'reason'),
+    [
+        (12 * SECOND + 1, 'stamp_jump'),
+        (-101, 'too_late'),
+        (-START_NS, 'too_late'),
+    ],
 )
 def test_stamps_far_from_all_others_are_refused(stamp_ns, reason):
-    queue = filled(velocity(0), velocity(600))
+    queue = filled(velocity(0), velocity(2 * SECOND))
     list(queue.pop_ready())
     with pytest.raises(InvalidEventError) as error:
         queue.push(velocity(stamp_ns))
     assert error.value.reason == reason
     assert '\n' not in str(error.value)
-    assert queue.newest_ns == START_NS + 600
+    assert queue.newest_ns == START_NS + 2 * SECOND
 
 
-@pytest.mark.parametrize('stamp_ns', [1600, 600, 599, 1])
+@pytest.mark.parametrize('stamp_ns', [12 * SECOND, 2 * SECOND, 2 * SECOND - 1, -100])
 def test_stamps_at_the_limits_are_taken(stamp_ns):
-    queue = filled(velocity(0), velocity(600))
+    queue = filled(velocity(0), velocity(2 * SECOND))
     assert not queue.push(observation(stamp_ns))
 
 
+@pytest.mark.parametrize('late_limit_ns', [0, 2 * SECOND])
+@pytest.mark.parametrize('ahead_s', [0.5, 2.5, 9.0, 20.0])
+def test_one_stamp_ahead_tells_of_no_jump_of_the_clock(ahead_s, late_limit_ns):
+    queue = filled(*dense(SECOND), late_limit_ns=late_limit_ns)
+    with contextlib.suppress(InvalidEventError):
+        assert not queue.push(velocity(SECOND + round(ahead_s * SECOND) + 1))
+    for event in dense(20 * SECOND)[50:]:
+        with contextlib.suppress(InvalidEventError):
+            assert not queue.push(event)
+        queue.pop_ready()
+    assert queue.newest_ns == event.stamp_ns
+
+
+def test_nothing_is_lost_after_one_stamp_ahead():
+    queue = filled(*dense(SECOND), velocity(6 * SECOND + 1), *dense(9 * SECOND)[50:])
+    assert stamps(queue.pop_all()) == sorted([*stamps(dense(9 * SECOND)), 6 * SECOND + 1])
+
+
+def test_a_pause_is_believed_when_enough_events_agree_and_none_of_them_is_lost():
+    events = [*dense(SECOND), *dense(11 * SECOND)[540:]]
+    queue = filled(*events[: 50 + CONFIRMATIONS - 1])
+    assert queue.newest_ns == events[49].stamp_ns
+    for event in events[50 + CONFIRMATIONS - 1 :]:
+        assert not queue.push(event)
+        assert queue.newest_ns == event.stamp_ns
+    assert queue.pop_all() == events
+
+
+def test_where_events_come_seldom_none_waits_for_others():
+    events = dense(60 * SECOND, step_ns=5 * SECOND)
+    queue = filled(*events[: 1 + CONFIRMATIONS], window_ns=0)
+    assert queue.pop_ready() == events[: 1 + CONFIRMATIONS]
+    for event in events[1 + CONFIRMATIONS :]:
+        assert not queue.push(event)
+        assert queue.pop_ready() == [event]
+
+
+def test_events_of_one_message_do_not_confirm_each_other():
+    queue = filled(*dense(SECOND))
+    for number in range(2 * CONFIRMATIONS):
+        assert not queue.push(observation(5 * SECOND, [number]))
+    assert queue.newest_ns < START_NS + SECOND
+
+
+def test_a_sensor_with_a_clock_that_is_ahead_waits_for_the_others():
+    queue = make_queue()
+    for event in dense(10 * SECOND):
+        assert not queue.push(event)
+        assert not queue.push(observation(event.stamp_ns - START_NS + 3 * SECOND))
+    assert queue.newest_ns == event.stamp_ns
+
+
 def test_stamps_that_do_not_agree_confirm_no_jump():
-    queue = make_queue(max_jump_ns=1000)
-    queue.push(velocity(START_NS))
-    for far_ns in (10**12, 3, 10**14, 7, 10**13, 10**15, 10**12, 10**14):
+    queue = filled(*dense(SECOND))
+    for far_s in (100, -20, 200, -40, 1000, 300, -70, 500):
         with pytest.raises(InvalidEventError):
-            queue.push(velocity(START_NS + far_ns if far_ns > 10 else far_ns - START_NS))
+            queue.push(velocity(far_s * SECOND))
 
 
-@pytest.mark.parametrize('jump_ns', [10**15, -(10**15)])
+@pytest.mark.parametrize('jump_ns', [10**15, -(10**15), -3 * SECOND])
 def test_a_jump_of_the_clock_is_believed_when_enough_events_agree(jump_ns):
     queue = filled(velocity(0))
     for k in range(CONFIRMATIONS - 1):
