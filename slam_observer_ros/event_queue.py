@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import blake2b
 import heapq
 from typing import TypeAlias
 
@@ -24,9 +25,9 @@ class EventQueue:
     """Holds events back for a reorder window, then gives them out in stamp order.
 
     Of two events with one stamp the velocity comes first, and two observations are ordered by
-    their ids and points, so the order does not depend on which arrived first. A second velocity
-    of one kind and stamp is a duplicate; so is an observation that has the ids and points of
-    another one.
+    a digest of their ids and points, so the order does not depend on which arrived first. A
+    second velocity of one kind and stamp is a duplicate; so is an observation that has the ids
+    and points of another one.
 
     A stamp ahead by more than events may be late would make all that follow too late if it were
     wrong. Unless events come that seldom, it waits until time has come there, or until others
@@ -109,11 +110,7 @@ class EventQueue:
         return events
 
     def _insert(self, event: Event) -> None:
-        stamp_ns = event.stamp_ns
-        if isinstance(event, ObservationEvent):
-            key = (stamp_ns, True, event.ids.tobytes() + event.points.tobytes())
-        else:
-            key = (stamp_ns, False, type(event).__name__.encode())
+        key = _key(event)
         if key in self._known:
             raise InvalidEventError('duplicate', 'an event with this stamp is already known')
         self._known.add(key)
@@ -147,6 +144,14 @@ class EventQueue:
             return False
         self._strays = 0
         return True
+
+
+def _key(event: Event) -> Key:
+    if not isinstance(event, ObservationEvent):
+        return event.stamp_ns, False, type(event).__name__.encode()
+    # Keys outlive their events, which may be clouds of many points.
+    content = event.ids.tobytes() + event.points.tobytes()
+    return event.stamp_ns, True, blake2b(content, digest_size=16).digest()
 
 
 def _refusal(ahead_ns: int) -> InvalidEventError:

@@ -94,6 +94,12 @@ def test_two_sensors_may_see_different_landmarks_at_one_instant():
     assert len(list(queue.pop_all())) == 2
 
 
+def test_what_is_known_of_an_event_does_not_grow_with_its_points():
+    queue = filled(observation(3, range(10_000)))
+    ((_, _, content),) = queue._known
+    assert len(content) < 100
+
+
 def test_keys_of_old_events_are_forgotten():
     queue = make_queue()
     for k in range(2000):
