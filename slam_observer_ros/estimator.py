@@ -357,7 +357,7 @@ class Estimator:
         timeline = self._timeline
         timeline.begin(event.stamp_ns)
         if event.stamp_ns < (timeline.state_ns or 0):
-            event = timeline.carry_forward(event, self._slam.gains.calibration)
+            event = timeline.carry_forward(event, self._slam)
             self._counts['late_observation'] += 1
         timeline.advance(self._frame.states, event.stamp_ns)
         ids, residuals = self._frame.states.observe(event)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import reduce
+from itertools import accumulate
 
 import numpy as np
 
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.motion import Motion
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray
@@ -22,6 +23,22 @@ def transition(
     held = _held(velocities, calibration, start_ns, end_ns)
     V = calibration.apply(held.body_velocities)
     return reduce(np.matmul, se3.exp(V * held.dt_s[:, None]), np.eye(4))
+
+
+def transition_covariance(
+    velocities: VelocityHistory,
+    calibration: Calibration,
+    noise: NoiseModel,
+    start_ns: int,
+    end_ns: int,
+) -> FloatArray:
+    """Return that (6, 6) of w in exp(w) Φ, Φ the :func:`transition`: body frame at its start."""
+    held = _held(velocities, calibration, start_ns, end_ns)
+    motions = se3.exp(calibration.apply(held.body_velocities) * held.dt_s[:, None])
+    starts = list(accumulate(motions[:-1], np.matmul, initial=np.eye(4)))
+    Ad = se3.adjoint(np.array(starts))
+    covariance: FloatArray = (Ad @ noise.motion(held) @ so3.transpose(Ad)).sum(axis=0)
+    return covariance
 
 
 def motion(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from slam_observer_ros.axes import SPATIAL
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.calibration import Calibration
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.hypotheses import Hypotheses
-from slam_observer_ros.odometry import transition
+from slam_observer_ros.odometry import transition, transition_covariance
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
+from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.velocity_history import VelocityHistory
 
@@ -105,17 +107,27 @@ class Timeline:
             return se3.inverse(self.motion(calibration, end_ns, start_ns))
         return transition(self.velocities, calibration, start_ns, end_ns)
 
-    def carry_forward(self, event: ObservationEvent, calibration: Calibration) -> ObservationEvent:
-        """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since."""
+    def carry_forward(self, event: ObservationEvent, slam: Slam) -> ObservationEvent:
+        """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
+
+        Its points are as uncertain as they were, and as that motion makes them. Its error is one
+        and the same for all m, but is given to each as its own: m of them would average it down.
+        """
         state_ns = event.stamp_ns if self.state_ns is None else self.state_ns
-        back = self.motion(calibration, state_ns, event.stamp_ns)
+        back = self.motion(slam.gains.calibration, state_ns, event.stamp_ns)
         turn, points = back[:3, :3], event.points
         if event.velocities is not None:
             points = points + event.velocities * (state_ns - event.stamp_ns) * 1e-9
+        Q = transition_covariance(
+            self.velocities, slam.gains.calibration, slam.noise, event.stamp_ns, state_ns
+        )
+        C = SPATIAL.output_matrix(points)
+        moved = len(points) * C @ Q @ so3.transpose(C)
+        covariances = slam.noise.observation(event) + moved
         return replace(
             event,
             stamp_ns=state_ns,
             points=se3.transform(back, points),
-            covariances=None if event.covariances is None else turn @ event.covariances @ turn.T,
+            covariances=turn @ covariances @ turn.T,
             velocities=None if event.velocities is None else se3.rotate(back, event.velocities),
         )

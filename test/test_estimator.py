@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gain_worlds
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -12,10 +13,15 @@ import pytest
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.evaluation.consistency import average_nees
+from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.event_queue import CONFIRMATIONS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam import Slam
+from slam_observer_ros.timeline import Timeline
 
 START_NS = 1_700_000_000_000_000_000
 LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 1], [0, 4, 0.5], [1, -4, 0], [2, 2, 2]])
@@ -137,6 +143,49 @@ def test_a_velocity_later_than_the_window_counts_from_then_on():
     np.testing.assert_allclose(estimator.pose[:3, 3], [1.0, 0.0, 0.0], atol=1e-9)
     assert estimator.counts['late_velocity'] == 1
     assert estimator.dropped == {'too_late': 1}, 'a newer velocity was known before it'
+
+
+@pytest.mark.parametrize('are_given', [False, True])
+def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_given):
+    settings = Settings(
+        observation_model='cartesian',
+        point_noise=0.1,
+        angular_velocity_noise=(0.0, 0.0, 0.2),
+        linear_velocity_noise=(0.3, 0.0, 0.0),
+    )
+    slam, timeline = Slam(settings, np.eye(4)), Timeline(settings)
+    turning = np.array([0.0, 0.0, 1e-9, 0.0, 0.0, 0.0])
+    for step in range(21):
+        timeline.append(velocity(0.1 * step, turning))
+    timeline.advance(Hypotheses(slam, settings), START_NS + 2 * 10**9)
+    given_m2 = 0.01 * np.eye(3)[None] if are_given else None
+    event = ObservationEvent(START_NS + 10**9, np.array([1]), np.array([[5.0, 0, 0]]), given_m2)
+    carried = timeline.carry_forward(event, slam)
+    expected = np.diag([0.01 + 0.3**2, 0.01 + (5.0 * 0.2) ** 2, 0.01])
+    np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_observations_that_come_late_among_others_leave_the_covariance_honest(two_d_mode):
+    settings = Settings(
+        two_d_mode=two_d_mode, reorder_window=0.0, observation_model='cartesian', point_noise=0.02
+    )
+    errors, covariances = [], []
+    for seed in range(4):
+        world = gain_worlds.drive(settings, 20.0, seed, seen=3)
+        late = {id(event) for event in world.observations()[1::2]}
+        arrivals = {
+            id(event): event.stamp_ns + 1.9e9 * (id(event) in late) for event in world.events
+        }
+        estimator = Estimator(settings)
+        for event in sorted(world.events, key=lambda event: arrivals[id(event)]):
+            estimator.add(event)
+            if isinstance(event, ObservationEvent) and event.stamp_ns % (5 * 10**9) == 0:
+                truth = world.true_pose(estimator.stamp_ns)
+                errors.append(pose_errors(estimator.pose, truth))
+                covariances.append(estimator.pose_covariance)
+        assert estimator.counts['late_observation'] > 30
+    assert average_nees(np.array(errors), np.array(covariances)) < 2.0
 
 
 def test_an_event_later_than_the_limit_is_refused():

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from strategies import generators
 
+from slam_observer_ros.axes import SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.odometry import transition, transition_covariance
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.velocity_history import HeldVelocities
+from slam_observer_ros.velocity_history import HeldVelocities, VelocityHistory
 
 
 def held(velocities, dt_s, gap_s=None, covariances=None):
@@ -138,6 +141,34 @@ def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(gains, variance)
         assert estimator.add(VelocityEvent(step * 10**8, np.zeros(6), np.diag(known)))
         assert estimator.add(ObservationEvent(step * 10**8, np.arange(4), points))
     np.testing.assert_allclose(estimator.pose, np.eye(4), atol=0.2)
+
+
+@given(generators())
+def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
+    settings = Settings(angular_velocity_noise=(0.01,) * 3, linear_velocity_noise=(0.02,) * 3)
+    pieces, dt_ns = 5, 10_000_000
+    V = rng.normal(size=(pieces, 6))
+
+    def way(V):
+        history = VelocityHistory(10**9)
+        for piece, velocity in enumerate(V):
+            history.append(VelocityEvent(piece * dt_ns, velocity))
+        return history, Calibration(Settings(), SPATIAL)
+
+    def error(piece, w):
+        moved = V.copy()
+        moved[piece] += w / (dt_ns * 1e-9)
+        Phi = transition(*way(V), 0, pieces * dt_ns)
+        return se3.log(transition(*way(moved), 0, pieces * dt_ns) @ se3.inverse(Phi))
+
+    expected = np.zeros((6, 6))
+    Q = np.diag([1e-4] * 3 + [4e-4] * 3) * dt_ns * 1e-9
+    for piece in range(pieces):
+        F = np.array([error(piece, 1e-6 * w) / 1e-6 for w in np.eye(6)]).T
+        expected += F @ Q @ F.T
+    found = transition_covariance(*way(V), NoiseModel(settings), 0, pieces * dt_ns)
+    # A rate's noise is taken to act at the piece's beginning, not throughout: hence 2 %.
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
 
 def test_no_motion_has_no_covariances():
