@@ -140,7 +140,7 @@ def _as_innovation(
     """Return what it would be to see the landmarks ``rows`` (q,) at ``points`` (q, 3)."""
     a = observer.a[rows]
     e = points - a
-    return Innovation(rows, e, e - observer.y_ref[rows], a, noise, 0.0)
+    return Innovation(rows, e, e - observer.y_ref[rows], a, noise, np.zeros(len(rows)))
 
 
 def _largest(vectors: FloatArray) -> float:

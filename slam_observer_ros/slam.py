@@ -93,7 +93,6 @@ class Slam:
         self.moved_ids = np.empty(0, dtype=np.int64)
         self.rejected_in_a_row = 0
         self.noise = NoiseModel(settings)
-        self._innovation_ns: int | None = None
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
@@ -163,7 +162,7 @@ class Slam:
 
     def restart_time(self) -> None:
         """Go on from here at any other time; what was seen before can't be looked back at."""
-        self._innovation_ns = self._end_velocity = None
+        self._end_velocity = None
         self.landmarks.restart_time()
         self.gains.restart(self.observer)
 
@@ -309,7 +308,6 @@ class Slam:
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
-        self._innovation_ns = event.stamp_ns
         rejected = weights == 0.0
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
@@ -325,14 +323,14 @@ class Slam:
     ) -> Innovation:
         """Return what the landmarks ``rows`` (m,), seen with ``covariances`` (m, 3, 3), tell."""
         e, r = self.observer.errors(rows, event.points)
-        since_ns = event.stamp_ns if self._innovation_ns is None else self._innovation_ns
+        unseen_ns = event.stamp_ns - self.landmarks.last_seen_ns[rows]
         return Innovation(
             rows,
             e,
             r,
             self.observer.a[rows],
             self.turned(covariances),
-            (event.stamp_ns - since_ns) * 1e-9,
+            unseen_ns.astype(np.float64) * 1e-9,
         )
 
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
@@ -414,5 +412,3 @@ class Slam:
         self.observer.add_landmarks(event.points)
         self.gains.add_landmarks(self.observer.y_ref[-m:], self.turned(covariances[:m]))
         self.landmarks.add(event.ids, event.stamp_ns)
-        if self._innovation_ns is None:
-            self._innovation_ns = event.stamp_ns

@@ -43,7 +43,8 @@ class Filter:
 
     def innovation(self, indices, points, covariances):
         e, r = self.observer.errors(indices, points)
-        return Innovation(indices, e, r, self.observer.a[indices], self._turned(covariances), 0.1)
+        dt_s = np.full(len(r), 0.1)
+        return Innovation(indices, e, r, self.observer.a[indices], self._turned(covariances), dt_s)
 
     def see(self, indices, points, covariances):
         self.gains.recall(self.observer, indices)

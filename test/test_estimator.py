@@ -188,6 +188,19 @@ def test_observations_that_come_late_among_others_leave_the_covariance_honest(tw
     assert average_nees(np.array(errors), np.array(covariances)) < 2.0
 
 
+def test_with_constant_gains_a_second_camera_of_the_same_stamps_corrects_the_map():
+    estimator = Estimator(Settings(gains='constant'))
+    points = LANDMARKS.copy()
+    points[3:] += 0.3
+    for step in range(400):
+        stamp_ns = START_NS + 50_000_000 * step
+        for ids in (np.arange(3), np.arange(3, 5)):
+            estimator.add(ObservationEvent(stamp_ns, ids, points[ids]))
+        points = LANDMARKS
+    seen = se3.transform(se3.inverse(estimator.pose), estimator.world_points)
+    np.testing.assert_allclose(seen, LANDMARKS[estimator.landmark_ids], atol=0.01)
+
+
 def test_an_event_later_than_the_limit_is_refused():
     events = [velocity(0.05 * step) for step in range(100)] + [observation(1.0)]
     estimator = run(events, reorder_window=0.1, late_limit=1.0)

@@ -28,8 +28,8 @@ class Innovation:
         (m, 3) â_i, metres.
     covariances : FloatArray
         (m, 3, 3) covariance of the observations, rotated into the reference frame, m².
-    dt_s : float
-        Seconds since the innovation before this one.
+    dt_s : FloatArray
+        (m,) seconds since each of them was seen before.
 
     """
 
@@ -38,7 +38,7 @@ class Innovation:
     r: FloatArray
     a: FloatArray
     covariances: FloatArray
-    dt_s: float
+    dt_s: FloatArray
 
     def select(self, mask: BoolArray) -> Innovation:
         """Return the part of it that ``mask`` (m,) picks."""
@@ -51,6 +51,7 @@ class Innovation:
             r=self.r[mask],
             a=self.a[mask],
             covariances=self.covariances[mask],
+            dt_s=self.dt_s[mask],
         )
 
 

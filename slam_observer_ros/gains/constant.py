@@ -116,10 +116,12 @@ class ConstantGains:
         k = np.full(len(innovation.r), self.gain_k)
         step_on = paper_step if self.step_mode == 'paper' else centroid_step
         step = partial(step_on, axes=self._axes)
-        dt_s = min(innovation.dt_s, self.max_time_s)
-        D = safe_step(step, k, innovation.e, innovation.r, dt_s)
+        dt_s = np.minimum(innovation.dt_s, self.max_time_s)
+        # One time for the pose: were the r_i to act for different ones, L (34) might grow.
+        D = safe_step(step, k, innovation.e, innovation.r, float(np.mean(dt_s)))
         remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
-        d = -np.expm1(-self.gain_l / self.gain_k * dt_s) * remaining  # (31)
+        shares = -np.expm1(-self.gain_l / self.gain_k * dt_s)
+        d = shares[:, None] * remaining  # (31)
         return Correction(D, innovation.indices, d), np.ones(len(k))
 
     def distances(self, innovation: Innovation) -> FloatArray:
