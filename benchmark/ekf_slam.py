@@ -12,10 +12,10 @@ those of the observer.
 from __future__ import annotations
 
 import numpy as np
-from odometry import Odometry
+from odometry import Event, Odometry
 
 from slam_observer_ros.axes import PLANAR, SPATIAL
-from slam_observer_ros.events import Event, VelocityEvent
+from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.gains.robust import block_diagonal, observation_weights
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel

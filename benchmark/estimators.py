@@ -10,11 +10,11 @@ from typing import Protocol
 from ekf_slam import EkfSlam
 from gtsam_baselines import accurate_isam2, default_isam2, optimise_batch
 import numpy as np
-from odometry import Odometry
+from odometry import Event, Odometry
 from worlds import without_calibration
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings

@@ -15,9 +15,9 @@ from typing import Any, Protocol
 
 import gtsam
 import numpy as np
-from odometry import Odometry
+from odometry import Event, Odometry
 
-from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from itertools import accumulate
+from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.velocity_history import VelocityHistory
+
+Event: TypeAlias = VelocityEvent | ObservationEvent
+"""What the worlds consist of: each velocity is one sensor's."""
 
 
 class Odometry:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from odometry import Event
 from worlds import World
 
-from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.types import FloatArray, IntArray
 
 GROSS_SHARE = 0.05

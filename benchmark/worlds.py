@@ -10,9 +10,10 @@ import os
 from pathlib import Path
 
 import numpy as np
+from odometry import Event
 
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import LandmarkTruth, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
