@@ -132,10 +132,14 @@ class VelocityHistory:
         since = np.array([joined.since_ns for joined in held], dtype=np.int64).reshape(-1, 2)
         begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
         stops = np.minimum(np.maximum(since[:, 1] + self._timeout_ns, begins), ends)
+        is_stated = np.array([joined.is_stated for joined in held], dtype=np.bool_).reshape(-1, 2)
+        covariances = np.zeros((len(held), 6, 6))
+        if is_stated.any():  # to gather zeros would take longer than all the rest
+            covariances[:] = [joined.covariance for joined in held]
         return HeldVelocities(
             self._counting(np.array([joined.body_velocity for joined in held]).reshape(-1, 6)),
-            np.array([joined.covariance for joined in held]).reshape(-1, 6, 6),
-            np.array([joined.is_stated for joined in held], dtype=np.bool_).reshape(-1, 2),
+            covariances,
+            is_stated,
             _seconds(stops - begins),
             _seconds(ends - stops),
             _seconds(begins[:, None] - since),
