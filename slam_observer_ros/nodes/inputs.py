@@ -18,8 +18,11 @@ from slam_observer_ros.recording.cdr import Buffer
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports about one topic."""
 
-DISCOVERY_S = 3.0
-"""How long a topic may be without publisher or message before that is reported."""
+DISCOVERY_S = 5.0
+"""How long a topic may be without publisher or message before that is reported.
+
+Where an announcement was lost, as on a busy machine, DDS repeats it after 3 s only.
+"""
 
 MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
