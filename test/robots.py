@@ -9,6 +9,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import PointCloud, PointCloud2
 
+from slam_observer_ros.event_queue import CONFIRMATIONS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.nodes.conversions import (
     header_message,
@@ -61,8 +62,8 @@ class Robot:
             self.landmarks.publish(self._observation(event))
 
     def send_zeros(self):
-        """Stand still for long enough that nothing is held back by the reorder window."""
-        for _ in range(3):
+        """Stand still for long enough that nothing is held back, even after a pause."""
+        for _ in range(CONFIRMATIONS + 2):
             self.send(VelocityEvent(time.time_ns(), np.zeros(6)))
             self.ros.spin_for(0.06)
 
