@@ -9,7 +9,7 @@ one after another, nor whether the map is known from the start or is loaded late
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy import special
 
 from slam_observer_ros.axes import Axes, axes_of
 from slam_observer_ros.events import is_automatic
@@ -167,10 +167,17 @@ def find_transform(
         if _turn_std_rad(P, G[rows], there, axes) > MAX_TURN_STD_RAD:
             return None
         misfit, doubts = _contradictions(G[rows[p:]], P[p:, p:] + there, r)
-        if misfit <= chi2.isf(2.0 * norm.sf(CONTRADICTION_SIGMAS), r.size - p):
+        if misfit <= _improbable(r.size - p):
             return T, agree
         agree[np.flatnonzero(agree)[np.argmax(doubts)]] = False
     return None
+
+
+def _improbable(degrees_of_freedom: int) -> float:
+    """Return the χ² that is as improbable as ``CONTRADICTION_SIGMAS``."""
+    # scipy.stats has it too, but takes a second to import, at the start of each node.
+    both_tails = 2.0 * special.ndtr(-CONTRADICTION_SIGMAS)
+    return float(special.chdtri(degrees_of_freedom, both_tails))
 
 
 def _aligned(
