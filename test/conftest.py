@@ -40,6 +40,9 @@ os.environ['ROS_LOG_DIR'] = str(SCRATCH)
 os.environ['HYPOTHESIS_STORAGE_DIRECTORY'] = str(SCRATCH)
 os.environ['MPLBACKEND'] = 'Agg'
 
+# A background job of a shell ignores Ctrl-C, and so would all programs that the tests stop by it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # As the programs do: tests on a busy machine take ten times longer otherwise.
 use_one_thread()
 
