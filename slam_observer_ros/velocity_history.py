@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from slam_observer_ros.events import AngularVelocityEvent, flatten_velocities, VelocityEvent
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
-_UNKNOWN = np.zeros((6, 6))
+NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
+"""Stamp of a velocity that timed out before time began, nanoseconds."""
+
+FIRST_CAPACITY = 64
+"""Velocities that there is room for at first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,20 +64,6 @@ class HeldVelocities:
         return means
 
 
-@dataclass(frozen=True, slots=True)
-class _Joined:
-    """The velocity in force from one event to the next, of one message or two.
-
-    ``covariance`` is zero where unknown. ``is_stated`` and ``since_ns``, the messages' stamps, are
-    of the angular and the linear part.
-    """
-
-    body_velocity: FloatArray
-    covariance: FloatArray
-    is_stated: tuple[bool, bool]
-    since_ns: tuple[int, int]
-
-
 class VelocityHistory:
     """Velocity events in stamp order, joined with the angular velocities of another sensor.
 
@@ -89,8 +80,9 @@ class VelocityHistory:
     def __init__(self, timeout_ns: int, is_planar: bool = False) -> None:
         self._timeout_ns = timeout_ns
         self._is_planar = is_planar
-        self._stamps_ns: list[int] = []
-        self._joined: list[_Joined] = []
+        # In force from each stamp to the next; the first is what is known before any event.
+        self._stamps_ns = [NEVER_NS]
+        self._joined = _Joined.with_room_for(FIRST_CAPACITY)
         self._velocity: VelocityEvent | None = None
         self._angular: AngularVelocityEvent | None = None
 
@@ -108,38 +100,33 @@ class VelocityHistory:
         angular = self._angular
         if angular is not None and not 0 <= event.stamp_ns - angular.stamp_ns <= self._timeout_ns:
             angular = None
+        count = len(self._stamps_ns)
+        if count == self._joined.capacity:
+            self._joined = self._joined.copied(slice(count), 2 * count)
+        self._joined.write(count, self._velocity, angular)
         self._stamps_ns.append(event.stamp_ns)
-        self._joined.append(_join(self._velocity, angular))
         return True
 
     def latest(self, stamp_ns: int) -> FloatArray | None:
         """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
         place = bisect_right(self._stamps_ns, stamp_ns) - 1
-        if place < 0 or stamp_ns - self._joined[place].since_ns[1] > self._timeout_ns:
+        if stamp_ns - self._joined.since_ns[place, 1] > self._timeout_ns:
             return None
-        return self._counting(self._joined[place].body_velocity)
+        return self._counting(self._joined.body_velocities[place])
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
         first = bisect_right(self._stamps_ns, start_ns) - 1
         last = bisect_left(self._stamps_ns, end_ns)
-        stamps_ns = self._stamps_ns[max(first, 0) : last]
-        held = self._joined[max(first, 0) : last]
-        if first < 0:
-            stamps_ns.insert(0, start_ns)
-            held.insert(0, _join(VelocityEvent(start_ns - self._timeout_ns, np.zeros(6)), None))
-        stamps = np.array([*stamps_ns, end_ns], dtype=np.int64)
-        since = np.array([joined.since_ns for joined in held], dtype=np.int64).reshape(-1, 2)
+        stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
         begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
+        joined, rows = self._joined, slice(first, last)
+        since = joined.since_ns[rows]
         stops = np.minimum(np.maximum(since[:, 1] + self._timeout_ns, begins), ends)
-        is_stated = np.array([joined.is_stated for joined in held], dtype=np.bool_).reshape(-1, 2)
-        covariances = np.zeros((len(held), 6, 6))
-        if is_stated.any():  # to gather zeros would take longer than all the rest
-            covariances[:] = [joined.covariance for joined in held]
         return HeldVelocities(
-            self._counting(np.array([joined.body_velocity for joined in held]).reshape(-1, 6)),
-            covariances,
-            is_stated,
+            self._counting(joined.body_velocities[rows]),
+            joined.covariances[rows].copy(),
+            joined.is_stated[rows].copy(),
             _seconds(stops - begins),
             _seconds(ends - stops),
             _seconds(begins[:, None] - since),
@@ -156,33 +143,81 @@ class VelocityHistory:
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
-        first = bisect_right(self._stamps_ns, stamp_ns) - 1
-        if first > len(self._stamps_ns) // 2:
-            del self._stamps_ns[:first]
-            del self._joined[:first]
+        first, count = bisect_right(self._stamps_ns, stamp_ns) - 1, len(self._stamps_ns)
+        if first > count // 2:
+            kept = np.append(0, np.arange(first, count))
+            self._joined = self._joined.copied(kept, self._joined.capacity)
+            del self._stamps_ns[1:first]
 
     def _counting(self, body_velocities: FloatArray) -> FloatArray:
-        """Return what counts of velocities (…, 6): for all of a step at once, which costs less."""
-        return flatten_velocities(body_velocities) if self._is_planar else body_velocities
+        """Return what counts of velocities (…, 6), as a copy: for all of a step at once."""
+        if self._is_planar:
+            return flatten_velocities(body_velocities)
+        return np.array(body_velocities)
 
 
-def _join(velocity: VelocityEvent, angular: AngularVelocityEvent | None) -> _Joined:
-    """Return the velocity, with the other sensor's angular part if it has one."""
-    linear_ns, is_linear_stated = velocity.stamp_ns, velocity.covariance is not None
-    covariance = _UNKNOWN if velocity.covariance is None else velocity.covariance
-    if angular is None:
-        stated = (is_linear_stated, is_linear_stated)
-        return _Joined(velocity.body_velocity, covariance, stated, (linear_ns, linear_ns))
-    joined = np.zeros((6, 6))
-    joined[3:, 3:] = covariance[3:, 3:]
-    if angular.covariance is not None:
-        joined[:3, :3] = angular.covariance
-    return _Joined(
-        np.concatenate([angular.angular_velocity, velocity.body_velocity[3:]]),
-        joined,
-        (angular.covariance is not None, is_linear_stated),
-        (angular.stamp_ns, linear_ns),
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class _Joined:
+    """Velocities in force from one event to the next, each of one message or two.
+
+    Attributes
+    ----------
+    body_velocities : FloatArray
+        (c, 6) the velocities, rad/s and m/s.
+    covariances : FloatArray
+        (c, 6, 6) their covariances, zero where unknown.
+    is_stated : BoolArray
+        (c, 2) whether the covariance of the angular and of the linear part is known.
+    since_ns : IntArray
+        (c, 2) stamps of the messages that the angular and the linear part are of, nanoseconds.
+
+    """
+
+    body_velocities: FloatArray
+    covariances: FloatArray
+    is_stated: BoolArray
+    since_ns: IntArray
+
+    @classmethod
+    def with_room_for(cls, capacity: int) -> _Joined:
+        """Return unknown velocities."""
+        return cls(
+            np.zeros((capacity, 6)),
+            np.zeros((capacity, 6, 6)),
+            np.zeros((capacity, 2), dtype=np.bool_),
+            np.full((capacity, 2), NEVER_NS, dtype=np.int64),
+        )
+
+    @property
+    def capacity(self) -> int:
+        """How many velocities there is room for."""
+        return len(self.since_ns)
+
+    def copied(self, rows: slice | IntArray, capacity: int) -> _Joined:
+        """Return some of the velocities, with room for ``capacity`` of them."""
+        roomy = _Joined.with_room_for(capacity)
+        for field in fields(_Joined):
+            kept = getattr(self, field.name)[rows]
+            getattr(roomy, field.name)[: len(kept)] = kept
+        return roomy
+
+    def write(
+        self, row: int, velocity: VelocityEvent, angular: AngularVelocityEvent | None
+    ) -> None:
+        """Fill in a row with a velocity, with the other sensor's angular part if it has one."""
+        is_stated = velocity.covariance is not None
+        self.body_velocities[row] = velocity.body_velocity
+        self.covariances[row] = velocity.covariance if is_stated else 0.0
+        self.is_stated[row] = is_stated
+        self.since_ns[row] = velocity.stamp_ns
+        if angular is None:
+            return
+        is_stated = angular.covariance is not None
+        self.body_velocities[row, :3] = angular.angular_velocity
+        self.covariances[row, :3] = self.covariances[row, :, :3] = 0.0
+        self.covariances[row, :3, :3] = angular.covariance if is_stated else 0.0
+        self.is_stated[row, 0] = is_stated
+        self.since_ns[row, 0] = angular.stamp_ns
 
 
 def _seconds(nanoseconds: IntArray) -> FloatArray:
