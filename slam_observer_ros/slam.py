@@ -296,9 +296,11 @@ class Slam:
 
     def _turn_to_world(self, A: FloatArray) -> FloatArray:
         """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
-        J = np.eye(6)
-        J[3:, :3] = -so3.hat(A[:3, 3])
-        return np.kron(np.eye(2), self.observer.reference_pose[:3, :3]) @ J
+        R = self.observer.reference_pose[:3, :3]
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = R
+        turn[3:, :3] = -R @ so3.hat(A[:3, 3])
+        return turn
 
     def _innovate(self, event: ObservationEvent, innovation: Innovation) -> BoolArray:
         """Correct the state by the landmarks of ``event``; return which (m,) were not rejected."""

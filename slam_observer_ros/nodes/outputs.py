@@ -32,6 +32,7 @@ from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.recording.frames import TransformSource
 from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud, FLOAT32_ID_LIMIT
+from slam_observer_ros.types import FloatArray
 
 PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
@@ -89,10 +90,11 @@ class Outputs:
         if stamp_ns in (None, self._fast_stamp_ns) or not self._estimator.is_localised:
             return
         self._fast_stamp_ns = stamp_ns
-        self._publish_pose(stamp_ns)
+        pose = self._estimator.pose
+        self._publish_pose(stamp_ns, pose)
         if self._broadcaster is not None:
-            self._broadcaster.add(stamp_ns, self._estimator.pose)
-        self._extend_path(stamp_ns)
+            self._broadcaster.add(stamp_ns, pose)
+        self._extend_path(stamp_ns, pose)
         self._lyapunov.publish(Float64(data=float(self._estimator.lyapunov)))
         self._publish_estimates(stamp_ns)
 
@@ -128,20 +130,20 @@ class Outputs:
         if self._broadcaster is not None:
             self._broadcaster.forget()
 
-    def _publish_pose(self, stamp_ns: int) -> None:
+    def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
         header = header_message(stamp_ns, self._settings.map_frame)
         covariance = pose_covariance_field(self._estimator.pose_covariance)
-        pose = PoseWithCovariance(pose=pose_message(self._estimator.pose), covariance=covariance)
+        uncertain = PoseWithCovariance(pose=pose_message(pose), covariance=covariance)
         twist = TwistWithCovariance(
             twist=twist_message(self._estimator.body_velocity),
             covariance=unknown_covariance_field(),
         )
-        self._pose.publish(PoseWithCovarianceStamped(header=header, pose=pose))
+        self._pose.publish(PoseWithCovarianceStamped(header=header, pose=uncertain))
         self._odometry.publish(
             Odometry(
                 header=header,
                 child_frame_id=self._settings.base_frame,
-                pose=pose,
+                pose=uncertain,
                 twist=twist,
             )
         )
@@ -158,10 +160,10 @@ class Outputs:
         raw = encode_point_cloud(stamp_ns, self._settings.map_frame, ids, points)
         self._estimates.publish(raw)
 
-    def _extend_path(self, stamp_ns: int) -> None:
+    def _extend_path(self, stamp_ns: int, pose: FloatArray) -> None:
         last_ns = self._path_stamp_ns
         if last_ns is not None and 0 <= stamp_ns - last_ns < PATH_SPACING_NS:
             return
         self._path_stamp_ns = stamp_ns
         header = header_message(stamp_ns, self._settings.map_frame)
-        self._path.append(PoseStamped(header=header, pose=pose_message(self._estimator.pose)))
+        self._path.append(PoseStamped(header=header, pose=pose_message(pose)))
