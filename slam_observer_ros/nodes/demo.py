@@ -34,6 +34,9 @@ PUBLISH_RATE_HZ = 100.0
 INITIAL_BIAS_M = 1.5
 """Large, so that the transient can be seen in the picture."""
 
+QUEUE_DEPTH = 10_000
+"""More than the simulator sends, so that an observer on a slow machine falls behind, no more."""
+
 STALL_LIMIT_S = 30.0
 LAST_MESSAGES_S = 0.5
 STOP_LIMIT_S = 10.0
@@ -118,6 +121,9 @@ def _run(
                 gains='constant',
                 velocity_type='TwistStamped',
                 landmarks_type='PointCloud2',
+                twist_qos='reliable',
+                landmarks_qos='reliable',
+                queue_depth=QUEUE_DEPTH,
                 publish_rate=PUBLISH_RATE_HZ,
                 use_sim_time=is_simulated_time,
             )
@@ -186,7 +192,7 @@ def _listen(
     duration_s: float,
     console: Console,
 ) -> None:
-    """Show how far the run is until the simulator ends by itself."""
+    """Show how far the run is until the simulator ends and the observer has caught up."""
     columns = (
         TextColumn('{task.description}'),
         BarColumn(),
@@ -197,7 +203,7 @@ def _listen(
     with Progress(*columns, console=console) as progress:
         task = progress.add_task('observing', total=duration_s, level='…')
         heard, limit_s = 0, time.monotonic() + STALL_LIMIT_S
-        while simulator.poll() is None:
+        while simulator.poll() is None or listener.is_behind:
             executor.spin_once(timeout_sec=0.1)
             _check(listener, stop, limit_s)
             if len(listener.lyapunov) > heard:

@@ -28,6 +28,9 @@ from slam_observer_ros.recording.point_clouds import decode_point_cloud, decode_
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.types import FloatArray
 
+CAUGHT_UP_NS = 500_000_000
+"""What an estimate may lag behind at the end, as the last events are held back for others."""
+
 DEEP_QOS = QoSProfile(depth=10_000)
 
 MEASURED = {'/twist': TwistStamped, '/landmarks': PointCloud2}
@@ -94,6 +97,14 @@ class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
     def is_disturbed(self) -> bool:
         """Return whether another program publishes on the demo's topics too."""
         return any(self.count_publishers(topic) > 1 for topic in {**MEASURED, **ESTIMATED})
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the latest estimate is far from the latest true pose in time."""
+        if not self._true_stamps_ns:
+            return False
+        newest_ns = self._stamps_ns[-1] if self._stamps_ns else 0
+        return self._true_stamps_ns[-1] - newest_ns > CAUGHT_UP_NS
 
     @property
     def elapsed_s(self) -> float:

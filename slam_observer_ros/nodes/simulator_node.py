@@ -39,6 +39,9 @@ TICK_S = 0.005
 MATCH_DELAY_S = 1.0
 """A publisher knows of its reader before the reader can receive; wait so much longer."""
 
+ACKNOWLEDGED_S = 10.0
+"""How long the last messages may be on their way, as on a busy machine."""
+
 SIMULATED_EPOCH_NS = 1_000_000_000
 """First stamp where /clock is simulated; zero would mean 'no time yet'."""
 
@@ -117,7 +120,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
 
     def _finish(self) -> None:
         for publisher in (self._twist, self._landmarks, self._true_pose):
-            publisher.wait_for_all_acked(Duration(seconds=1))
+            publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
         self.get_logger().info('the run is over')
         self.context.try_shutdown()
 
