@@ -27,6 +27,7 @@ from slam_observer_ros.slam import Slam
 from slam_observer_ros.timeline import Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.validation import check_event
+from slam_observer_ros.velocity_history import VelocityHistory
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +46,9 @@ class Estimator:
         (4, 4) pose at the first event, body to world; also the reference P°. Default identity.
     on_update : callable, optional
         Called with an :class:`Update` after each observation that was used.
+    on_motion : callable, optional
+        Called with the velocities and two stamps, nanoseconds, before the state is moved on along
+        them from one to the other.
 
     Attributes
     ----------
@@ -67,13 +71,14 @@ class Estimator:
         settings: Settings,
         initial_pose: FloatArray | None = None,
         on_update: Callable[[Update], None] | None = None,
+        on_motion: Callable[[VelocityHistory, int, int], None] | None = None,
     ) -> None:
         self.settings = settings
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
         self._times_moved = 0
-        self._on_update = on_update
+        self._on_update, self._on_motion = on_update, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
 
@@ -108,7 +113,7 @@ class Estimator:
             return
         logger.warning('The clock has jumped%s; pose and map are held.', after)
         self.flush()
-        self._catch_up()
+        self.catch_up()
         self._frame.states.restart_time()
         self._forget_time()
 
@@ -152,7 +157,7 @@ class Estimator:
             (6, 6) its covariance, as :attr:`pose_covariance` has it; default exact.
 
         """
-        self._catch_up()
+        self.catch_up()
         self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
@@ -183,6 +188,11 @@ class Estimator:
         """Use the events that are still held back, as at the end of a recording."""
         for ready in self._queue.pop_all():
             self._process(ready)
+
+    def catch_up(self) -> None:
+        """Move the state on to ``stamp_ns`` now, rather than with the next observation."""
+        if self.stamp_ns is not None:
+            self._advance(self.stamp_ns)
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; the state is not changed.
@@ -349,7 +359,7 @@ class Estimator:
         if is_late:
             self._tell_of_late()
         if self._timeline.is_full:
-            self._timeline.advance(self._frame.states, event.stamp_ns)
+            self._advance(event.stamp_ns)
 
     def _process_observation(self, event: ObservationEvent) -> None:
         if self.settings.two_d_mode:
@@ -359,7 +369,7 @@ class Estimator:
         if event.stamp_ns < (timeline.state_ns or 0):
             event = timeline.carry_forward(event, self._slam)
             self._counts['late_observation'] += 1
-        timeline.advance(self._frame.states, event.stamp_ns)
+        self._advance(event.stamp_ns)
         ids, residuals = self._frame.states.observe(event)
         self._tell_of_moved(self._slam.moved_ids)
         self._counts['observation'] += 1
@@ -388,10 +398,11 @@ class Estimator:
         if _is_power_of_ten(self._times_moved):
             logger.warning('Landmarks %s have moved (%d so far).', ids.tolist(), self._times_moved)
 
-    def _catch_up(self) -> None:
-        """Move the states on to the last event that was used."""
-        if self.stamp_ns is not None:
-            self._timeline.advance(self._frame.states, self.stamp_ns)
+    def _advance(self, stamp_ns: int) -> None:
+        start_ns = self._timeline.state_ns
+        if self._on_motion is not None and start_ns is not None and start_ns < stamp_ns:
+            self._on_motion(self._timeline.velocities, start_ns, stamp_ns)
+        self._timeline.advance(self._frame.states, stamp_ns)
 
     def _forget_time(self) -> None:
         """Forget all that has a stamp but the map."""

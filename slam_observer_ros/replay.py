@@ -2,8 +2,7 @@
 
 What is measured is the *online* estimate: the pose as it was known at each moment, from the events
 received until then, never corrected in hindsight. The trajectory is sampled at the stamps of
-velocities and observations alike, so that stretches in which nothing is seen count too, at most
-every :data:`SAMPLE_PERIOD_NS`.
+velocities and observations alike, so that stretches in which nothing is seen count too.
 """
 
 from __future__ import annotations
@@ -18,68 +17,14 @@ from slam_observer_ros.estimates import Update, used_points
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import Event, ObservationEvent
+from slam_observer_ros.events import Event
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.truth import Truth
+from slam_observer_ros.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
-
-SAMPLE_PERIOD_NS = 50_000_000
-"""Least time between two poses of a sampled trajectory: 20 Hz at most."""
-
-
-class TrajectorySampler:
-    """Collects the poses that an estimator passes through.
-
-    Parameters
-    ----------
-    estimator : Estimator
-        What is watched.
-    with_covariances : bool
-        Whether to collect their covariances, too, which take longer to compute.
-
-    """
-
-    def __init__(self, estimator: Estimator, with_covariances: bool) -> None:
-        self._estimator = estimator
-        self._with_covariances = with_covariances
-        self._stamps_ns: list[int] = []
-        self._poses: list[FloatArray] = []
-        self._covariances: list[FloatArray] = []
-
-    def follow(self, estimator: Estimator) -> None:
-        """Go on with the poses of another estimator."""
-        self._estimator = estimator
-
-    def sample(self) -> None:
-        """Keep the present pose, unless the one kept last is less than a period older.
-
-        Poses that are not yet in the frame of a map that was loaded are not kept.
-        """
-        stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None or not self._estimator.is_localised:
-            return
-        if self._stamps_ns and 0 <= stamp_ns - self._stamps_ns[-1] < SAMPLE_PERIOD_NS:
-            return
-        self._stamps_ns.append(stamp_ns)
-        self._poses.append(self._estimator.pose)
-        covariance = self._estimator.pose_covariance if self._with_covariances else None
-        if covariance is not None:
-            self._covariances.append(covariance)
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """The poses kept, in stamp order."""
-        return Trajectory.from_samples(self._stamps_ns, self._poses)
-
-    @property
-    def covariances(self) -> FloatArray | None:
-        """(k, 6, 6) covariance of each pose of the trajectory; None where the gains know none."""
-        if not self._covariances:
-            return None
-        latest = dict(zip(self._stamps_ns, self._covariances, strict=True))
-        return np.array([latest[stamp_ns] for stamp_ns in sorted(latest)])
+from slam_observer_ros.velocity_history import VelocityHistory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +38,8 @@ class Replay:
     trajectory : Trajectory
         (k) poses of the online estimate.
     pose_covariances : FloatArray or None
-        (k, 6, 6) their covariances, as :attr:`Estimator.pose_covariance` gives them.
+        (k, 6, 6) their covariances, as :attr:`Estimator.pose_covariance` gives them; None
+        without truth to compare their errors with.
     dead_reckoning : Trajectory
         What the velocities alone give, from the same start.
     configuration : ConfigurationError
@@ -178,7 +124,7 @@ class _Run:
         self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
     ) -> None:
         self._settings = settings
-        self._estimator = Estimator(settings, on_update=self._on_update)
+        self._estimator = Estimator(settings, on_update=self._on_update, on_motion=self._on_motion)
         self._in_known_map = landmark_map is not None
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
@@ -191,9 +137,9 @@ class _Run:
         self._start()
 
     def _start(self) -> None:
-        self._sampler = TrajectorySampler(self._estimator, with_covariances=True)
-        self._blind = Estimator(self._settings)
-        self._blind_sampler = TrajectorySampler(self._blind, with_covariances=False)
+        has_truth = self._pose_truth is not None
+        self._sampler = TrajectorySampler(self._estimator, with_covariances=has_truth)
+        self._dead_reckoning = DeadReckoning()
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None
@@ -202,24 +148,22 @@ class _Run:
     def add(self, event: Event) -> None:
         self._events += 1
         start_s = time.thread_time()
-        accepted = self._estimator.add(event)
+        self._estimator.add(event)
         self._seconds += time.thread_time() - start_s
         self._note_jump()
         self._sample()
-        if accepted and not isinstance(event, ObservationEvent):
-            self._blind.add(event)
-            self._blind_sampler.sample()
 
     def finish(self) -> Replay:
         start_s = time.thread_time()
         self._estimator.flush()
+        self._estimator.catch_up()
         self._seconds += time.thread_time() - start_s
         self._sample()
         return Replay(
             self._estimator,
             self._sampler.trajectory,
             self._sampler.covariances,
-            self._blind_sampler.trajectory,
+            self._dead_reckoning.trajectory,
             self._configuration,
             np.repeat(
                 np.array([update.stamp_ns for update in self._updates], dtype=np.int64),
@@ -240,6 +184,12 @@ class _Run:
             self._start_ns = self._estimator.stamp_ns
         self._sampler.sample()
 
+    def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
+        start_s = time.thread_time()
+        self._note_jump()
+        self._dead_reckoning.advance(velocities, start_ns, end_ns)
+        self._seconds -= time.thread_time() - start_s
+
     def _on_update(self, update: Update) -> None:
         start_s = time.thread_time()
         self._note_jump()
@@ -249,18 +199,13 @@ class _Run:
         self._seconds -= time.thread_time() - start_s
 
     def _note_jump(self) -> None:
-        """Start again, or let the velocities alone go on at another time, as the estimator did."""
+        """Start again if the estimator did."""
         if self._estimator.jumps == self._jumps:
             return
         self._jumps = self._estimator.jumps
         self._history_since, self._observations_since = 'the clock jumped', 0
         if self._settings.on_time_jump == 'reset':
             self._start()
-            return
-        self._blind.flush()
-        self._blind_sampler.sample()
-        self._blind = Estimator(self._settings, self._blind.pose)
-        self._blind_sampler.follow(self._blind)
 
     def _note_observation(self) -> None:
         """Count an observation, unless with it what was seen until then became the prior."""

@@ -12,7 +12,7 @@ from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import PoseTruth
 from slam_observer_ros.observer import lyapunov
-from slam_observer_ros.replay import SAMPLE_PERIOD_NS
+from slam_observer_ros.sampling import SAMPLE_PERIOD_NS
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation
 from slam_observer_ros.types import FloatArray
