@@ -137,7 +137,7 @@ class _Run:
         self._start()
 
     def _start(self) -> None:
-        has_truth = self._pose_truth is not None
+        has_truth = self._pose_truth is not None and len(self._pose_truth.poses) > 0
         self._sampler = TrajectorySampler(self._estimator, with_covariances=has_truth)
         self._dead_reckoning = DeadReckoning()
         self._configuration = ConfigurationError()
