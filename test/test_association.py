@@ -25,6 +25,7 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
+from slam_observer_ros.field_of_view import FieldOfView
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.joint_compatibility import (
     columns_of,
@@ -93,6 +94,31 @@ def test_what_is_seen_once_or_twice_is_never_in_the_map_and_soon_forgotten():
         observe(estimator, 0.1 * step, [[3.0, 0.0, 0.0], *stray])
         assert len(estimator.landmark_ids) == (1 if step >= 2 else 0)
     assert estimator.counts['unsupported_landmark'] == 1
+
+
+@given(st.integers(0, 10_000), st.integers(1, 40), st.sampled_from([2, 3]))
+def test_a_sensor_sees_where_it_saw_something_and_in_between(seed, m, k):
+    rng = np.random.default_rng(seed)
+    seen = rng.normal(size=(m, 3)) * [1.0, 1.0, k == 3]
+    field = FieldOfView(k)
+    for point in seen:
+        field.include(point[None])
+    last = FieldOfView(k)
+    last.include(seen)
+    shares = rng.dirichlet(np.ones(m + 1), 20)[:, :m]
+    assert field.contains(seen).all()
+    assert field.contains(shares @ seen).all()
+    beyond = 2.0 * seen[[np.argmax(np.linalg.norm(seen, axis=1))]]
+    has_inside = m >= k
+    assert field.contains(beyond).item() == (not has_inside)
+    assert_array_equal(field.contains(3.0 * seen), last.contains(3.0 * seen))
+
+
+def test_where_all_points_lie_in_one_plane_all_of_space_counts_as_in_view():
+    field = FieldOfView(3)
+    for step in range(100):
+        field.include(np.array([[np.cos(step), np.sin(step), 0.0]]))
+    assert field.contains(np.array([[0.0, 0.0, 5.0], [9.0, 0.0, 0.0]])).all()
 
 
 def test_points_with_and_without_id_are_told_apart_in_one_observation():

@@ -1,0 +1,53 @@
+"""Where a sensor sees, as far as that follows from what it has seen."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from slam_observer_ros.types import BoolArray, FloatArray
+
+SLACK = 1e-9
+"""How far outside, as a share of what it measures across, a point may be and still be inside."""
+
+
+class FieldOfView:
+    """The convex hull of the sensor and of all points that it ever saw, in the body frame.
+
+    So no sensor has to be described. If anything it takes more for seen than was looked at: one
+    wrong point behind a camera, and that sees all around. Until the hull has an inside, which it
+    never has in space where all points lie in one plane, everything counts as in view.
+
+    Parameters
+    ----------
+    k : int
+        Leading coordinates that matter: 2 in the plane, 3 in space.
+
+    """
+
+    def __init__(self, k: int) -> None:
+        self._corners = np.zeros((1, k))
+        self._faces: FloatArray = np.empty((0, k + 1))
+        self._slack_m = 0.0
+
+    def include(self, points: FloatArray) -> None:
+        """Take in points (m, 3) that were seen, metres, body frame."""
+        k = self._corners.shape[1]
+        known = self.contains(points) & (len(self._faces) > 0)
+        if known.all():
+            return
+        # No array is changed in place: copies of a state share them.
+        corners = np.concatenate([self._corners, points[~known, :k]])
+        try:
+            hull = ConvexHull(corners)
+        except QhullError:  # all of them in one point, on one line or in one plane
+            self._corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
+            return
+        self._corners, self._faces = corners[hull.vertices], hull.equations
+        self._slack_m = SLACK * float(np.ptp(self._corners, axis=0).max())
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Return which points (m, 3) lie where the sensor sees, metres, body frame."""
+        k = self._corners.shape[1]
+        heights_m = points[:, :k] @ self._faces[:, :k].T + self._faces[:, k]
+        return np.asarray((heights_m <= self._slack_m).all(axis=1))
