@@ -21,6 +21,8 @@ class LandmarkTable:
         (n,) how many observations in a row were rejected at one place, up to now.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
+    overlooked_ns : IntArray
+        (n,) how long each was in view since then and was not seen, nanoseconds.
 
     """
 
@@ -29,6 +31,8 @@ class LandmarkTable:
         self.counts: IntArray = np.empty(0, dtype=np.int64)
         self.rejections: IntArray = np.empty(0, dtype=np.int64)
         self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
+        self.overlooked_ns: IntArray = np.empty(0, dtype=np.int64)
+        self._in_view_ns: IntArray = np.empty(0, dtype=np.int64)
         self._rejected_at: FloatArray = np.empty((0, 3))
         self._order: IntArray = np.empty(0, dtype=np.int64)
 
@@ -51,6 +55,9 @@ class LandmarkTable:
         self.rejections = np.concatenate([self.rejections, np.zeros(len(ids), dtype=np.int64)])
         self._rejected_at = np.concatenate([self._rejected_at, np.zeros((len(ids), 3))])
         self.last_seen_ns = np.concatenate([self.last_seen_ns, np.full(len(ids), stamp_ns)])
+        none = np.zeros(len(ids), dtype=np.int64)
+        self.overlooked_ns = np.concatenate([self.overlooked_ns, none])
+        self._in_view_ns = np.concatenate([self._in_view_ns, np.full(len(ids), stamp_ns)])
         self._order = np.argsort(self.ids)
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
@@ -61,6 +68,7 @@ class LandmarkTable:
     def restart_time(self) -> None:
         """Take all landmarks as last seen before any stamp to come."""
         self.last_seen_ns = np.full(len(self), -1)
+        self._in_view_ns = np.full(len(self), -1)
 
     def renumber(self, indices: IntArray, ids: IntArray) -> None:
         """Give the rows ``indices`` (m,) other ids (m,)."""
@@ -72,6 +80,8 @@ class LandmarkTable:
         self.counts[indices] += 1
         self.rejections[indices] = 0
         self.last_seen_ns[indices] = np.maximum(self.last_seen_ns[indices], stamp_ns)
+        self.overlooked_ns[indices] = 0
+        self._in_view_ns[indices] = stamp_ns
 
     def reject(
         self, indices: IntArray, world_points: FloatArray, tolerances_m: FloatArray
@@ -98,10 +108,16 @@ class LandmarkTable:
         needed = np.minimum(self.counts[indices] + 1, max_rejections)
         return np.asarray(rejections >= needed)
 
-    def unsupported(self, confirmations: int, since_ns: int) -> IntArray:
-        """Return rows without an id, seen too seldom, and not at all since a stamp."""
-        seldom = is_automatic(self.ids) & (self.counts < confirmations)
-        return np.flatnonzero(seldom & (self.last_seen_ns < since_ns))
+    def unconfirmed(self, confirmations: int) -> IntArray:
+        """Return rows without an id that were seen too seldom."""
+        return np.flatnonzero(is_automatic(self.ids) & (self.counts < confirmations))
+
+    def overlook(self, indices: IntArray, in_view: BoolArray, stamp_ns: int) -> None:
+        """Add the time up to ``stamp_ns`` for those of the rows (m,) that were and are in view."""
+        since_ns = self._in_view_ns[indices]
+        looked_ns = np.where(in_view & (since_ns >= 0), stamp_ns - since_ns, 0)
+        self.overlooked_ns[indices] += looked_ns
+        self._in_view_ns[indices] = np.where(in_view, stamp_ns, -1)
 
     def unseen_since(self, stamp_ns: int) -> IntArray:
         """Return rows not seen since a stamp: least often seen first, then longest ago."""
@@ -120,4 +136,6 @@ class LandmarkTable:
         self.rejections = np.delete(self.rejections, indices)
         self._rejected_at = np.delete(self._rejected_at, indices, axis=0)
         self.last_seen_ns = np.delete(self.last_seen_ns, indices)
+        self.overlooked_ns = np.delete(self.overlooked_ns, indices)
+        self._in_view_ns = np.delete(self._in_view_ns, indices)
         self._order = np.argsort(self.ids)

@@ -65,7 +65,7 @@ def readings(
     gains = slam.gains
     if not isinstance(gains, RiccatiGains):
         return [Reading(event, 0.0)]
-    slam.forget_unsupported(event.stamp_ns)
+    slam.forget_unsupported(event)
     sighting = slam.look(event)
     suspects = suspect_ids(slam, sighting)
     if (event.ids == UNKNOWN_ID).any():

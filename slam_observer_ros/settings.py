@@ -221,7 +221,8 @@ class Settings:
     )
     support_timeout: float = parameter(
         10.0,
-        'Points without id: how long a landmark with too few confirmations is kept while unseen',
+        'Points without id: how long a landmark with too few confirmations is kept that is in '
+        'view, as far as can be told, and not seen',
         unit='s',
         minimum=0.0,
         maximum=1e6,

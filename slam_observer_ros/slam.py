@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slam_observer_ros.axes import axes_of
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.field_of_view import FieldOfView
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.motion import Motion
@@ -74,6 +76,8 @@ class Slam:
         Noise of velocities and observations.
     index : LandmarkIndex
         For landmarks near a point.
+    field_of_view : FieldOfView
+        Where points without an id were seen.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
     moved_ids : IntArray
@@ -96,6 +100,7 @@ class Slam:
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
+        self.field_of_view = FieldOfView(axes_of(settings.two_d_mode).point)
 
     @property
     def confirmed(self) -> IntArray:
@@ -280,13 +285,21 @@ class Slam:
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
 
-    def forget_unsupported(self, stamp_ns: int) -> None:
-        """Forget landmarks without an id that were seen too seldom, and not lately."""
-        since_ns = stamp_ns - round(self.settings.support_timeout * 1e9)
-        forgotten = self.landmarks.unsupported(self.settings.confirmations, since_ns)
-        if len(forgotten):
-            self.remove(forgotten)
-            self.counts['unsupported_landmark'] += len(forgotten)
+    def forget_unsupported(self, event: ObservationEvent) -> None:
+        """Forget landmarks without an id that were seen too seldom, though they were in view.
+
+        One that the robot has turned away from may be the only tie to what was mapped before.
+        """
+        rows = self.landmarks.unconfirmed(self.settings.confirmations)
+        if len(rows):
+            in_view = self.field_of_view.contains(self.observer.body_points(rows))
+            self.landmarks.overlook(rows, in_view, event.stamp_ns)
+            overlooked_s = self.landmarks.overlooked_ns[rows] * 1e-9
+            forgotten = rows[overlooked_s > self.settings.support_timeout]
+            if len(forgotten):
+                self.remove(forgotten)
+                self.counts['unsupported_landmark'] += len(forgotten)
+        self.field_of_view.include(event.points)
 
     def turned(self, covariances: FloatArray) -> FloatArray:
         """Return covariances (m, 3, 3) from the body frame in the reference frame."""

@@ -96,6 +96,28 @@ def test_what_is_seen_once_or_twice_is_never_in_the_map_and_soon_forgotten():
     assert estimator.counts['unsupported_landmark'] == 1
 
 
+def test_what_was_seen_once_is_known_again_after_looking_elsewhere():
+    """The robot turns round with its back to it, for far longer than ``support_timeout``."""
+    front = np.array([[3.0, 0.0, 0.0], [3.0, 1.5, 0.0], [3.0, -1.5, 0.0]])
+    back = np.array([[-3.0, 0.5, 0.0], [-3.0, -1.0, 0.0]])
+    once = np.array([[2.5, -0.8, 0.0]])
+    estimator = Estimator(replace(PLANAR, angular_scale_noise=(0.0, 0.0, 0.0)))
+    turns = np.concatenate([np.zeros(10), np.full(30, np.pi / 3), np.zeros(300)])
+    turns = np.concatenate([turns, np.full(30, -np.pi / 3), np.zeros(5)])
+    heading = 0.0
+    for step, turn in enumerate(turns):
+        stand(estimator, 0.1 * step, (0, 0, turn, 0, 0, 0))
+        here = se3.inverse(se3.exp(np.array([0.0, 0.0, heading, 0.0, 0.0, 0.0])))
+        is_last = step >= len(turns) - 5
+        seen = {step < 5: front, step == 5: once, 40 <= step < 340: back, is_last: once}
+        if True in seen:
+            observe(estimator, 0.1 * step, se3.transform(here, seen[True]))
+        heading += 0.1 * turn
+    assert estimator.counts['unsupported_landmark'] == 0
+    assert estimator.landmark_ids.tolist() == [FIRST_AUTOMATIC_ID + i for i in range(6)]
+    assert estimator.landmark_counts.tolist() == [5, 5, 5, 6, 300, 300]
+
+
 @given(st.integers(0, 10_000), st.integers(1, 40), st.sampled_from([2, 3]))
 def test_a_sensor_sees_where_it_saw_something_and_in_between(seed, m, k):
     rng = np.random.default_rng(seed)
