@@ -24,10 +24,9 @@ from slam_observer_ros.map_frame import MapFrame
 from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
-from slam_observer_ros.timeline import Timeline
+from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.validation import check_event
-from slam_observer_ros.velocity_history import VelocityHistory
 
 logger = logging.getLogger(__name__)
 
@@ -57,8 +56,9 @@ class Estimator:
         (``'late_velocity'``, ``'late_observation'``), points in observations
         (``'observed_point'``), observations made before the place in a loaded map was found
         (``'not_localised'``), how often it was lost again (``'lost'``), and what became of
-        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'unmapped_landmark'``,
-        ``'unsupported_landmark'``, and ``'unknown_id'``, which are not used).
+        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``, which are not
+        used).
     dropped : Counter
         Events refused, by reason.
     jumps : int
@@ -71,7 +71,7 @@ class Estimator:
         settings: Settings,
         initial_pose: FloatArray | None = None,
         on_update: Callable[[Update], None] | None = None,
-        on_motion: Callable[[VelocityHistory, int, int], None] | None = None,
+        on_motion: OnMotion | None = None,
     ) -> None:
         self.settings = settings
         self._counts: Counter[str] = Counter()
@@ -91,6 +91,7 @@ class Estimator:
             (4, 4) body to world. By default identity, or unknown in a map that was loaded.
 
         """
+        self._start_pose = pose
         self._frame.start(pose)
         self._forget_time()
         self._last: Update | None = None
@@ -101,7 +102,6 @@ class Estimator:
         ``reset`` starts again where the run began, or anywhere in a loaded map; ``hold`` keeps
         pose and map, and goes on from there.
         """
-        self.jumps += 1
         newest_ns = self.newest_stamp_ns
         after = '' if newest_ns is None else f' after {newest_ns * 1e-9:.3f} s'
         if self.settings.on_time_jump == 'reset':
@@ -109,13 +109,14 @@ class Estimator:
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
                 after,
             )
-            self.reset(None if self._frame.loaded else self._slam.observer.reference_pose)
-            return
-        logger.warning('The clock has jumped%s; pose and map are held.', after)
-        self.flush()
-        self.catch_up()
-        self._frame.states.restart_time()
-        self._forget_time()
+            self.reset(None if self._frame.loaded else self._start_pose)
+        else:
+            logger.warning('The clock has jumped%s; pose and map are held.', after)
+            self.release()
+            self._catch_up()
+            self._frame.states.restart_time()
+            self._forget_time()
+        self.jumps += 1
 
     def load_map(
         self,
@@ -157,7 +158,7 @@ class Estimator:
             (6, 6) its covariance, as :attr:`pose_covariance` has it; default exact.
 
         """
-        self.catch_up()
+        self._catch_up()
         self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
@@ -184,15 +185,19 @@ class Estimator:
             self._process(ready)
         return True
 
-    def flush(self) -> None:
-        """Use the events that are still held back, as at the end of a recording."""
-        for ready in self._queue.pop_all():
+    def release(self) -> None:
+        """Use the events that are held back for others, as before something is changed.
+
+        One with a stamp far ahead stays: it may be wrong, and would make all others too late.
+        """
+        for ready in self._queue.pop_believed():
             self._process(ready)
 
-    def catch_up(self) -> None:
-        """Move the state on to ``stamp_ns`` now, rather than with the next observation."""
-        if self.stamp_ns is not None:
-            self._advance(self.stamp_ns)
+    def flush(self) -> None:
+        """Use all events that are held back and move on to the last: the recording is over."""
+        for ready in self._queue.pop_all():
+            self._process(ready)
+        self._catch_up()
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; the state is not changed.
@@ -359,7 +364,7 @@ class Estimator:
         if is_late:
             self._tell_of_late()
         if self._timeline.is_full:
-            self._advance(event.stamp_ns)
+            self._catch_up()
 
     def _process_observation(self, event: ObservationEvent) -> None:
         if self.settings.two_d_mode:
@@ -369,7 +374,7 @@ class Estimator:
         if event.stamp_ns < (timeline.state_ns or 0):
             event = timeline.carry_forward(event, self._slam)
             self._counts['late_observation'] += 1
-        self._advance(event.stamp_ns)
+        timeline.advance(self._frame.states, event.stamp_ns)
         ids, residuals = self._frame.states.observe(event)
         self._tell_of_moved(self._slam.moved_ids)
         self._counts['observation'] += 1
@@ -398,11 +403,10 @@ class Estimator:
         if _is_power_of_ten(self._times_moved):
             logger.warning('Landmarks %s have moved (%d so far).', ids.tolist(), self._times_moved)
 
-    def _advance(self, stamp_ns: int) -> None:
-        start_ns = self._timeline.state_ns
-        if self._on_motion is not None and start_ns is not None and start_ns < stamp_ns:
-            self._on_motion(self._timeline.velocities, start_ns, stamp_ns)
-        self._timeline.advance(self._frame.states, stamp_ns)
+    def _catch_up(self) -> None:
+        """Move the states on to the last event that was used."""
+        if self.stamp_ns is not None:
+            self._timeline.advance(self._frame.states, self.stamp_ns)
 
     def _forget_time(self) -> None:
         """Forget all that has a stamp but the map."""
@@ -412,7 +416,7 @@ class Estimator:
             max_jump_ns=round(settings.max_stamp_jump * 1e9),
             late_limit_ns=round(settings.late_limit * 1e9),
         )
-        self._timeline = Timeline(settings)
+        self._timeline = Timeline(settings, self._on_motion)
 
 
 def _is_power_of_ten(count: int) -> bool:

@@ -97,16 +97,22 @@ class EventQueue:
 
     def pop_ready(self) -> list[Event]:
         """Give out, in order, the events that have left the window."""
-        ready_ns = (self.newest_ns or 0) - self._window_ns
-        ready = []
-        while self._heap and self._heap[0][0][0] <= ready_ns:
-            ready.append(heapq.heappop(self._heap)[1])
-        return ready
+        return self._pop_until((self.newest_ns or 0) - self._window_ns)
+
+    def pop_believed(self) -> list[Event]:
+        """Give out, in order, all events but those with a stamp that waits for others."""
+        return self._pop_until(self.newest_ns or 0)
 
     def pop_all(self) -> list[Event]:
         """Give out all events that are left, in order."""
         events = [event for _, event in sorted(self._heap)]
         self._heap.clear()
+        return events
+
+    def _pop_until(self, stamp_ns: int) -> list[Event]:
+        events = []
+        while self._heap and self._heap[0][0][0] <= stamp_ns:
+            events.append(heapq.heappop(self._heap)[1])
         return events
 
     def _insert(self, event: Event) -> None:

@@ -156,7 +156,6 @@ class _Run:
     def finish(self) -> Replay:
         start_s = time.thread_time()
         self._estimator.flush()
-        self._estimator.catch_up()
         self._seconds += time.thread_time() - start_s
         self._sample()
         return Replay(

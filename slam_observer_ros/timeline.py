@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeAlias
 
 from slam_observer_ros.axes import SPATIAL
 from slam_observer_ros.errors import InvalidEventError
@@ -16,6 +18,9 @@ from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.velocity_history import VelocityHistory
 
+OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
+"""Called with velocities, and with the two stamps between which they lead, nanoseconds."""
+
 MAX_PENDING_VELOCITIES = 128
 """Velocities that may wait for an observation before the state is moved on without one."""
 
@@ -27,6 +32,8 @@ class Timeline:
     ----------
     settings : Settings
         ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
+    on_motion : callable, optional
+        Called each time before the states are moved on.
 
     Attributes
     ----------
@@ -39,13 +46,14 @@ class Timeline:
 
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, on_motion: OnMotion | None = None) -> None:
         timeout_ns = round(settings.velocity_timeout * 1e9)
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
         self.stamp_ns: int | None = None
         self.state_ns: int | None = None
         # A delay, and beyond it half of what velocities are averaged over to estimate it.
         self._kept_ns = round((settings.late_limit + 2.0 * MAX_DELAY_S) * 1e9)
+        self._on_motion = on_motion
         self._pending = 0
         self._newest_ns: dict[type, int] = {}
 
@@ -93,13 +101,16 @@ class Timeline:
         return None if self.stamp_ns is None else self.velocities.latest(self.stamp_ns)
 
     def advance(self, states: Hypotheses, stamp_ns: int) -> None:
-        """Move the states, which are those of ``state_ns``, on to ``stamp_ns``."""
-        start_ns = stamp_ns if self.state_ns is None else self.state_ns
-        if stamp_ns > start_ns:
-            states.advance(self.velocities, start_ns, stamp_ns)
-            self.velocities.forget_before(stamp_ns - self._kept_ns)
-        self.state_ns = stamp_ns
+        """Move the states, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
         self._pending = 0
+        start_ns = self.state_ns
+        if start_ns is None or stamp_ns <= start_ns:
+            return
+        if self._on_motion is not None:
+            self._on_motion(self.velocities, start_ns, stamp_ns)
+        states.advance(self.velocities, start_ns, stamp_ns)
+        self.velocities.forget_before(stamp_ns - self._kept_ns)
+        self.state_ns = stamp_ns
 
     def motion(self, calibration: Calibration, start_ns: int, end_ns: int) -> FloatArray:
         """Return how the body moves (4, 4) between two stamps, backwards if need be."""

@@ -21,7 +21,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
-from slam_observer_ros.timeline import Timeline
+from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
 
 START_NS = 1_700_000_000_000_000_000
 LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 1], [0, 4, 0.5], [1, -4, 0], [2, 2, 2]])
@@ -143,6 +143,13 @@ def test_a_velocity_later_than_the_window_counts_from_then_on():
     np.testing.assert_allclose(estimator.pose[:3, 3], [1.0, 0.0, 0.0], atol=1e-9)
     assert estimator.counts['late_velocity'] == 1
     assert estimator.dropped == {'too_late': 1}, 'a newer velocity was known before it'
+
+
+def test_however_many_velocities_come_late_no_motion_counts_twice():
+    events = [velocity(0.0), observation(0.4, [])]
+    events += [velocity(0.001 * step) for step in range(1, 3 * MAX_PENDING_VELOCITIES)]
+    estimator = run(events, reorder_window=0.0)
+    np.testing.assert_allclose(estimator.pose, true_pose(0.4), atol=1e-9)
 
 
 @pytest.mark.parametrize('are_given', [False, True])
@@ -307,6 +314,21 @@ def test_one_stamp_ahead_does_not_cost_the_map(ahead_s, reorder_window):
     np.testing.assert_allclose(wrong.world_points, right.world_points, atol=0.02)
 
 
+def test_events_released_in_between_leave_one_stamp_ahead_waiting():
+    events = drive()
+    ahead = VelocityEvent(events[60].stamp_ns + 2_500_000_001, BODY_VELOCITY)
+    estimator = Estimator(Settings(confirmations=1))
+    for event in [*events[:60], ahead]:
+        estimator.add(event)
+    estimator.release()
+    assert estimator.stamp_ns == events[59].stamp_ns
+    for event in events[60:]:
+        assert estimator.add(event)
+    estimator.release()
+    assert_same_state(estimator, run(events))
+    assert not estimator.dropped
+
+
 def test_an_empty_observation_moves_the_state_on_and_nothing_else():
     empty = ObservationEvent(START_NS + 10**9, np.empty(0, dtype=np.int64), np.empty((0, 3)))
     estimator = run([velocity(0.0), empty], velocity_timeout=2.0)
@@ -432,6 +454,15 @@ def test_after_a_jump_back_in_time_landmarks_out_of_view_make_room_for_new_ones(
             assert estimator.add(ObservationEvent(stamp_ns, np.array(ids), points))
         estimator.restart_time()
     assert sorted(estimator.landmark_ids) == [2, 7, 8]
+
+
+def test_after_a_jump_all_starts_where_the_run_began_though_the_robot_was_moved_since():
+    start = true_pose(3.0)
+    estimator = Estimator(Settings(), initial_pose=start)
+    assert estimator.add(velocity(0.0))
+    estimator.set_pose(true_pose(7.0))
+    estimator.restart_time()
+    np.testing.assert_array_equal(estimator.pose, start)
 
 
 def test_told_of_a_jump_the_estimator_starts_again_at_once():

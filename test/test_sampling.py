@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -62,3 +64,12 @@ def test_covariances_are_collected_only_to_compare_errors_with():
     assert result.pose_covariances.shape == (len(result.trajectory.poses), 6, 6)
     for lacking in (nothing, None):
         assert replay(events_of(400, 7), Settings(), lacking).pose_covariances is None
+
+
+def test_what_is_seen_before_a_jump_does_not_count_as_seen_since():
+    before, after = events_of(100, 5), events_of(60, 5)
+    later = [replace(event, stamp_ns=event.stamp_ns + 1000 * SECOND) for event in before]
+    settings = Settings(on_time_jump='hold', reorder_window=0.5)
+    result = replay([*later, *after], settings)
+    assert result.estimator.jumps == 1
+    assert result.observations_since == len(result.estimator.smooth().stamps_ns)

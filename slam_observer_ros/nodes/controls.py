@@ -47,7 +47,7 @@ class Controls:
         return self._answer(response, 'pose and what was mapped are forgotten')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._estimator.flush()  # what has come before the pause counts
+        self._estimator.release()  # what has come before the pause counts
         self._intake.is_paused = True
         return self._answer(response, 'paused: the pose is held, and all that comes in is dropped')
 
@@ -62,7 +62,7 @@ class Controls:
         return response
 
     def _forget(self, message: Int64) -> None:
-        self._estimator.flush()  # else a sighting that is held back would bring it back
+        self._estimator.release()  # else a sighting that is held back would bring it back
         was_known = self._estimator.forget(message.data)
         self._node.get_logger().info(
             f'landmark {message.data} is {"forgotten" if was_known else "not known"}'

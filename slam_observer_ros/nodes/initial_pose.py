@@ -58,7 +58,7 @@ class InitialPose:
         except MessageError as error:
             self._node.get_logger().error(f'the pose given is not used: {error}')
             return
-        self._estimator.flush()  # what has come before belongs to where the robot was
+        self._estimator.release()  # what has come before belongs to where the robot was
         self._estimator.set_pose(message.pose, filled_in(message.covariance))
         self._on_move()
         x, y, z = message.position.tolist()

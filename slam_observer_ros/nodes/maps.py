@@ -100,7 +100,7 @@ class Maps:
 
     def _save(self, path: Path) -> str:
         estimator = self._estimator
-        estimator.flush()
+        estimator.release()
         if not estimator.is_localised:
             raise MapError('the place in the loaded map is not known yet: nothing is saved')
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
@@ -114,7 +114,7 @@ class Maps:
                 f"map {path} is in frame '{landmark_map.frame_id}', and 'map_frame' is "
                 f"'{self._map_frame}': make them the same"
             )
-        self._estimator.flush()  # what has come before belongs to the old frame
+        self._estimator.release()  # what has come before belongs to the old frame
         self._estimator.load_map(landmark_map)
         self._on_load()
         place = 'the robot has found its place in it'
