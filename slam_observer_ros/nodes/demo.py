@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import AbstractContextManager, contextmanager, ExitStack
 import math
 import os
 from pathlib import Path
 import subprocess
 import sys
 import time
+from typing import TypeAlias
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -27,6 +28,8 @@ from slam_observer_ros.nodes.demo_listener import DemoListener
 from slam_observer_ros.nodes.demo_report import report
 from slam_observer_ros.nodes.runner import StopSignal
 from slam_observer_ros.recording.writer import RecordingWriter
+
+NodeContext: TypeAlias = AbstractContextManager['subprocess.Popen[bytes]']
 
 MESSAGE_RATE_HZ = 20.0
 PUBLISH_RATE_HZ = 100.0
@@ -106,45 +109,52 @@ def _run(
     """Start both nodes, listen until the simulation is over, stop them."""
     stop = StopSignal()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    is_simulated_time = options.real_time_factor != 1.0
     with ExitStack() as cleanup:
         cleanup.callback(rclpy.try_shutdown)
-        listener = DemoListener(writer, is_simulated_time)
+        listener = DemoListener(writer, _is_simulated_time(options))
         cleanup.callback(listener.destroy_node)
         executor = SingleThreadedExecutor()
         executor.add_node(listener)
         cleanup.callback(executor.shutdown)
-        cleanup.enter_context(
-            _node(
-                'observer_node',
-                folder,
-                gains='constant',
-                velocity_type='TwistStamped',
-                landmarks_type='PointCloud2',
-                twist_qos='reliable',
-                landmarks_qos='reliable',
-                queue_depth=QUEUE_DEPTH,
-                publish_rate=PUBLISH_RATE_HZ,
-                use_sim_time=is_simulated_time,
-            )
-        )
+        cleanup.enter_context(_observer(options, folder))
         _wait_for_observer(executor, listener, stop)
-        simulator = cleanup.enter_context(
-            _node(
-                'simulator_node',
-                folder,
-                stamped=True,
-                landmarks_type='PointCloud2',
-                velocity_rate=MESSAGE_RATE_HZ,
-                observation_rate=MESSAGE_RATE_HZ,
-                initial_bias=INITIAL_BIAS_M,
-                duration=options.duration,
-                real_time_factor=options.real_time_factor,
-                wait_for_subscribers=2,
-            )
-        )
+        simulator = cleanup.enter_context(_simulator(options, folder))
         _listen(executor, listener, simulator, stop, options.duration, console)
     return listener
+
+
+def _is_simulated_time(options: argparse.Namespace) -> bool:
+    return bool(options.real_time_factor != 1.0)
+
+
+def _observer(options: argparse.Namespace, folder: Path) -> NodeContext:
+    return _node(
+        'observer_node',
+        folder,
+        gains='constant',
+        velocity_type='TwistStamped',
+        landmarks_type='PointCloud2',
+        twist_qos='reliable',
+        landmarks_qos='reliable',
+        queue_depth=QUEUE_DEPTH,
+        publish_rate=PUBLISH_RATE_HZ,
+        use_sim_time=_is_simulated_time(options),
+    )
+
+
+def _simulator(options: argparse.Namespace, folder: Path) -> NodeContext:
+    return _node(
+        'simulator_node',
+        folder,
+        stamped=True,
+        landmarks_type='PointCloud2',
+        velocity_rate=MESSAGE_RATE_HZ,
+        observation_rate=MESSAGE_RATE_HZ,
+        initial_bias=INITIAL_BIAS_M,
+        duration=options.duration,
+        real_time_factor=options.real_time_factor,
+        wait_for_subscribers=2,
+    )
 
 
 @contextmanager
