@@ -97,9 +97,12 @@ def write_rosbag2(
 
 
 def write_rosbag1(path: Path) -> Path:
-    """Write the run as a ROS 1 .bag."""
+    """Write the run as a ROS 1 .bag, which begins with a message of a type that ROS 2 lacks."""
     typestore = get_typestore(Stores.ROS1_NOETIC)
     with rosbag1.Writer(path) as bag:
+        log_type = 'rosgraph_msgs/msg/Log'
+        rosout = bag.add_connection('/rosout', log_type, typestore=typestore)
+        bag.write(rosout, ros.STAMP_NS, b'')
         connections = {}
         for topic, stamp_ns, message in messages():
             if topic not in connections:

@@ -51,6 +51,12 @@ def write_big_mcap(path: Path, count: int = 30_000) -> Path:
     return path
 
 
+def open_files(directory: Path) -> list[Path]:
+    """List what this process holds open in a directory."""
+    held = (descriptor.resolve() for descriptor in Path('/proc/self/fd').iterdir())
+    return [file for file in held if directory.resolve() in file.parents]
+
+
 class TestFormats:
     @pytest.mark.parametrize('name', FORMATS)
     def test_every_format_gives_the_same_events(self, paths, name):
@@ -183,6 +189,15 @@ class TestDamage:
                     list(recording.events(recording.find_topics()))
             except RecordingError as error:
                 assert '\n' not in str(error)
+
+    def test_a_file_whose_first_message_is_damaged_is_closed_again(self, tmp_path):
+        path = recordings.write_mcap(tmp_path / 'run.mcap')
+        whole = path.read_bytes()
+        path.write_bytes(whole[:2000] + bytes(50) + whole[2050:])
+        with pytest.raises(RecordingError, match='can not be read') as caught:
+            open_recording(path)
+        assert str(path) in str(caught.value)
+        assert open_files(tmp_path) == []
 
     def test_malformed_message_is_left_out_and_counted(self, tmp_path, caplog):
         path = tmp_path / 'malformed.mcap'

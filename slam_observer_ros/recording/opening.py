@@ -54,7 +54,12 @@ def open_source(path: Path) -> tuple[MessageSource, str | None]:
             'or a rosbag2 directory'
         )
     source, warning = _open_file(path)
-    _refuse_compressed_messages(path, source)
+    try:
+        if path.suffix != '.bag':  # ROS 1 compresses no messages, and the first may be unreadable
+            _refuse_compressed_messages(path, source)
+    except RecordingError:
+        source.close()
+        raise
     return source, warning
 
 
@@ -134,7 +139,6 @@ def _refuse_compressed_messages(path: Path, source: MessageSource) -> None:
     """Refuse a file whose messages are compressed one by one: only metadata.yaml tells so."""
     first = next(iter(source.messages(source.topics)), None)
     if first is not None and bytes(first.data[: len(_ZSTD_MAGIC)]) == _ZSTD_MAGIC:
-        source.close()
         raise RecordingError(
             f'{path}: its messages are compressed, which are read of a whole rosbag2 directory '
             'only: keep its metadata.yaml beside it and give the directory'
