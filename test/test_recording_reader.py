@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 import shutil
 
@@ -164,6 +165,18 @@ class TestDamage:
             events = list(recording.events(recording.find_topics()))
             assert len(events) == recording.message_count
         assert count < len(events) < 2 * count
+
+    @pytest.mark.parametrize('size', [0, 8, 300])
+    def test_of_a_split_recording_a_file_without_any_whole_message_is_left_out(self, split, size):
+        directory, count = split
+        os.truncate(directory / '1.mcap', size)
+        with open_recording(directory) as recording:
+            assert f'{directory / "1.mcap"}: can not be read' in recording.warning
+            assert recording.message_count == count
+            assert len(list(recording.events(recording.find_topics()))) == count
+        os.truncate(directory / '0.mcap', size)
+        with pytest.raises(RecordingError, match=f'{directory / "0.mcap"}: .* no whole message'):
+            open_recording(directory)
 
     def test_of_a_split_recording_a_file_that_is_missing_is_named(self, split):
         directory, _ = split

@@ -92,10 +92,17 @@ def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
 
 
 def _open_parts(files: Sequence[Path]) -> tuple[MessageSource, str | None]:
-    opened = [open_source(file) for file in files]
-    if len(opened) == 1:
-        return opened[0]
-    warnings = [warning for _, warning in opened if warning]
+    """Open what can be read of a recording's files; raise the first error if nothing can."""
+    opened: list[tuple[MessageSource, str | None]] = []
+    errors: list[Exception] = []
+    for file in files:
+        try:
+            opened.append(open_source(file))
+        except (RecordingError, OSError) as error:
+            errors.append(error)
+    if not opened:
+        raise errors[0]
+    warnings = [warning for _, warning in opened if warning] + [str(error) for error in errors]
     return SplitSource([source for source, _ in opened]), '; '.join(warnings) or None
 
 
