@@ -15,7 +15,7 @@ import yaml
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError, SlamObserverError
 from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.recording.map_file import read_map, write_map
+from slam_observer_ros.recording.map_file import check_writable, read_map, write_map
 from slam_observer_ros.settings import Settings
 
 SURVEYED = """\
@@ -123,6 +123,22 @@ def test_a_map_is_written_where_a_link_leads_and_never_over_a_pipe(tmp_path):
         write_map(tmp_path / 'pipe', a_map(4), Settings())
     assert (tmp_path / 'pipe').is_fifo()
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_whether_a_map_can_be_written_is_told_of_where_it_would_be_written(tmp_path):
+    (tmp_path / 'elsewhere').mkdir()
+    (tmp_path / 'link.yaml').symlink_to('elsewhere/map.yaml')
+    check_writable(tmp_path / 'link.yaml')
+    (tmp_path / 'elsewhere').rmdir()
+    reason = f'the directory {tmp_path / "elsewhere"} takes no file: No such file'
+    with pytest.raises(MapError, match=rf"can't write map .*link\.yaml: {reason}"):
+        check_writable(tmp_path / 'link.yaml')
+    os.mkfifo(tmp_path / 'pipe')
+    with pytest.raises(MapError, match=r"can't write map .*pipe: it is there, and no regular"):
+        check_writable(tmp_path / 'pipe')
+    with pytest.raises(MapError, match=r"can't write map .*: it is a directory"):
+        check_writable(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_folder_that_is_missing_is_named(tmp_path):

@@ -29,7 +29,7 @@ import yaml
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError
 from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.output_files import unfinished_file
+from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 
@@ -95,16 +95,20 @@ def check_writable(path: Path) -> None:
     Raises
     ------
     MapError
-        If its directory takes no file, or it is a directory itself.
+        If the directory that its name leads to takes no file, or it is there and no file.
 
     """
     if path.is_dir():
         raise MapError(f"can't write map {path}: it is a directory")
     try:
-        with tempfile.TemporaryFile(dir=path.parent):
+        directory = destination(path).parent
+    except OSError as error:
+        raise MapError(f"can't write map {path}: {error.strerror}") from error
+    try:
+        with tempfile.TemporaryFile(dir=directory):
             pass
     except OSError as error:
-        reason = f'the directory {path.parent} takes no file: {error.strerror}'
+        reason = f'the directory {directory} takes no file: {error.strerror}'
         raise MapError(f"can't write map {path}: {reason}") from error
 
 
