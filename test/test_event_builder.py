@@ -8,12 +8,13 @@ import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_velocity, pose_from_rpy
-from slam_observer_ros.recording.event_builder import EventBuilder
+from slam_observer_ros.recording.event_builder import EventBuilder, MAX_WAITING
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.recording.messages import VelocityMessage
+from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.transform_buffer import TransformBuffer
 
 MS = 1_000_000
@@ -91,3 +92,20 @@ def test_a_transform_that_always_comes_too_late_changes_nothing(log):
         events += wheel.send(1)
     assert_array_equal([event.body_velocity for event in events], [V] * len(events))
     assert [record.levelname for record in log.records] == ['WARNING']
+
+
+def test_what_too_many_wait_behind_is_dropped_and_told():
+    drops = []
+    transforms = TransformBuffer()
+    builder = EventBuilder(BaseFrame(InputSettings(), transforms), 10.0, 0.5, drops.append)
+    for k in range(MAX_WAITING + 3):
+        observation = ObservationEvent(k * MS, np.array([1]), np.ones((1, 3)))
+        assert not builder.add(ObservationMessage('camera', observation), k * MS)
+    assert not builder.retry(MAX_WAITING * MS)
+    assert len(drops) == 3
+    assert f'more than {MAX_WAITING} measurements wait' in str(drops[0])
+    assert "'camera' and 'base_link' are not connected" in str(drops[0])
+    transforms.insert('base_link', 'camera', 0, WHEEL, is_static=True)
+    events = builder.finish()
+    assert [event.stamp_ns for event in events] == [k * MS for k in range(3, MAX_WAITING + 3)]
+    assert len(drops) == 3

@@ -83,7 +83,7 @@ class EventBuilder:
         self._transform_timeout_ns = round(transform_timeout_s * NANOSECONDS_PER_SECOND)
         self._on_drop = on_drop
         self._poses = PoseDifferences(round(velocity_timeout_s * NANOSECONDS_PER_SECOND))
-        self._waiting: deque[_Waiting] = deque(maxlen=MAX_WAITING)
+        self._waiting: deque[_Waiting] = deque()
         self._taken_as_base: dict[str, tuple[int, VelocityMessage]] = {}
 
     def add(self, measured: Measured, now_ns: int) -> list[Event]:
@@ -107,12 +107,12 @@ class EventBuilder:
 
     def retry(self, now_ns: int) -> list[Event]:
         """Return the events of what has waited long enough, or for what is known by now."""
-        waiting, self._waiting = self._waiting, deque(maxlen=MAX_WAITING)
+        waiting, self._waiting = self._waiting, deque()
         return [event for item in waiting for event in self._attempt(item, now_ns)]
 
     def finish(self) -> list[Event]:
         """Return the events of what still waits, when nothing more will come."""
-        waiting, self._waiting = self._waiting, deque(maxlen=MAX_WAITING)
+        waiting, self._waiting = self._waiting, deque()
         return [event for item in waiting for event in self._attempt(item, item.deadline_ns)]
 
     def forget(self) -> None:
@@ -124,10 +124,17 @@ class EventBuilder:
             event: Event | None = self._event(item.measured, now_ns)
         except TransformError as error:
             if now_ns < item.deadline_ns:
-                self._waiting.append(item)
+                self._wait(item, error)
                 return []
             event = self._give_up(item, error)
         return [] if event is None else [event]
+
+    def _wait(self, item: _Waiting, error: TransformError) -> None:
+        if len(self._waiting) == MAX_WAITING:
+            self._waiting.popleft()
+            text = f'more than {MAX_WAITING} measurements wait for their transforms: {error}'
+            self._on_drop(TransformError(text))
+        self._waiting.append(item)
 
     def _event(self, measured: _InFrame, now_ns: int) -> Event:
         if isinstance(measured, VelocityMessage):
