@@ -41,6 +41,11 @@ class Topic:
         return f'{self.name} ({self.message_type}, {self.count} messages)'
 
 
+def last_part(name: str) -> str:
+    """Return what follows the last slash of a topic's name or a message type."""
+    return name.rpartition('/')[2]
+
+
 class RawMessage(NamedTuple):
     """One recorded message: its topic, receive time in nanoseconds, and CDR bytes."""
 

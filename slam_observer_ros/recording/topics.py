@@ -23,7 +23,7 @@ from slam_observer_ros.recording.messages import (
     POSE_DECODERS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.recording.sources import Topic
+from slam_observer_ros.recording.sources import last_part, Topic
 from slam_observer_ros.recording.transform_topics import (
     transform_topics,
     TRANSFORMS_TYPE,
@@ -134,7 +134,7 @@ def select_topics(
     used = [topic for topic in topics if topic.count > 0]
 
     def fits(topic: Topic, role: _Role) -> bool:
-        if not role.is_truth and _last_part(topic.name) == 'landmarks':
+        if not role.is_truth and last_part(topic.name) == 'landmarks':
             return topic.message_type in (*role.message_types, *role.types_by_name)
         if topic.message_type not in role.message_types:
             return False
@@ -181,20 +181,20 @@ def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:
 
 def _velocity_rank(name: str) -> int:
     """Prefer ``twist``; put commands behind measurements."""
-    if _last_part(name) == 'twist':
+    if last_part(name) == 'twist':
         return 0
     return 2 if 'cmd' in name or 'command' in name else 1
 
 
 def _landmark_rank(name: str) -> int:
     """Prefer ``landmarks``; put an observer's own estimates last."""
-    if _last_part(name) == 'landmarks':
+    if last_part(name) == 'landmarks':
         return 0
-    return 2 if _last_part(name) in ESTIMATE_NAMES else 1
+    return 2 if last_part(name) in ESTIMATE_NAMES else 1
 
 
 def _pose_rank(name: str) -> int:
-    return 0 if _last_part(name) == 'pose' else 1
+    return 0 if last_part(name) == 'pose' else 1
 
 
 _VELOCITY = _Role('velocity', '--velocity-topic', VELOCITY_DECODERS, False, _velocity_rank)
@@ -222,16 +222,12 @@ def _landmark_choice(name: str | None, landmarks_type: str) -> tuple[_Role, str 
         types, name = [TRANSFORMS_TYPE], name or '/tf'
     else:
         known = (*_LANDMARKS.message_types, *_LANDMARKS.types_by_name)
-        types = [known_type for known_type in known if _last_part(known_type) == landmarks_type]
+        types = [known_type for known_type in known if last_part(known_type) == landmarks_type]
     return replace(_LANDMARKS, message_types=types, types_by_name=()), name
 
 
 def _is_truth(name: str) -> bool:
     return not TRUTH_NAMES.isdisjoint(name.lower().split('/'))
-
-
-def _last_part(name: str) -> str:
-    return name.rpartition('/')[2]
 
 
 def _named(topics: Sequence[Topic], role: _Role, name: str) -> Topic:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import logging
 from os.path import commonpath
 
-from slam_observer_ros.recording.sources import Topic
+from slam_observer_ros.recording.sources import last_part, Topic
 
 TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
 """Type of /tf, which holds landmarks if they are fiducials."""
@@ -50,7 +50,7 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
         for topic in topics
         if topic.message_type == TRANSFORMS_TYPE
         and topic.count
-        and _last_part(topic) in ('tf', 'tf_static')
+        and last_part(topic.name) in ('tf', 'tf_static')
     ]
     shared = commonpath([_namespace(topic) for topic in inputs])
     fitting = [tree for tree in trees if _encloses(_namespace(tree), shared)]
@@ -64,7 +64,7 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
             ' and '.join(topic.name for topic in inputs),
         )
     innermost_last = sorted(fitting, key=lambda tree: len(_namespace(tree)))
-    chosen = {_last_part(tree): (tree,) for tree in innermost_last}
+    chosen = {last_part(tree.name): (tree,) for tree in innermost_last}
     return TransformTopics(chosen.get('tf_static', ()), chosen.get('tf', ()))
 
 
@@ -74,7 +74,3 @@ def _encloses(outer: str, inner: str) -> bool:
 
 def _namespace(topic: Topic) -> str:
     return '/' + topic.name.strip('/').rpartition('/')[0]
-
-
-def _last_part(topic: Topic) -> str:
-    return topic.name.rpartition('/')[2]
