@@ -91,6 +91,7 @@ class TestVelocities:
         covariance[0, 0] = first
         raw = ros.serialise(ros.odometry([1.0] * 6, covariance))
         assert messages.decode_odometry_twist(raw).event.covariance is None
+        assert messages.decode_odometry_pose(raw).covariance is None
 
     def imu(self, covariance: np.ndarray) -> bytes:
         return ros.serialise(ros.imu([1.0, 2.0, 3.0], covariance))
@@ -138,9 +139,11 @@ class TestPoses:
                 ros.serialise(message, little_endian)
             )
             assert (decoded.stamp_ns, decoded.frame_id) == (ros.STAMP_NS, frame_id)
+            assert decoded.child_frame_id == getattr(message, 'child_frame_id', '')
             np.testing.assert_allclose(decoded.pose, self.EXPECTED, atol=1e-15)
-            if decoded.covariance is not None:
-                np.testing.assert_array_equal(decoded.covariance, ANGULAR_FIRST_COVARIANCE)
+            is_uncertain = hasattr(getattr(message, 'pose', None), 'covariance')
+            expected = ANGULAR_FIRST_COVARIANCE if is_uncertain else None
+            np.testing.assert_equal(decoded.covariance, expected)
 
     @given(st.lists(st.tuples(FRAMES, FRAMES), max_size=4), ENDIANNESS)
     def test_tf_message(self, frames, little_endian):

@@ -16,8 +16,6 @@ from rosbags.rosbag2 import Reader
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.messages import decode_odometry_pose, decode_odometry_twist
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.writer import RecordingWriter
 
@@ -40,24 +38,6 @@ def test_observations_keep_covariances_and_velocities(tmp_path):
     np.testing.assert_array_equal(read.points, written.points)
     np.testing.assert_array_equal(read.covariances, written.covariances)
     np.testing.assert_array_equal(read.velocities, written.velocities)
-
-
-@pytest.mark.parametrize('covariance', [None, np.arange(36.0).reshape(6, 6)])
-def test_odometry_round_trip(tmp_path, covariance):
-    pose = se3.exp(np.arange(6.0) / 4)
-    path = tmp_path / 'run.mcap'
-    with RecordingWriter(path) as writer:
-        writer.write_odometry(ros.STAMP_NS, pose, np.arange(6.0), covariance)
-    with Reader(path) as bag:
-        [(_, stamp_ns, data)] = bag.messages()
-    decoded = decode_odometry_pose(data)
-    assert stamp_ns == decoded.stamp_ns == ros.STAMP_NS
-    assert (decoded.frame_id, decoded.child_frame_id) == ('map', 'base_link')
-    np.testing.assert_allclose(decoded.pose, pose, atol=1e-12)
-    np.testing.assert_equal(decoded.covariance, covariance)
-    velocity = decode_odometry_twist(data).event
-    np.testing.assert_array_equal(velocity.body_velocity, np.arange(6.0))
-    assert velocity.covariance is None
 
 
 def test_other_tools_find_schemas_counts_and_latching(tmp_path):

@@ -7,7 +7,6 @@ from pathlib import Path
 import tempfile
 from types import TracebackType
 
-import numpy as np
 from rosbags.interfaces import (
     Connection,
     Qos,
@@ -31,13 +30,11 @@ from slam_observer_ros.output_files import destination
 from slam_observer_ros.recording.cdr import Buffer
 from slam_observer_ros.recording.message_factory import MessageFactory
 from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
-from slam_observer_ros.types import FloatArray
 
 VELOCITY_TOPIC = '/twist'
 LANDMARKS_TOPIC = '/landmarks'
 POSE_TRUTH_TOPIC = '/ground_truth/pose'
 LANDMARK_TRUTH_TOPIC = '/ground_truth/landmarks'
-ODOMETRY_TOPIC = '/odometry'
 BASE_FRAME = 'base_link'
 MAP_FRAME = 'map'
 
@@ -235,51 +232,6 @@ class RecordingWriter:
         layout = point_cloud2_layout(truth.ids, truth.world_points)
         message = self._messages.point_cloud2(stamp_ns, frame_id, layout)
         self._write_message(topic, message, stamp_ns, latched=True)
-
-    def write_odometry(
-        self,
-        stamp_ns: int,
-        pose: FloatArray,
-        body_velocity: FloatArray,
-        pose_covariance: FloatArray | None = None,
-        topic: str = ODOMETRY_TOPIC,
-    ) -> None:
-        """Write an estimate as Odometry.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            Time of validity.
-        pose : FloatArray
-            (4, 4) base frame to map.
-        body_velocity : FloatArray
-            (6,) angular then linear.
-        pose_covariance : FloatArray or None
-            (6, 6) of rotation vector and position in the axes of the map; None if unknown.
-        topic : str
-
-        """
-        unknown = np.zeros(36)
-        unknown[0] = -1.0
-        message = self._messages.make(
-            'nav_msgs/msg/Odometry',
-            self._messages.header(stamp_ns, MAP_FRAME),
-            BASE_FRAME,
-            self._messages.make(
-                'geometry_msgs/msg/PoseWithCovariance',
-                self._messages.pose(pose),
-                # ROS puts position before rotation.
-                unknown
-                if pose_covariance is None
-                else np.roll(pose_covariance, 3, (0, 1)).ravel(),
-            ),
-            self._messages.make(
-                'geometry_msgs/msg/TwistWithCovariance',
-                self._messages.twist(body_velocity),
-                unknown,
-            ),
-        )
-        self._write_message(topic, message, stamp_ns)
 
     def _write_message(
         self,
