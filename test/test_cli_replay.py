@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import recordings
 import ros_messages as ros
+from tum_files import read_tum
 import yaml
 
 from slam_observer_ros.cli import main
-from slam_observer_ros.evaluation.trajectory import read_tum
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 

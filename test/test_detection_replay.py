@@ -13,8 +13,8 @@ import ros_messages as ros
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from tum_files import read_tum
 
-from slam_observer_ros.evaluation.trajectory import read_tum
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, pose_from_rpy
 from slam_observer_ros.geometry import se3, so3

@@ -5,8 +5,8 @@ from __future__ import annotations
 from command_line import CommandLine
 import numpy as np
 import pytest
+from tum_files import read_tum
 
-from slam_observer_ros.evaluation.trajectory import read_tum
 from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.landmark_map import LandmarkMap

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 import ros_messages as ros
+from tum_files import read_tum
 
-from slam_observer_ros.evaluation.trajectory import read_tum
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.extrinsics import pose_from_rpy
 from slam_observer_ros.geometry import se3, so3

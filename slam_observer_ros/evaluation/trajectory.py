@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -82,11 +81,6 @@ class Trajectory:
     def rotations(self) -> FloatArray:
         """(k, 3, 3) rotations from body to world axes."""
         return self.poses[:, :3, :3]
-
-    @property
-    def path_length_m(self) -> float:
-        """Sum of the distances between consecutive positions, metres."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def during(self, other: Trajectory) -> Trajectory:
         """Return the least part that spans the time of another trajectory, as far as it does."""
@@ -223,62 +217,6 @@ def write_tum(trajectory: Trajectory, path: Path) -> Path:
     except OSError as error:
         raise EvaluationError(f"can't write {path}: {error.strerror}") from error
     return path
-
-
-def read_tum(path: Path) -> Trajectory:
-    """Read a TUM file; empty lines and lines that begin with ``#`` are passed over.
-
-    Parameters
-    ----------
-    path : Path
-        File with ``t x y z qx qy qz qw`` a line, quaternions of any length but zero.
-
-    Returns
-    -------
-    Trajectory
-        Its poses, stamps rounded to the nanosecond.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be read, a line is malformed, or the stamps don't increase.
-
-    """
-    try:
-        lines = path.read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"can't read {path}: {error}") from error
-    stamps_ns: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=1):
-        words = line.split()
-        if not words or words[0].startswith('#'):
-            continue
-        try:
-            stamp_ns, row = _parse_tum_words(words)
-        except (ValueError, ArithmeticError) as error:
-            raise EvaluationError(f'{path}, line {number}: {error}') from error
-        stamps_ns.append(stamp_ns)
-        rows.append(row)
-    numbers = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    poses = se3.pose(so3.from_quaternion(numbers[:, 3:]), numbers[:, :3])
-    try:
-        return Trajectory(np.array(stamps_ns, dtype=np.int64), poses)
-    except EvaluationError as error:
-        raise EvaluationError(f'{path}: {error}') from error
-
-
-def _parse_tum_words(words: list[str]) -> tuple[int, list[float]]:
-    if len(words) != 8:
-        raise ValueError(f'8 numbers expected, {len(words)} found')
-    stamp_ns = int((Decimal(words[0]) * NANOSECONDS_PER_SECOND).to_integral_value())
-    if abs(stamp_ns) > np.iinfo(np.int64).max:
-        raise ValueError('the stamp is out of range')
-    row = [float(word) for word in words[1:]]
-    norm = float(np.linalg.norm(row[3:]))
-    if norm == 0.0 or not np.isfinite(row).all():
-        raise ValueError('position and quaternion are no pose')
-    return stamp_ns, row[:3] + [value / norm for value in row[3:]]
 
 
 def _seconds_text(stamp_ns: int) -> str:
