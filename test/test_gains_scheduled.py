@@ -180,7 +180,7 @@ def test_landmarks_wait_in_few_groups():
         rows = np.union1d(rng.choice(n, 3), leaves.due())
         F, N, _ = leaves.now(rows)
         leaves.update(rows, F, N)
-        assert leaves.group_count <= 2 + np.log2(n)
+        assert len(leaves._sizes) <= 2 + np.log2(n)
         touched += len(rows)
     assert touched < 3 * 3000 * np.log2(n)
 

@@ -59,11 +59,6 @@ class Leaves:
     def __len__(self) -> int:
         return len(self._F)
 
-    @property
-    def group_count(self) -> int:
-        """How many groups there are."""
-        return len(self._sizes)
-
     def add(self, F: FloatArray, N: FloatArray) -> None:
         """Append landmarks (m,) with F (m, k, q) and N (m, k, k), m²."""
         rows = np.arange(len(self), len(self) + len(F))
