@@ -63,7 +63,8 @@ class Settings:
     )
     late_limit: float = parameter(
         2.0,
-        'How late an observation may come after the reorder window and still be carried forward',
+        'How late an event may come after the reorder window: an observation is carried forward, '
+        'a velocity counts from then on, unless a newer one of its kind was used before it',
         unit='s',
         minimum=0.0,
         maximum=60.0,

@@ -215,6 +215,12 @@ def test_an_event_later_than_the_limit_is_refused():
     assert len(estimator.landmark_ids) == 0
 
 
+def test_a_velocity_later_than_the_limit_is_refused():
+    events = [velocity(0.0), observation(1.0), observation(2.0), velocity(0.5)]
+    assert run(events, reorder_window=0.1, late_limit=1.5).counts['late_velocity'] == 1
+    assert run(events, reorder_window=0.1, late_limit=1.3).dropped == {'too_late': 1}
+
+
 def test_in_a_gap_the_pose_is_held_and_flagged():
     estimator = run([velocity(0.0), observation(3.0, [0])], velocity_timeout=0.5)
     np.testing.assert_allclose(estimator.pose, true_pose(0.5), atol=1e-9)
