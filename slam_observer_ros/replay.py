@@ -131,7 +131,7 @@ class _Run:
         self._landmark_truth = truth.landmarks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
         self._history_since = 'the start'
-        self._observations = self._observations_since = self._used_points = 0
+        self._observations = self._observations_since = self._used_points = self._forgotten = 0
         self._jumps = self._events = 0
         self._seconds = 0.0
         self._start()
@@ -208,7 +208,13 @@ class _Run:
 
     def _note_observation(self) -> None:
         """Count an observation, unless with it what was seen until then became the prior."""
-        used = used_points(self._estimator.counts)
+        counts = self._estimator.counts
+        if counts['forgotten_landmark'] > self._forgotten:
+            # The prior is of before this observation, which is the first to be looked back at.
+            self._history_since = 'landmarks had to make room (max_landmarks)'
+            self._observations_since = 0
+        self._forgotten = counts['forgotten_landmark']
+        used = used_points(counts)
         self._observations += used > self._used_points
         self._observations_since += used > self._used_points
         self._used_points = used

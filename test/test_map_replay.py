@@ -191,6 +191,16 @@ def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
     assert 'hindsight_window' not in jumped.errors + loaded.errors
 
 
+def test_smoothing_tells_that_landmarks_had_to_make_room(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    limited = ('--smooth', '--set', 'max_landmarks=30', *SETTINGS)
+    told = slam_observer('replay', path, *limited).errors
+    assert 'those since landmarks had to make room (max_landmarks)' in told
+    window = ('--set', 'hindsight_window=10', '--set', 'hindsight_interval=1')
+    told = slam_observer('replay', path, *limited, *window).errors
+    assert 'hindsight_window=0 smooths more' in told
+
+
 @pytest.mark.parametrize('resets', [True, False])
 def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_told(
     slam_observer, tmp_path, resets
