@@ -37,8 +37,9 @@ format: $(READY)  ## let ruff mend style and layout
 	$(VENV)/bin/ruff check --no-cache --fix
 	$(VENV)/bin/ruff format --no-cache
 
+# The tests of one file share nodes and a ROS domain; those of two have nothing in common.
 pytest: $(READY)  ## the tests alone
-	$(PYTHON_IN_VENV) -m pytest
+	$(PYTHON_IN_VENV) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 colcon: $(READY)  ## build, install and test as a ROS workspace does
 	scripts/colcon_check.sh $(VENV)

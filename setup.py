@@ -55,6 +55,7 @@ setup(
             'catkin_pkg',  # reads package.xml
         ],
         'dev': [
+            'pytest-xdist',  # tests that wait for nodes leave time for others
             'ruff',
             'mypy',
             'types-PyYAML',
