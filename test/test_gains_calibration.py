@@ -51,8 +51,7 @@ def scale_and_bias(estimator):
 
 def deviations(estimator, count):
     """Standard deviations of the ``count`` estimated entries."""
-    gains = estimator._slam.gains
-    return np.sqrt(np.diag(gains._P)[gains._p : gains._p + count])
+    return np.sqrt(estimator._slam.gains.calibration_variances[:count])
 
 
 def with_gains(settings, gains):

@@ -32,7 +32,8 @@ class FixedMapGains(RiccatiGains):
     def __init__(self, before: RiccatiGains, landmark_covariances: FloatArray) -> None:
         super().__init__(before._settings)
         self.calibration = before.calibration
-        self._P = before._P[: self._first, : self._first].copy()
+        first = self._joint.first
+        self._joint.P = before._joint.P[:first, :first].copy()
         self._landmark_covariances = landmark_covariances
 
     @property
@@ -42,7 +43,7 @@ class FixedMapGains(RiccatiGains):
 
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose's covariance."""
-        predict(self._P, self._axes, self.calibration, motion)
+        predict(self._joint.P, self._axes, self.calibration, motion)
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""
@@ -62,14 +63,14 @@ class FixedMapGains(RiccatiGains):
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
         C = self._pose_output(innovation)
-        PC = self._P[:, : self._p] @ C.T
+        PC = self._joint.P[:, : self._p] @ C.T
         return PC, C @ PC[: self._p]
 
     def _output_covariances(
         self, C: FloatArray, columns: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the covariances of C ε with ε (…, p, j), and of its own (…, j, j)."""
-        PC = self._P[: self._p, : self._p] @ so3.transpose(C)
+        PC = self._joint.pose @ so3.transpose(C)
         return PC, C @ PC
 
     def _as_correction(self, x: FloatArray) -> Correction:

@@ -28,9 +28,10 @@ from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.hindsight import Hindsight
+from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.gains.motion import Motion
-from slam_observer_ros.gains.prediction import initial_covariance, predict
+from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.robust import (
     are_far,
     block_diagonal,
@@ -66,12 +67,12 @@ class RiccatiGains:
         self._axes = axes_of(settings.two_d_mode)
         self.calibration = Calibration(settings, self._axes)
         self._p = len(self._axes.pose)
-        self._first = self._p + self.calibration.count
         self._is_moving = settings.landmark_velocity_error > 0.0
-        self._stride = self._axes.point * (2 if self._is_moving else 1)
-        self._first_columns = self._first + np.arange(self._axes.point)
-        self._P = initial_covariance(self._axes, self.calibration)
-        start = Prior(np.eye(4), self.calibration.values, np.empty((0, 3)), self._P.copy())
+        self._joint = JointCovariance(
+            self._axes, self.calibration, settings.landmark_velocity_error
+        )
+        P = self._joint.P.copy()
+        start = Prior(np.eye(4), self.calibration.values, np.empty((0, 3)), P)
         self._hindsight = Hindsight(self._axes, settings, start)
 
     def change_settings(self, settings: Settings) -> None:
@@ -81,35 +82,32 @@ class RiccatiGains:
     @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
-        variances: FloatArray = np.diagonal(self._P)[self._p : self._first]
+        variances: FloatArray = np.diagonal(self._joint.P)[self._p : self._joint.first]
         return variances
 
     @property
     def pose_covariance(self) -> FloatArray:
         """(6, 6) covariance of the pose error ε; zero on axes that are not estimated."""
-        return self._axes.full_pose_covariance(self._P[: self._p, : self._p])
+        return self._axes.full_pose_covariance(self._joint.pose)
 
     def pose_covariance_after(self, motion: Motion) -> FloatArray:
         """Return what it will be after a motion yet to be predicted (6, 6)."""
-        P = self._P[: self._first, : self._first].copy()
+        first = self._joint.first
+        P = self._joint.P[:first, :first].copy()
         predict(P, self._axes, self.calibration, motion)
         return self._axes.full_pose_covariance(P[: self._p, : self._p])
 
     @property
     def landmark_covariances(self) -> FloatArray:
         """(n, 3, 3) covariances of the landmark errors ã_i."""
-        k = self._axes.point
-        columns = self._columns(np.arange(self._count)).reshape(-1, k)
-        covariances = np.zeros((self._count, 3, 3))
-        covariances[:, :k, :k] = self._P[columns[:, :, None], columns[:, None, :]]
-        return covariances
+        return self._joint.landmarks
 
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
         if self._is_moving:
             self._predict_moving(observer, motion)
             return
-        noise, F = predict(self._P, self._axes, self.calibration, motion)
+        noise, F = predict(self._joint.P, self._axes, self.calibration, motion)
         if not self.looks_back:
             return
         if observer.u.any():
@@ -124,70 +122,40 @@ class RiccatiGains:
         Its noise turns R_Ã in ã_i = â_i − R_Ã a_i and ũ_i = û_i − R_Ã u_i, and leaves
         â_i − a_i = ã_i − [â_i]× ω and û_i − u_i = ũ_i − [û_i]× ω alone.
         """
-        everything = np.arange(self._count)
-        a, u = self._columns(everything), self._velocity_columns(everything)
+        joint, everything = self._joint, np.arange(self._joint.count)
+        a, u = joint.columns(everything), joint.velocity_columns(everything)
         duration_s = np.sum(motion.dt_s + motion.gap_s)
-        self._P[a] += duration_s * self._P[u]
-        self._P[:, a] += duration_s * self._P[:, u]
+        joint.P[a] += duration_s * joint.P[u]
+        joint.P[:, a] += duration_s * joint.P[:, u]
         columns = np.append(a, u)
         vectors = np.concatenate([observer.a, observer.u])
-        self._turn(columns, vectors)
-        predict(self._P, self._axes, self.calibration, motion)
-        self._turn(columns, -vectors)
+        joint.turn(columns, vectors)
+        predict(joint.P, self._axes, self.calibration, motion)
+        joint.turn(columns, -vectors)
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks (m, 3) with room for them in P."""
-        self._place(self._make_room(len(y_ref)), y_ref, covariances)
+        self._joint.place_seen(self._joint.make_room(len(y_ref)), y_ref, covariances)
 
     def relocate_landmarks(
         self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
     ) -> None:
         """Take landmarks for new ones; what was seen of them before now is forgotten."""
         self._hindsight.history.relocate_landmarks(indices)
-        self._place(indices, y_ref, covariances)
-
-    def _place(self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Fill in P for landmarks seen now: ã_i = J ε + noise, with J = [−[y_i°]×, I]."""
-        P, p, k = self._P, self._p, self._axes.point
-        columns = self._columns(indices)
-        J = self._axes.output_matrix(y_ref).reshape(-1, p)
-        P[columns] = J @ P[:p]
-        P[:, columns] = P[columns].T
-        own = J @ P[:p, :p] @ J.T + block_diagonal(covariances[:, :k, :k])
-        P[np.ix_(columns, columns)] = own
-        self._place_velocities(indices)
-
-    def _place_velocities(self, indices: IntArray) -> None:
-        """Fill in P for landmarks whose velocity is not known at all yet."""
-        if self._is_moving:
-            columns = self._velocity_columns(indices)
-            self._P[columns] = self._P[:, columns] = 0.0
-            self._P[columns, columns] = self._settings.landmark_velocity_error**2
-
-    def _make_room(self, m: int) -> IntArray:
-        """Append m landmarks to P, filled with zeros; return their indices."""
-        count, old = self._count, self._P
-        self._P = np.zeros((len(old) + self._stride * m,) * 2)
-        self._P[: len(old), : len(old)] = old
-        return np.arange(count, count + m)
+        self._joint.place_seen(indices, y_ref, covariances)
 
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
-        p, pose = self._p, self._axes.pose
-        self._P[:p] = self._P[:, :p] = 0.0
-        self._P[:p, :p] = covariance[np.ix_(pose, pose)]
+        pose = self._axes.pose
+        self._joint.set_pose(covariance[np.ix_(pose, pose)])
 
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Append landmarks whose errors are independent of all else."""
-        k, indices = self._axes.point, self._make_room(len(covariances))
-        columns = self._columns(indices)
-        self._P[np.ix_(columns, columns)] = block_diagonal(covariances[:, :k, :k])
-        self._place_velocities(indices)
+        self._joint.place_known(self._joint.make_room(len(covariances)), covariances)
 
     def joint_covariance(self, indices: IntArray) -> FloatArray:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks together."""
-        columns = np.append(np.arange(self._p), self._columns(indices))
-        return self._P[np.ix_(columns, columns)]
+        return self._joint.with_pose(indices)
 
     def anchor(
         self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
@@ -196,20 +164,19 @@ class RiccatiGains:
 
         G is taken at y_i°, as C_i is: so it spans what P holds of the gauge already.
         """
-        k = self._axes.point
-        G = np.zeros((len(self._P), self._p))
+        k, joint = self._axes.point, self._joint
+        G = np.zeros((len(joint.P), self._p))
         G[: self._p] = np.eye(self._p)
-        everything = self._columns(np.arange(self._count))
+        everything = joint.columns(np.arange(joint.count))
         G[everything] = self._axes.output_matrix(observer.y_ref).reshape(-1, self._p)
         R = block_diagonal(covariances[:, :k, :k])
-        x, self._P = anchor(self._P, G, self._columns(indices), R, r[:, :k].ravel())
+        x, joint.P = anchor(joint.P, G, joint.columns(indices), R, r[:, :k].ravel())
         return self._as_correction(-x)
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Delete the rows and columns of the landmarks at ``indices``."""
-        columns = np.append(self._columns(indices), self._velocity_columns(indices))
         self._hindsight.history.remove_landmarks(indices)
-        self._P = np.delete(np.delete(self._P, columns, axis=0), columns, axis=1)
+        self._joint.remove(indices)
 
     def recall(self, observer: Observer, indices: IntArray) -> None:
         """Do nothing: these gains put nothing off."""
@@ -220,7 +187,7 @@ class RiccatiGains:
 
     def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each observation was given."""
-        k, P = self._axes.point, self._P
+        k, P = self._axes.point, self._joint.P
         r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
         weights = observation_weights(r, self.foretold(innovation)[1], noise, self._settings)
         passed = weights > 0.0
@@ -235,7 +202,7 @@ class RiccatiGains:
     def distances(self, innovation: Innovation) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
         k = self._axes.point
-        columns = self._columns(innovation.indices).reshape(-1, k)
+        columns = self._joint.columns(innovation.indices).reshape(-1, k)
         _, CPC = self._output_covariances(self._chord_output(innovation), columns)
         return mahalanobis(innovation.r[:, :k], CPC + innovation.covariances[:, :k, :k])
 
@@ -261,13 +228,13 @@ class RiccatiGains:
 
         """
         C = self._chord_output(innovation).reshape(-1, self._p)
-        return self._output_covariances(C, self._columns(innovation.indices))
+        return self._output_covariances(C, self._joint.columns(innovation.indices))
 
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
-        columns = self._columns(innovation.indices)
+        columns = self._joint.columns(innovation.indices)
         C = self._pose_output(innovation)
-        PC = self._P[:, : self._p] @ C.T - self._P[:, columns]
+        PC = self._joint.P[:, : self._p] @ C.T - self._joint.P[:, columns]
         return PC, C @ PC[: self._p] - PC[columns]
 
     def _pose_output(self, innovation: Innovation) -> FloatArray:
@@ -290,9 +257,9 @@ class RiccatiGains:
 
         C is (…, j, p), and ``columns`` (…, j) are those of ã in P.
         """
-        P, to_pose = self._P[: self._p, : self._p], self._P[columns, : self._p]
-        own = self._P[columns[..., :, None], columns[..., None, :]]
-        PC = P @ so3.transpose(C) - so3.transpose(to_pose)
+        P = self._joint.P
+        to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
+        PC = self._joint.pose @ so3.transpose(C) - so3.transpose(to_pose)
         return PC, C @ PC - to_pose @ so3.transpose(C) + own
 
     def settle(self, observer: Observer) -> None:
@@ -303,14 +270,8 @@ class RiccatiGains:
         """
         if not observer.a.any():
             return
-        self._turn(self._map_columns, observer.a)
+        self._joint.turn(self._joint.map_columns, observer.a)
         observer.rebase(observer.A, observer.y_ref + observer.a)
-
-    def _turn(self, columns: IntArray | slice, vectors: FloatArray) -> None:
-        """Make errors x_i at ``columns`` x_i − [y_i]× ω, for ``vectors`` y (m, 3)."""
-        L = self._axes.turn_matrix(vectors).reshape(-1, self._p)
-        self._P[columns] += L @ self._P[: self._p]
-        self._P[:, columns] += self._P[:, : self._p] @ L.T
 
     @property
     def looks_back(self) -> bool:
@@ -347,7 +308,7 @@ class RiccatiGains:
     def restart(self, observer: Observer) -> None:
         """Forget the past: what is known now is all that is known when looking back."""
         points = observer.y_ref + observer.a
-        covariance = self._with_pose_error_by(se3.inverse(observer.A), self._P)
+        covariance = self._with_pose_error_by(se3.inverse(observer.A), self._joint.P)
         self._hindsight.restart(Prior(observer.A, self.calibration.values, points, covariance))
 
     def _as_solution(self, observer: Observer) -> Solution:
@@ -369,7 +330,7 @@ class RiccatiGains:
         """
         start, end = step.start, step.end
         observer.rebase(start.poses[-1], start.points)
-        self._P = self._with_pose_error_by(observer.A, covariance)
+        self._joint.P = self._with_pose_error_by(observer.A, covariance)
         self.calibration.shift(end.calibration - self.calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(Correction(D, slice(None), end.points - start.points))
@@ -384,34 +345,14 @@ class RiccatiGains:
         changed[:, :p] = changed[:, :p] @ Ad.T
         return changed
 
-    @property
-    def _count(self) -> int:
-        return (len(self._P) - self._first) // self._stride
-
-    @property
-    def _map_columns(self) -> IntArray | slice:
-        """Columns of P that belong to all landmarks; a slice, which is cheap, if it can be."""
-        if self._is_moving:
-            return self._columns(np.arange(self._count))
-        return slice(self._first, None)
-
-    def _columns(self, indices: IntArray) -> IntArray:
-        """Return the columns of P that belong to landmarks (m,), as (m · point,)."""
-        return (self._first_columns + self._stride * indices[:, None]).ravel()
-
-    def _velocity_columns(self, indices: IntArray) -> IntArray:
-        """Return those of the landmarks' velocities, none where these are not estimated."""
-        if not self._is_moving:
-            return np.empty(0, dtype=np.int64)
-        return self._columns(indices) + self._axes.point
-
     def _as_correction(self, x: FloatArray) -> Correction:
         """Return the group element exp(x); the calibration moves by its own part of x."""
-        self.calibration.shift(x[self._p : self._first])
+        joint = self._joint
+        self.calibration.shift(x[self._p : joint.first])
         Delta = self._axes.full_pose(x[: self._p])
         self._hindsight.note_correction(Delta[:3])
-        X = slam_group.exp(Delta, self._axes.full_points(x[self._map_columns]))
+        X = slam_group.exp(Delta, self._axes.full_points(x[joint.map_columns]))
         if not self._is_moving:
             return Correction(X.A, slice(None), X.a)
-        u = self._axes.full_points(x[self._velocity_columns(np.arange(self._count))])
+        u = self._axes.full_points(x[joint.velocity_columns(np.arange(joint.count))])
         return Correction(X.A, slice(None), X.a, u)

@@ -1,0 +1,127 @@
+"""The covariance of all errors that the Riccati gains know of, and which columns are whose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.axes import Axes
+from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.prediction import initial_covariance
+from slam_observer_ros.gains.robust import block_diagonal
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+class JointCovariance:
+    """P, the covariance of x = (ε, c, ã_1 … ã_n); with landmarks that move, (ã_i, ũ_i) for ã_i.
+
+    Parameters
+    ----------
+    axes, calibration : Axes, Calibration
+        Which p axes of the pose and k of a point, and which c of the calibration are estimated.
+    velocity_error : float
+        Standard deviation of a new landmark's velocity, m/s; 0 where landmarks stand still.
+
+    Attributes
+    ----------
+    P : FloatArray
+        (p + c + …, p + c + …) the covariance.
+    first : int
+        p + c, the first column of the landmarks.
+
+    """
+
+    def __init__(self, axes: Axes, calibration: Calibration, velocity_error: float) -> None:
+        self._axes = axes
+        self._p = len(axes.pose)
+        self._velocity_error = velocity_error
+        self._stride = axes.point * (2 if velocity_error > 0.0 else 1)
+        self.P = initial_covariance(axes, calibration)
+        self.first = len(self.P)
+        self._first_columns = self.first + np.arange(axes.point)
+
+    @property
+    def count(self) -> int:
+        """How many landmarks there are."""
+        return (len(self.P) - self.first) // self._stride
+
+    @property
+    def pose(self) -> FloatArray:
+        """(p, p) covariance of ε."""
+        return self.P[: self._p, : self._p]
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """(n, 3, 3) covariances of the landmark errors ã_i."""
+        k = self._axes.point
+        columns = self.columns(np.arange(self.count)).reshape(-1, k)
+        covariances = np.zeros((self.count, 3, 3))
+        covariances[:, :k, :k] = self.P[columns[:, :, None], columns[:, None, :]]
+        return covariances
+
+    @property
+    def map_columns(self) -> IntArray | slice:
+        """Columns that belong to all landmarks; a slice, which is cheap, if it can be."""
+        if self._velocity_error > 0.0:
+            return self.columns(np.arange(self.count))
+        return slice(self.first, None)
+
+    def columns(self, indices: IntArray) -> IntArray:
+        """Return the columns that belong to landmarks (m,), as (m k,)."""
+        return (self._first_columns + self._stride * indices[:, None]).ravel()
+
+    def velocity_columns(self, indices: IntArray) -> IntArray:
+        """Return those of the landmarks' velocities, none where these are not estimated."""
+        if self._velocity_error == 0.0:
+            return np.empty(0, dtype=np.int64)
+        return self.columns(indices) + self._axes.point
+
+    def with_pose(self, indices: IntArray) -> FloatArray:
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks together."""
+        columns = np.append(np.arange(self._p), self.columns(indices))
+        return self.P[np.ix_(columns, columns)]
+
+    def set_pose(self, covariance: FloatArray) -> None:
+        """Take over the covariance (p, p) of ε, independent of all else."""
+        self.P[: self._p] = self.P[:, : self._p] = 0.0
+        self.P[: self._p, : self._p] = covariance
+
+    def make_room(self, m: int) -> IntArray:
+        """Append m landmarks, filled with zeros; return their indices."""
+        count, old = self.count, self.P
+        self.P = np.zeros((len(old) + self._stride * m,) * 2)
+        self.P[: len(old), : len(old)] = old
+        return np.arange(count, count + m)
+
+    def place_seen(self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Fill in landmarks seen now: ã_i = J ε + noise, with J = [−[y_i°]×, I]."""
+        P, p, k = self.P, self._p, self._axes.point
+        columns = self.columns(indices)
+        J = self._axes.output_matrix(y_ref).reshape(-1, p)
+        P[columns] = J @ P[:p]
+        P[:, columns] = P[columns].T
+        own = J @ P[:p, :p] @ J.T + block_diagonal(covariances[:, :k, :k])
+        P[np.ix_(columns, columns)] = own
+        self._place_velocities(indices)
+
+    def place_known(self, indices: IntArray, covariances: FloatArray) -> None:
+        """Fill in landmarks whose errors are independent of all else."""
+        k, columns = self._axes.point, self.columns(indices)
+        self.P[np.ix_(columns, columns)] = block_diagonal(covariances[:, :k, :k])
+        self._place_velocities(indices)
+
+    def remove(self, indices: IntArray) -> None:
+        """Delete the rows and columns of landmarks."""
+        columns = np.append(self.columns(indices), self.velocity_columns(indices))
+        self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
+
+    def turn(self, columns: IntArray | slice, vectors: FloatArray) -> None:
+        """Make errors x_i at ``columns`` x_i − [y_i]× ω, for ``vectors`` y (m, 3)."""
+        L = self._axes.turn_matrix(vectors).reshape(-1, self._p)
+        self.P[columns] += L @ self.P[: self._p]
+        self.P[:, columns] += self.P[:, : self._p] @ L.T
+
+    def _place_velocities(self, indices: IntArray) -> None:
+        """Fill in landmarks whose velocity is not known at all yet."""
+        columns = self.velocity_columns(indices)
+        self.P[columns] = self.P[:, columns] = 0.0
+        self.P[columns, columns] = self._velocity_error**2
