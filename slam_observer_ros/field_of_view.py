@@ -12,11 +12,12 @@ SLACK = 1e-9
 
 
 class FieldOfView:
-    """The convex hull of the sensor and of all points that it ever saw, in the body frame.
+    """The convex hull of the base and of all points that were ever seen, in the body frame.
 
     So no sensor has to be described. If anything it takes more for seen than was looked at: one
     wrong point behind a camera, and that sees all around. Until the hull has an inside, which it
-    never has in space where all points lie in one plane, everything counts as in view.
+    never has where all points lie in one plane with the base, everything counts as in view, and
+    of the points seen the latest are kept.
 
     Parameters
     ----------
@@ -36,7 +37,6 @@ class FieldOfView:
         known = self.contains(points) & (len(self._faces) > 0)
         if known.all():
             return
-        # No array is changed in place: copies of a state share them.
         corners = np.concatenate([self._corners, points[~known, :k]])
         try:
             hull = ConvexHull(corners)

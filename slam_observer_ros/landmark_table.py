@@ -128,6 +128,8 @@ class LandmarkTable:
         """Take the rows ``indices`` as seen for the first time."""
         self.counts[indices] = 1
         self.rejections[indices] = 0
+        self.overlooked_ns[indices] = 0
+        self._in_view_ns[indices] = -1
 
     def remove(self, indices: IntArray) -> None:
         """Delete rows; those behind move up."""

@@ -77,7 +77,7 @@ class Slam:
     index : LandmarkIndex
         For landmarks near a point.
     field_of_view : FieldOfView
-        Where points without an id were seen.
+        Where points were seen, to know where one without an id should have been.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
     moved_ids : IntArray

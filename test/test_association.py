@@ -37,6 +37,7 @@ from slam_observer_ros.joint_compatibility import (
 )
 from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.settings import Settings
@@ -375,3 +376,12 @@ def test_the_index_misses_no_landmark_while_they_move_and_change_in_number(seed,
         landmarks = landmarks + rng.normal(scale=0.05, size=landmarks.shape)
         landmarks = np.concatenate([landmarks, rng.uniform(-10.0, 10.0, (rng.integers(9), 3))])
         landmarks = np.delete(landmarks, rng.integers(len(landmarks)), axis=0)
+
+
+def test_a_landmark_that_was_placed_anew_has_not_been_overlooked_before():
+    landmarks, row, in_view = LandmarkTable(), np.array([0]), np.array([True])
+    landmarks.add(np.array([FIRST_AUTOMATIC_ID]), 0)
+    landmarks.restart(row)
+    for second in (100, 101):
+        landmarks.overlook(row, in_view, second * SECOND_NS)
+    assert landmarks.overlooked_ns.tolist() == [SECOND_NS]
