@@ -26,10 +26,7 @@ RELIABLE = QoSProfile(depth=5000)
 class NodeProcess:
     """A node as a child process, with its output in a file."""
 
-    started = 0
-
     def __init__(self, name: str, log: Path, *arguments: str, **parameters: object) -> None:
-        NodeProcess.started += 1
         self.log = log
         command = [sys.executable, '-m', f'slam_observer_ros.nodes.{name}', '--ros-args']
         for key, value in parameters.items():
@@ -70,7 +67,6 @@ class Client:
         self.node = rclpy.create_node('test_client', context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
-        self._service_clients: dict[tuple[str, int], Any] = {}
 
     def collect(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
         """Return a list to which every message on the topic will be appended."""
@@ -107,20 +103,14 @@ class Client:
 
     def call(self, service_class: type, name: str, request: Any) -> Any:
         """Call a service and return its response."""
-        client = self._service_client(service_class, name)
+        client = self.node.create_client(service_class, name)
+        self.spin_until(client.service_is_ready, name)
+        # The server may not have heard of its client yet; its response would then be lost.
+        self.spin_for(0.5)
         future = client.call_async(request)
         self.spin_until(future.done, f'response of {name}')
+        self.node.destroy_client(client)
         return future.result()
-
-    def _service_client(self, service_class: type, name: str) -> Any:
-        """Return a client the service has heard of, the same one until another node starts."""
-        key = name, NodeProcess.started
-        if key not in self._service_clients:
-            client = self._service_clients[key] = self.node.create_client(service_class, name)
-            self.spin_until(client.service_is_ready, name)
-            # The server may not have heard of its client yet; its response would then be lost.
-            self.spin_for(0.5)
-        return self._service_clients[key]
 
     def close(self) -> None:
         self._executor.shutdown()
