@@ -379,6 +379,7 @@ def test_reset_forgets_pose_and_map(ros, observer):
     with Robot(ros) as robot:
         robot.run(RUN)
         ros.spin_until(lambda: estimates and len(estimates[-1].points) == 4, 'four landmarks')
+        robot.send_zeros()  # else a velocity still on its way would move it after the reset
         response = ros.call(Trigger, '/observer_node/reset', Trigger.Request())
         assert response.success
         ros.spin_for(0.2)
