@@ -7,8 +7,11 @@ from scipy.spatial import ConvexHull, QhullError
 
 from slam_observer_ros.types import BoolArray, FloatArray
 
-SLACK = 1e-9
-"""How far outside, as a share of what it measures across, a point may be and still be inside."""
+MARGIN = 0.01
+"""How far outside, as a share of what it measures across, a point may be and still be inside.
+
+Points are noisy, and without it each exact one at the sensor's full range would be a corner.
+"""
 
 
 class FieldOfView:
@@ -24,30 +27,35 @@ class FieldOfView:
     k : int
         Leading coordinates that matter: 2 in the plane, 3 in space.
 
+    Attributes
+    ----------
+    corners : FloatArray
+        (q, k) the base and the points seen that span the hull, metres, body frame.
+
     """
 
     def __init__(self, k: int) -> None:
-        self._corners = np.zeros((1, k))
+        self.corners = np.zeros((1, k))
         self._faces: FloatArray = np.empty((0, k + 1))
-        self._slack_m = 0.0
+        self._margin_m = 0.0
 
     def include(self, points: FloatArray) -> None:
         """Take in points (m, 3) that were seen, metres, body frame."""
-        k = self._corners.shape[1]
+        k = self.corners.shape[1]
         known = self.contains(points) & (len(self._faces) > 0)
         if known.all():
             return
-        corners = np.concatenate([self._corners, points[~known, :k]])
+        corners = np.concatenate([self.corners, points[~known, :k]])
         try:
             hull = ConvexHull(corners)
         except QhullError:  # all of them in one point, on one line or in one plane
-            self._corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
+            self.corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
             return
-        self._corners, self._faces = corners[hull.vertices], hull.equations
-        self._slack_m = SLACK * float(np.ptp(self._corners, axis=0).max())
+        self.corners, self._faces = corners[hull.vertices], hull.equations
+        self._margin_m = MARGIN * float(np.ptp(self.corners, axis=0).max())
 
     def contains(self, points: FloatArray) -> BoolArray:
         """Return which points (m, 3) lie where the sensor sees, metres, body frame."""
-        k = self._corners.shape[1]
+        k = self.corners.shape[1]
         heights_m = points[:, :k] @ self._faces[:, :k].T + self._faces[:, k]
-        return np.asarray((heights_m <= self._slack_m).all(axis=1))
+        return np.asarray((heights_m <= self._margin_m).all(axis=1))

@@ -7,6 +7,12 @@ import numpy as np
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
+LONGEST_LOOK_NS = 1_000_000_000
+"""Most that counts as time in view from one observation to the next, nanoseconds.
+
+Where the sensor looked in a longer pause, nobody knows.
+"""
+
 
 class LandmarkTable:
     """Book-keeping of n landmarks; row i belongs to the observer's landmark i.
@@ -115,8 +121,8 @@ class LandmarkTable:
     def overlook(self, indices: IntArray, in_view: BoolArray, stamp_ns: int) -> None:
         """Add the time up to ``stamp_ns`` for those of the rows (m,) that were and are in view."""
         since_ns = self._in_view_ns[indices]
-        looked_ns = np.where(in_view & (since_ns >= 0), stamp_ns - since_ns, 0)
-        self.overlooked_ns[indices] += looked_ns
+        looked_ns = np.minimum(stamp_ns - since_ns, LONGEST_LOOK_NS)
+        self.overlooked_ns[indices] += np.where(in_view & (since_ns >= 0), looked_ns, 0)
         self._in_view_ns[indices] = np.where(in_view, stamp_ns, -1)
 
     def unseen_since(self, stamp_ns: int) -> IntArray:

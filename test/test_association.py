@@ -132,9 +132,19 @@ def test_a_sensor_sees_where_it_saw_something_and_in_between(seed, m, k):
     assert field.contains(seen).all()
     assert field.contains(shares @ seen).all()
     beyond = 2.0 * seen[[np.argmax(np.linalg.norm(seen, axis=1))]]
-    has_inside = m >= k
-    assert field.contains(beyond).item() == (not has_inside)
-    assert_array_equal(field.contains(3.0 * seen), last.contains(3.0 * seen))
+    if m < k:
+        assert field.contains(beyond).all()
+    elif m >= 10:  # with fewer all may lie nearly in one line
+        assert not field.contains(beyond).any()
+    assert not (field.contains(3.0 * seen) & ~last.contains(3.0 * seen)).any()
+
+
+def test_a_sensor_that_measures_exactly_has_a_field_of_view_with_few_corners():
+    field, rng = FieldOfView(3), np.random.default_rng(0)
+    for _ in range(3000):
+        direction = rng.normal(size=3)
+        field.include(3.0 * direction[None] / np.linalg.norm(direction))
+    assert len(field.corners) < 300
 
 
 def test_where_all_points_lie_in_one_plane_all_of_space_counts_as_in_view():
@@ -385,3 +395,12 @@ def test_a_landmark_that_was_placed_anew_has_not_been_overlooked_before():
     for second in (100, 101):
         landmarks.overlook(row, in_view, second * SECOND_NS)
     assert landmarks.overlooked_ns.tolist() == [SECOND_NS]
+
+
+def test_a_landmark_is_not_overlooked_while_nothing_is_observed():
+    """The robot may have turned away and back."""
+    landmarks, row, in_view = LandmarkTable(), np.array([0]), np.array([True])
+    landmarks.add(np.array([FIRST_AUTOMATIC_ID]), 0)
+    for step in (5, 10, 200, 205):
+        landmarks.overlook(row, in_view, step * SECOND_NS // 10)
+    assert landmarks.overlooked_ns.tolist() == [2.5 * SECOND_NS]
