@@ -15,11 +15,11 @@ def destination(path: Path) -> Path:
     Raises
     ------
     OSError
-        If there is something, and it is no file: a pipe or a device is not to be replaced.
+        If there is something, and it is no file: a pipe, a device or a link to itself.
 
     """
     target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():
+    if target.is_symlink() or (target.exists() and not target.is_file()):
         raise FileExistsError(errno.EEXIST, 'it is there, and no regular file', str(path))
     return target
 

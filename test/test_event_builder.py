@@ -100,12 +100,14 @@ def test_what_too_many_wait_behind_is_dropped_and_told():
     builder = EventBuilder(BaseFrame(InputSettings(), transforms), 10.0, 0.5, drops.append)
     for k in range(MAX_WAITING + 3):
         observation = ObservationEvent(k * MS, np.array([1]), np.ones((1, 3)))
-        assert not builder.add(ObservationMessage('camera', observation), k * MS)
+        frame = 'lidar' if k == MAX_WAITING else 'camera'
+        assert not builder.add(ObservationMessage(frame, observation), k * MS)
     assert not builder.retry(MAX_WAITING * MS)
     assert len(drops) == 3
     assert f'more than {MAX_WAITING} measurements wait' in str(drops[0])
     assert "'camera' and 'base_link' are not connected" in str(drops[0])
-    transforms.insert('base_link', 'camera', 0, WHEEL, is_static=True)
+    for frame in ('camera', 'lidar'):
+        transforms.insert('base_link', frame, 0, WHEEL, is_static=True)
     events = builder.finish()
     assert [event.stamp_ns for event in events] == [k * MS for k in range(3, MAX_WAITING + 3)]
     assert len(drops) == 3

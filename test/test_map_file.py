@@ -136,9 +136,12 @@ def test_whether_a_map_can_be_written_is_told_of_where_it_would_be_written(tmp_p
     os.mkfifo(tmp_path / 'pipe')
     with pytest.raises(MapError, match=r"can't write map .*pipe: it is there, and no regular"):
         check_writable(tmp_path / 'pipe')
+    (tmp_path / 'itself').symlink_to('itself')
+    with pytest.raises(MapError, match=r"can't write map .*itself: it is there, and no regular"):
+        check_writable(tmp_path / 'itself')
     with pytest.raises(MapError, match=r"can't write map .*: it is a directory"):
         check_writable(tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_a_folder_that_is_missing_is_named(tmp_path):

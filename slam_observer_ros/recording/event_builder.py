@@ -83,7 +83,7 @@ class EventBuilder:
         self._transform_timeout_ns = round(transform_timeout_s * NANOSECONDS_PER_SECOND)
         self._on_drop = on_drop
         self._poses = PoseDifferences(round(velocity_timeout_s * NANOSECONDS_PER_SECOND))
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[tuple[_Waiting, TransformError]] = deque()
         self._taken_as_base: dict[str, tuple[int, VelocityMessage]] = {}
 
     def add(self, measured: Measured, now_ns: int) -> list[Event]:
@@ -108,12 +108,12 @@ class EventBuilder:
     def retry(self, now_ns: int) -> list[Event]:
         """Return the events of what has waited long enough, or for what is known by now."""
         waiting, self._waiting = self._waiting, deque()
-        return [event for item in waiting for event in self._attempt(item, now_ns)]
+        return [event for item, _ in waiting for event in self._attempt(item, now_ns)]
 
     def finish(self) -> list[Event]:
         """Return the events of what still waits, when nothing more will come."""
         waiting, self._waiting = self._waiting, deque()
-        return [event for item in waiting for event in self._attempt(item, item.deadline_ns)]
+        return [event for item, _ in waiting for event in self._attempt(item, item.deadline_ns)]
 
     def forget(self) -> None:
         """Drop what waits, as after a jump of the clock."""
@@ -131,10 +131,10 @@ class EventBuilder:
 
     def _wait(self, item: _Waiting, error: TransformError) -> None:
         if len(self._waiting) == MAX_WAITING:
-            self._waiting.popleft()
-            text = f'more than {MAX_WAITING} measurements wait for their transforms: {error}'
+            _, reason = self._waiting.popleft()
+            text = f'more than {MAX_WAITING} measurements wait for their transforms: {reason}'
             self._on_drop(TransformError(text))
-        self._waiting.append(item)
+        self._waiting.append((item, error))
 
     def _event(self, measured: _InFrame, now_ns: int) -> Event:
         if isinstance(measured, VelocityMessage):
