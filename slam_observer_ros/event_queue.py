@@ -105,9 +105,7 @@ class EventQueue:
 
     def pop_all(self) -> list[Event]:
         """Give out all events that are left, in order."""
-        events = [event for _, event in sorted(self._heap)]
-        self._heap.clear()
-        return events
+        return self._pop_until(self._lead_ns)
 
     def _pop_until(self, stamp_ns: int) -> list[Event]:
         events = []
