@@ -82,6 +82,8 @@ class Smoothed:
         (n, 3) landmarks, metres, world.
     ids : IntArray
         (n,) their ids.
+    since : str
+        What happened before the first of them, so that there is no hindsight of more, in words.
 
     """
 
@@ -89,3 +91,4 @@ class Smoothed:
     poses: FloatArray
     world_points: FloatArray
     ids: IntArray
+    since: str

@@ -213,8 +213,7 @@ class Estimator:
             If the observations don't determine the whole trajectory.
 
         """
-        stamps_ns, poses, world_points = self._slam.smooth()
-        return Smoothed(stamps_ns, poses, world_points[self._slam.confirmed], self.landmark_ids)
+        return self._slam.smooth()
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""

@@ -273,7 +273,7 @@ def _complete(slam: Slam, known: LandmarkMap) -> None:
         _hold(slam, known)
     if not isinstance(slam.gains, FixedMapGains):
         slam.gains.add_known_landmarks(covariances)
-    slam.gains.restart(observer)
+    slam.gains.restart(observer, 'the place in the loaded map was found')
 
 
 def _hold(slam: Slam, known: LandmarkMap) -> None:

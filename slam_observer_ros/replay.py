@@ -56,12 +56,8 @@ class Replay:
         Whether the poses are in the frame of a map that was known in advance.
     start_ns : int
         Stamp of the first event that was used, nanoseconds; 0 if none was.
-    history_since : str
-        Since when it is possible to look back, in words.
     observations : int
         Observations of which points were used, also before the last start.
-    observations_since : int
-        Those of them since it is possible to look back.
 
     """
 
@@ -76,9 +72,7 @@ class Replay:
     seconds: float
     in_known_map: bool
     start_ns: int
-    history_since: str
     observations: int
-    observations_since: int
 
     @property
     def restarts(self) -> int:
@@ -130,8 +124,7 @@ class _Run:
             self._estimator.load_map(landmark_map)
         self._landmark_truth = truth.landmarks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
-        self._history_since = 'the start'
-        self._observations = self._observations_since = self._used_points = self._forgotten = 0
+        self._observations = self._used_points = 0
         self._jumps = self._events = 0
         self._seconds = 0.0
         self._start()
@@ -143,7 +136,6 @@ class _Run:
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None
-        self._was_localised = not self._in_known_map
 
     def add(self, event: Event) -> None:
         self._events += 1
@@ -173,9 +165,7 @@ class _Run:
             self._seconds,
             self._in_known_map,
             self._start_ns or 0,
-            self._history_since,
             self._observations,
-            self._observations_since,
         )
 
     def _sample(self) -> None:
@@ -202,27 +192,14 @@ class _Run:
         if self._estimator.jumps == self._jumps:
             return
         self._jumps = self._estimator.jumps
-        self._history_since, self._observations_since = 'the clock jumped', 0
         if self._settings.on_time_jump == 'reset':
             self._start()
 
     def _note_observation(self) -> None:
-        """Count an observation, unless with it what was seen until then became the prior."""
-        counts = self._estimator.counts
-        if counts['forgotten_landmark'] > self._forgotten:
-            # The prior is of before this observation, which is the first to be looked back at.
-            self._history_since = 'landmarks had to make room (max_landmarks)'
-            self._observations_since = 0
-        self._forgotten = counts['forgotten_landmark']
-        used = used_points(counts)
+        """Count an observation, if points of it were used."""
+        used = used_points(self._estimator.counts)
         self._observations += used > self._used_points
-        self._observations_since += used > self._used_points
         self._used_points = used
-        is_localised = self._estimator.is_localised
-        if is_localised and not self._was_localised:
-            self._history_since = 'the place in the loaded map was found'
-            self._observations_since = 0
-        self._was_localised = is_localised
 
     def _compare(self, update: Update) -> None:
         if self._pose_truth is None or self._landmark_truth is None:

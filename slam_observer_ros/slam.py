@@ -9,6 +9,7 @@ import numpy as np
 
 from slam_observer_ros.axes import axes_of
 from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.field_of_view import FieldOfView
 from slam_observer_ros.gains import make_gains
@@ -163,13 +164,13 @@ class Slam:
         back = np.linalg.inv(self._turn_to_world(observer.A))
         given = np.zeros((6, 6)) if covariance is None else covariance
         self.gains.set_pose_covariance(back @ given @ back.T)
-        self.gains.restart(observer)
+        self.gains.restart(observer, 'the pose was set')
 
     def restart_time(self) -> None:
         """Go on from here at any other time; what was seen before can't be looked back at."""
         self._end_velocity = None
         self.landmarks.restart_time()
-        self.gains.restart(self.observer)
+        self.gains.restart(self.observer, 'the clock jumped')
 
     def change_settings(self, settings: Settings) -> None:
         """Use other gains from now on."""
@@ -237,13 +238,15 @@ class Slam:
             self.counts['unknown_id'] += unknown
             self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
         event, rows, covariances = sighting.event, sighting.rows, sighting.covariances
-        if self._must_make_room(rows):
-            # A history without the forgotten landmarks would lose what they have told of the pose.
-            self.gains.restart(self.observer)
+        forgotten = self._in_the_way(event, rows)
+        if len(forgotten):
+            # A history without them would lose what they have told of the pose.
+            self.gains.restart(self.observer, 'landmarks had to make room (max_landmarks)')
         known, used = rows >= 0, np.ones(len(rows), dtype=np.bool_)
         ids = event.ids[known]
         used[known] = self._innovate(event.select(known), sighting.innovation)
         if not known.all():
+            self._make_room(forgotten)
             self._initialise(event.select(~known), covariances[~known])
             rows = self.landmarks.indices_of(event.ids)
             kept = rows >= 0
@@ -253,8 +256,8 @@ class Slam:
         self._look_back(event, rows)
         return ids, sighting.innovation.r
 
-    def smooth(self) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Return stamps (s,), poses (s, 4, 4) and points (n, 3), all in the world, in hindsight.
+    def smooth(self) -> Smoothed:
+        """Return trajectory and map in hindsight.
 
         Raises
         ------
@@ -276,8 +279,14 @@ class Slam:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
-        stamps_ns = np.array(self.gains.stamps_ns, dtype=np.int64)
-        return stamps_ns, P @ solution.poses[1:], se3.transform(P, solution.points)
+        history, rows = self.gains.history, self.confirmed
+        return Smoothed(
+            stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
+            poses=P @ solution.poses[1:],
+            world_points=se3.transform(P, solution.points[rows]),
+            ids=self.landmarks.ids[rows],
+            since=history.since,
+        )
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
@@ -398,32 +407,31 @@ class Slam:
             self.gains.relocate_landmarks(rows[far], y_ref, innovation.covariances[far])
             self.landmarks.restart(rows[far])
 
-    def _must_make_room(self, rows: IntArray) -> bool:
-        """Return whether those of ``rows`` (m,) that are new replace landmarks out of view."""
-        limit, kept = self.settings.max_landmarks, len(self.landmarks)
-        new = int(np.sum(rows < 0))
-        return new > 0 and 0 < limit < kept + new and len(rows) - new < kept
+    def _in_the_way(self, event: ObservationEvent, rows: IntArray) -> IntArray:
+        """Return which landmarks out of view make room for those of ``rows`` (m,) that are new.
 
-    def _make_room(self, event: ObservationEvent) -> ObservationEvent:
-        """Forget landmarks out of view, least often seen first; return the new ones that fit."""
-        limit, new = self.settings.max_landmarks, len(event.ids)
-        if limit == 0:
-            return event
-        table = self.landmarks
-        unseen = table.unseen_since(event.stamp_ns)
-        fitting = min(new, max(limit - len(table) + len(unseen), 0))  # a map may exceed it
-        forgotten = np.sort(unseen[: max(len(table) + fitting - limit, 0)])
-        self.remove(forgotten)
-        self.counts['forgotten_landmark'] += len(forgotten)
-        self.counts['unmapped_landmark'] += new - fitting
-        return event.select(np.arange(new) < fitting)
+        The least often seen go first.
+        """
+        limit, new = self.settings.max_landmarks, int(np.sum(rows < 0))
+        excess = len(self.landmarks) + new - limit
+        if limit == 0 or new == 0 or excess <= 0:
+            return np.empty(0, dtype=np.int64)
+        unseen = self.landmarks.unseen_since(event.stamp_ns)
+        return np.sort(unseen[~np.isin(unseen, rows)][:excess])
+
+    def _make_room(self, rows: IntArray) -> None:
+        if len(rows):
+            self.remove(rows)
+            self.counts['forgotten_landmark'] += len(rows)
 
     def _initialise(self, event: ObservationEvent, covariances: FloatArray) -> None:
-        """Add landmarks where they were seen."""
-        event = self._make_room(event)
-        m = len(event.ids)
+        """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
+        limit, new = self.settings.max_landmarks, len(event.ids)
+        m = min(new, max(limit - len(self.landmarks), 0)) if limit else new
+        self.counts['unmapped_landmark'] += new - m
         if not m:
             return
+        event = event.select(np.arange(new) < m)
         self.observer.add_landmarks(event.points)
         self.gains.add_landmarks(self.observer.y_ref[-m:], self.turned(covariances[:m]))
         self.landmarks.add(event.ids, event.stamp_ns)

@@ -462,6 +462,18 @@ def test_after_a_jump_back_in_time_landmarks_out_of_view_make_room_for_new_ones(
     assert sorted(estimator.landmark_ids) == [2, 7, 8]
 
 
+def test_a_landmark_in_view_makes_no_room_though_its_point_is_rejected():
+    estimator, points = Estimator(Settings(max_landmarks=3, reorder_window=0.0)), 3.0 * np.eye(3)
+    for step in range(5):
+        assert estimator.add(ObservationEvent(step * 10**8, np.arange(3), points))
+    points = np.concatenate([points, np.ones((1, 3))])
+    points[2] += 5.0
+    assert estimator.add(ObservationEvent(5 * 10**8, np.array([0, 1, 2, 9]), points))
+    assert sorted(estimator.landmark_ids) == [0, 1, 2]
+    assert estimator.counts['rejected_landmark'] == estimator.counts['unmapped_landmark'] == 1
+    assert estimator.smooth().since == 'the last start'
+
+
 def test_after_a_jump_all_starts_where_the_run_began_though_the_robot_was_moved_since():
     start = true_pose(3.0)
     estimator = Estimator(Settings(), initial_pose=start)

@@ -198,7 +198,7 @@ def test_smoothing_tells_that_landmarks_had_to_make_room(slam_observer, tmp_path
     assert 'those since landmarks had to make room (max_landmarks)' in told
     window = ('--set', 'hindsight_window=10', '--set', 'hindsight_interval=1')
     told = slam_observer('replay', path, *limited, *window).errors
-    assert 'hindsight_window=0 smooths more' in told
+    assert 'those since the history was cut (hindsight_window=0 keeps all of it)' in told
 
 
 @pytest.mark.parametrize('resets', [True, False])

@@ -66,10 +66,13 @@ def test_covariances_are_collected_only_to_compare_errors_with():
         assert replay(events_of(400, 7), Settings(), lacking).pose_covariances is None
 
 
-def test_what_is_seen_before_a_jump_does_not_count_as_seen_since():
+def test_what_was_seen_before_a_jump_is_not_smoothed_and_hindsight_says_why():
     before, after = events_of(100, 5), events_of(60, 5)
     later = [replace(event, stamp_ns=event.stamp_ns + 1000 * SECOND) for event in before]
     settings = Settings(on_time_jump='hold', reorder_window=0.5)
     result = replay([*later, *after], settings)
     assert result.estimator.jumps == 1
-    assert result.observations_since == len(result.estimator.smooth().stamps_ns)
+    smoothed = result.estimator.smooth()
+    assert len(smoothed.stamps_ns) < result.observations
+    assert (smoothed.stamps_ns < 1000 * SECOND).all()
+    assert smoothed.since == 'the clock jumped'

@@ -191,7 +191,7 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
         calibration = Calibration(settings, axes)
         count = d + calibration.count
         start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
-        history = History(axes, start)
+        history = History(axes, start, 'the start')
         for a, b in pairwise((0, *cuts, k)):
             no_gaps, at_ends = np.zeros(b - a), np.zeros((2, 6))
             part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], no_gaps, covariances[a:b], at_ends)

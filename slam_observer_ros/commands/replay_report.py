@@ -167,7 +167,11 @@ def with_smoothed(outcome: Outcome) -> Outcome:
     """Add what the whole recording tells in hindsight."""
     smoothed = outcome.result.estimator.smooth()
     if len(smoothed.stamps_ns) < outcome.result.observations:
-        _warn_of_cut(outcome.result, len(smoothed.stamps_ns))
+        logger.warning(
+            'Only the last %d observations are smoothed: those since %s.',
+            len(smoothed.stamps_ns),
+            smoothed.since,
+        )
     errors, landmark_rmse_m = measure_smoothed(smoothed, outcome.truth)
     return replace(
         outcome,
@@ -175,15 +179,6 @@ def with_smoothed(outcome: Outcome) -> Outcome:
         smoothed_errors=errors,
         smoothed_landmark_rmse_m=landmark_rmse_m,
     )
-
-
-def _warn_of_cut(result: Replay, smoothed: int) -> None:
-    """Tell why only the last observations are smoothed."""
-    if 0 < result.estimator.settings.hindsight_window <= result.observations_since:
-        why = 'others are only kept as a summary; --set hindsight_window=0 smooths more'
-    else:
-        why = f'those since {result.history_since}'
-    logger.warning('Only the last %d observations are smoothed: %s.', smoothed, why)
 
 
 def as_json(outcome: Outcome) -> dict[str, object]:

@@ -125,8 +125,11 @@ class GainDesign(Protocol):
 
         """
 
-    def restart(self, observer: Observer) -> None:
-        """Forget the past: what is known now is all that is known when looking back."""
+    def restart(self, observer: Observer, since: str) -> None:
+        """Forget the past: what is known now is all that is known when looking back.
+
+        ``since`` is what has happened, in words, for whoever asks why hindsight begins here.
+        """
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices``."""

@@ -93,7 +93,7 @@ class ConstantGains:
         """Return the correction that puts the known landmarks where they are known to be."""
         return Correction(np.eye(4), indices, -r)
 
-    def restart(self, observer: Observer) -> None:
+    def restart(self, observer: Observer, since: str) -> None:
         """Do nothing: constant gains have no memory."""
 
     def remove_landmarks(self, indices: IntArray) -> None:

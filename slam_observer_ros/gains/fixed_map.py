@@ -57,7 +57,7 @@ class FixedMapGains(RiccatiGains):
         """False: in an exact map there is no drift to undo."""
         return False
 
-    def restart(self, observer: Observer) -> None:
+    def restart(self, observer: Observer, since: str) -> None:
         """Do nothing: nothing is kept of the past."""
 
     def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:

@@ -64,11 +64,11 @@ class Hindsight:
         self.settings = settings
         self._axes = axes
         self._warning = _Warning()
-        self.restart(prior)
+        self.restart(prior, 'the last start')
 
-    def restart(self, prior: Prior) -> None:
-        """Forget all but the prior."""
-        self.history = History(self._axes, prior)
+    def restart(self, prior: Prior, since: str) -> None:
+        """Forget all but the prior; ``since`` is why, in words."""
+        self.history = History(self._axes, prior, since)
         self._rest()
 
     def _rest(self) -> None:

@@ -49,9 +49,13 @@ class History:
         Which axes are estimated.
     prior : Prior
         What was known before the first frame.
+    since : str
+        What happened then, in words.
 
     Attributes
     ----------
+    since : str
+        The same.
     stamps_ns : list of int
         Stamps of the frames, nanoseconds.
     poses : list of FloatArray
@@ -59,9 +63,10 @@ class History:
 
     """
 
-    def __init__(self, axes: Axes, prior: Prior) -> None:
+    def __init__(self, axes: Axes, prior: Prior, since: str) -> None:
         self._axes = axes
         self.prior = prior
+        self.since = since
         self.stamps_ns: list[int] = []
         self.poses: list[FloatArray] = [prior.pose]
         self._calibration = prior.calibration

@@ -28,6 +28,7 @@ from slam_observer_ros.gains.base import Innovation, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.hindsight import Hindsight
+from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.gains.motion import Motion
@@ -112,7 +113,7 @@ class RiccatiGains:
             return
         if observer.u.any():
             # How far they went depends on how the robot was turned, which no smoother here knows.
-            self.restart(observer)
+            self.restart(observer, 'a landmark came with a velocity')
         else:
             self._hindsight.history.move(motion.path, noise, F, self.calibration.values)
 
@@ -294,22 +295,23 @@ class RiccatiGains:
             self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
         if hindsight.window_is_full and not in_doubt:
-            self.restart(observer)
+            self.restart(observer, 'the history was cut (hindsight_window=0 keeps all of it)')
 
     def smooth(self, observer: Observer) -> Solution:
         """Return the estimates in hindsight of everything since the history's prior."""
         return self._hindsight.smooth(self._as_solution(observer))
 
     @property
-    def stamps_ns(self) -> list[int]:
-        """Stamps of the frames that :meth:`smooth` returns, nanoseconds."""
-        return self._hindsight.history.stamps_ns
+    def history(self) -> History:
+        """What it can look back at, frame by frame as :meth:`smooth` returns them."""
+        return self._hindsight.history
 
-    def restart(self, observer: Observer) -> None:
+    def restart(self, observer: Observer, since: str) -> None:
         """Forget the past: what is known now is all that is known when looking back."""
         points = observer.y_ref + observer.a
         covariance = self._with_pose_error_by(se3.inverse(observer.A), self._joint.P)
-        self._hindsight.restart(Prior(observer.A, self.calibration.values, points, covariance))
+        prior = Prior(observer.A, self.calibration.values, points, covariance)
+        self._hindsight.restart(prior, since)
 
     def _as_solution(self, observer: Observer) -> Solution:
         """Return the estimates as they are, for the smoother to start from."""

@@ -171,7 +171,7 @@ class ScheduledGains:
         """Return how far each landmark (n, 3) has yet to be moved, metres, reference frame."""
         return self._leaves.postponed_shifts()
 
-    def restart(self, observer: Observer) -> None:
+    def restart(self, observer: Observer, since: str) -> None:
         """Do nothing: these gains keep no history."""
 
     def remove_landmarks(self, indices: IntArray) -> None:
