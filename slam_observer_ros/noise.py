@@ -79,23 +79,20 @@ class NoiseModel:
         All of them can be inverted, even if a message or a point at the sensor itself says that
         some direction is known exactly.
         """
-        covariances = self._stated(event)
-        least = RESOLUTION_M**2 + LEAST_SHARE * np.einsum('ijj->i', covariances)
-        invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
-        return invertible
+        if event.covariances is None:
+            return self.at(event.points)
+        # Else far points that are said to be exact are lost beside an uncertain heading.
+        squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
+        least = RELATIVE_RESOLUTION**2 * squared_m2
+        return _invertible(event.covariances + least[:, None, None] * _IDENTITY)
 
-    def _stated(self, event: ObservationEvent) -> FloatArray:
-        """Return the covariances (m, 3, 3) as message or settings have them, m²."""
-        if event.covariances is not None:
-            # Else far points that are said to be exact are lost beside an uncertain heading.
-            squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
-            least = RELATIVE_RESOLUTION**2 * squared_m2
-            given: FloatArray = event.covariances + least[:, None, None] * _IDENTITY
-            return given
+    def at(self, points: FloatArray) -> FloatArray:
+        """Return what the settings say of points (m, 3) that a message has no covariances for."""
         s = self._settings
         if s.observation_model == 'cartesian':
-            return np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(event.points), 3, 3))
-        range_squared = np.einsum('ij,ij->i', event.points, event.points)
+            each = np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(points), 3, 3))
+            return _invertible(each)
+        range_squared = np.einsum('ij,ij->i', points, points)
         if s.observation_model == 'stereo':
             parallax = s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
             along = (range_squared * parallax) ** 2
@@ -103,7 +100,14 @@ class NoiseModel:
         else:
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2
-        return _along_and_across(event.points, range_squared, along, across)
+        return _invertible(_along_and_across(points, range_squared, along, across))
+
+
+def _invertible(covariances: FloatArray) -> FloatArray:
+    """Return covariances (m, 3, 3) of which no direction is known exactly, m²."""
+    least = RESOLUTION_M**2 + LEAST_SHARE * np.einsum('ijj->i', covariances)
+    invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
+    return invertible
 
 
 def _limited(covariances: FloatArray) -> FloatArray:

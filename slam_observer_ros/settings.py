@@ -236,8 +236,8 @@ class Settings:
     )
     hindsight_interval: int = parameter(
         20,
-        'Riccati gains: least observations between looking back over all of them, or a tenth of '
-        'these if that is more; 0 for never',
+        'Riccati gains: least observations to look back at at once, or a tenth of all so far if '
+        'that is more; 0 for never',
         minimum=0,
     )
     hindsight_turn: float = parameter(
@@ -249,7 +249,8 @@ class Settings:
     )
     hindsight_window: int = parameter(
         3000,
-        'Riccati gains: observations after which older ones are only kept as a summary; 0 for all',
+        'Riccati gains: observations after which smoothing starts anew from what is known then; '
+        '0 to smooth all of them',
         minimum=0,
     )
     localization_mode: str = parameter(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -374,7 +374,7 @@ class Slam:
             & ~self.landmarks.in_doubt(rows, self.settings.max_rejections)
         )
         points = np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
-        return self.noise.observation(replace(event, points=points))
+        return self.noise.at(points)
 
     def _look_back(self, event: ObservationEvent, rows: IntArray) -> None:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.

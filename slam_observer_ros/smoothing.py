@@ -20,31 +20,9 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
-
-
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """What was known before the first frame.
-
-    Attributes
-    ----------
-    pose : FloatArray
-        (4, 4) pose to which the first motion leads on.
-    calibration : FloatArray
-        (c,) estimate of the calibration.
-    points : FloatArray
-        (n, 3) landmarks already known then, metres; the first n of the map.
-    covariance : FloatArray
-        (d + c + k n, d + c + k n) covariance of (η, dc, dp).
-
-    """
-
-    pose: FloatArray
-    calibration: FloatArray
-    points: FloatArray
-    covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +58,20 @@ class Frames:
     landmarks: IntArray
     points: FloatArray
     information: FloatArray
+
+    def since(self, first: int) -> Frames:
+        """Return the frames from number ``first`` on."""
+        seen = slice(np.searchsorted(self.frames, first), None)
+        return Frames(
+            motions=self.motions[first:],
+            motion_covariances=self.motion_covariances[first:],
+            sensitivities=self.sensitivities[first:],
+            calibrations=self.calibrations[first:],
+            frames=self.frames[seen] - first,
+            landmarks=self.landmarks[seen],
+            points=self.points[seen],
+            information=self.information[seen],
+        )
 
 
 def no_frames(d: int, c: int, k: int) -> Frames:
@@ -215,16 +207,15 @@ class Smoother:
         return equations
 
     def _add_prior(self, equations: Equations, solution: Solution) -> None:
-        prior, d, k = self._prior, len(self._axes.pose), self._axes.point
-        eta, pose = se3.log(se3.inverse(prior.pose) @ solution.poses[0]), self._axes.pose
-        shifts = (solution.points[: len(prior.points)] - prior.points)[:, :k]
-        off = solution.calibration - prior.calibration
-        error = np.concatenate([eta[pose], off, shifts.ravel()])
-        information, known = self._prior_information.copy(), len(error) - d
-        J = se3.left_jacobian_inverse(-eta)[np.ix_(pose, pose)]
-        information[:d] = J.T @ information[:d]
-        pull = information @ error
-        information[:, :d] = information[:, :d] @ J
+        information, pull = self._prior.normal_equations(
+            self._axes,
+            self._prior_information,
+            solution.poses[0],
+            solution.calibration,
+            solution.points,
+        )
+        d = len(self._axes.pose)
+        known = len(pull) - d
         equations.diagonal[0] += information[:d, :d]
         equations.first[:, :known] += information[:d, d:]
         equations.corner[:known, :known] += information[d:, d:]

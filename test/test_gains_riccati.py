@@ -19,6 +19,7 @@ from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.smoothing import Smoother
 
 
 def started(rng, settings=PLAIN, n=4):
@@ -338,17 +339,18 @@ def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees(
     assert slam.gains.distances(innovation)[0] == pytest.approx(2.0, abs=0.1)
 
 
-def test_looking_back_waits_until_a_tenth_of_the_history_is_new(monkeypatch):
-    lengths = []
-    linearise = RiccatiGains._linearise_anew
+def test_what_was_looked_back_at_once_is_not_looked_back_at_again(monkeypatch):
+    frames = []
+    smooth = Smoother.smooth
 
-    def noted(gains, observer):
-        lengths.append(len(gains.stamps_ns))
-        linearise(gains, observer)
+    def noted(smoother, start, *rest):
+        frames.append(len(start.poses) - 1)
+        return smooth(smoother, start, *rest)
 
-    monkeypatch.setattr(RiccatiGains, '_linearise_anew', noted)
+    monkeypatch.setattr(Smoother, 'smooth', noted)
     settings = Settings(hindsight_interval=2, hindsight_turn=0.0)
-    estimate(drive(settings, 30.0), settings)
-    new = np.diff(lengths)
-    assert len(new) > 10
-    assert np.all(new >= np.maximum(2, 0.1 * np.array(lengths[1:])))
+    world = drive(settings, 30.0)
+    estimate(world, settings)
+    assert len(frames) > 10
+    assert np.sum(frames) <= len(world.observations())
+    assert np.all(frames >= np.maximum(2, 0.1 * np.cumsum(frames)))

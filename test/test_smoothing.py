@@ -30,8 +30,9 @@ from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Frames, Prior, Smoother, Solution
+from slam_observer_ros.smoothing import Frames, Smoother, Solution
 
 LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_distance=1e9)
 FRAMES, LANDMARKS = 5, 4
@@ -48,7 +49,7 @@ class Problem:
     Its unknowns are x = (η_0 … η_S, dc, dp) as in the module's text.
     """
 
-    def __init__(self, axes, calibrations, seed, known_landmarks=2):
+    def __init__(self, axes, calibrations, seed, is_relative=False, known_landmarks=2):
         rng = np.random.default_rng(seed)
         d, k, c = len(axes.pose), axes.point, calibrations
         self.axes, self.d, self.k, self.c = axes, d, k, c
@@ -61,6 +62,7 @@ class Problem:
             points[:known_landmarks]
             + 0.05 * axes.full_points(rng.normal(size=known_landmarks * k)),
             random_covariances(rng, 1, prior_size, 0.1)[0],
+            is_relative,
         )
         frames = np.repeat(np.arange(FRAMES), 3)
         landmarks = np.concatenate([rng.permutation(LANDMARKS)[:3] for _ in range(FRAMES)])
@@ -100,11 +102,14 @@ class Problem:
     def residuals(self, solution):
         """All residuals, whitened: the cost is half the sum of their squares."""
         pose, frames = self.axes.pose, self.frames
-        known = len(self.prior.points)
+        known, prior_points = solution.points[: len(self.prior.points)], self.prior.points
+        if self.prior.is_relative:
+            known = se3.transform(se3.inverse(solution.poses[0]), known)
+            prior_points = se3.transform(se3.inverse(self.prior.pose), prior_points)
         off = [
             se3.log(se3.inverse(self.prior.pose) @ solution.poses[0])[pose],
             solution.calibration - self.prior.calibration,
-            (solution.points[:known] - self.prior.points)[:, : self.k].ravel(),
+            (known - prior_points)[:, : self.k].ravel(),
         ]
         whitened = [whiten(np.linalg.inv(self.prior.covariance), np.concatenate(off))]
         for s in range(FRAMES):
@@ -139,7 +144,13 @@ def whiten(information, error):
 
 problems = pytest.mark.parametrize(
     'problem',
-    [Problem(axes, c, seed) for axes in (PLANAR, SPATIAL) for c in (0, 2) for seed in (0, 1)],
+    [
+        Problem(axes, c, seed, is_relative)
+        for axes in (PLANAR, SPATIAL)
+        for c in (0, 2)
+        for seed in (0, 1)
+        for is_relative in (False, True)
+    ],
 )
 
 
@@ -173,6 +184,20 @@ def test_marginal_is_that_of_the_dense_inverse(problem):
         rtol=1e-4,
         atol=1e-7,
     )
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+@pytest.mark.parametrize('forgotten', [[], [0], [0, 1]])
+def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten):
+    prior = Problem(axes, 2, seed=5).prior
+    indices = np.array(forgotten, dtype=np.int64)
+    absolute = prior.without(axes, indices)
+    relative = prior.relative(axes).without(axes, indices)
+    at_it = absolute.pose, absolute.calibration, absolute.points
+    expected, _ = absolute.normal_equations(axes, np.linalg.inv(absolute.covariance), *at_it)
+    found, pull = relative.normal_equations(axes, np.linalg.inv(relative.covariance), *at_it)
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(pull, 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
@@ -279,6 +304,18 @@ def test_hindsight_beats_the_online_estimate(two_d_mode):
         online.append(trajectory_errors(online_run, truth).ate_rmse_m)
         smoothed.append(trajectory_errors(smoothed_run, truth).ate_rmse_m)
     assert np.mean(smoothed) < 0.8 * np.mean(online)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_looking_back_a_piece_at_a_time_comes_to_what_all_of_it_tells(two_d_mode):
+    settings = Settings(
+        two_d_mode=two_d_mode, hindsight_interval=5, hindsight_turn=0.0, huber_threshold=0.0
+    )
+    for seed in range(3):
+        estimator = estimate(drive(settings, 30.0, seed), settings)
+        deviations_m = np.sqrt(np.trace(estimator.landmark_covariances, axis1=1, axis2=2))
+        shifts = estimator.world_points - estimator.smooth().world_points
+        assert np.all(np.linalg.norm(shifts, axis=1) < 0.2 * deviations_m)
 
 
 @pytest.mark.parametrize('max_landmarks', [0, 7])

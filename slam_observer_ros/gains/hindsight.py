@@ -1,8 +1,13 @@
-"""Looking back: when all that was seen is linearised anew, and what comes of it.
+"""Looking back: when what was seen is linearised anew, and what comes of it.
 
 Covariances that were computed around a poor early estimate stay wrong, so after a long blind
 stretch a plain filter closes its loop badly. How much its linearisation can have lost shows in
 how far its corrections have turned the robot.
+
+What was linearised anew stays as it is: from then on a summary stands for it, of where landmarks
+lie as seen from the pose of that time (:meth:`.Prior.relative`), which later corrections hardly
+bend. So the cost of looking back does not grow with the history, of which only
+:meth:`Hindsight.smooth` needs all.
 """
 
 from __future__ import annotations
@@ -16,15 +21,17 @@ from slam_observer_ros.axes import Axes
 from slam_observer_ros.errors import SmoothingError
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.gains.history import History
+from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Prior, Smoother, Solution, Step
+from slam_observer_ros.smoothing import Smoother, Solution, Step
 from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
 GROWTH = 0.1
-"""Share of the history that is new at least when looking back at all of it; with any less, the
-cost of each observation would grow with the history.
+"""Share of the history that is looked back at at least. As large maps take long histories, the
+O(n³) that looking back costs for n landmarks is shared by so many observations that each costs no
+more than an update, O(n²).
 """
 
 HURRY = 0.1
@@ -100,23 +107,36 @@ class Hindsight:
         self.history.see(seen, pose)
         self._observations += 1
 
-    def linearise_anew(self, start: Solution) -> tuple[Step, FloatArray] | None:
-        """Return the last step from ``start``, and the covariance where all was linearised.
+    def linearise_anew(
+        self, calibration: FloatArray, points: FloatArray
+    ) -> tuple[Step, FloatArray] | None:
+        """Linearise the frames anew that are not summarised yet, at the present estimates.
 
-        None, the first time after a warning, if the observations don't determine everything.
+        Returns
+        -------
+        step : Step
+            The last step.
+        covariance : FloatArray
+            That of the last pose, calibration and landmarks at the start of the step. None at
+            all, the first time after a warning, if the observations don't determine everything.
+
         """
         self._rest()
+        history, first = self.history, self.history.summarised
+        frames = history.frames().since(first)
+        start = Solution(np.array(history.poses[first:]), calibration, points)
         try:
-            step = self._smoother().smooth(start, ITERATIONS, TOLERANCE)
+            smoother = Smoother(self._axes, history.summary, frames, self.settings)
+            step = smoother.smooth(start, ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             self._warning.give()
             return None
-        self.history.poses = list(step.end.poses)
+        history.poses[first:] = list(step.end.poses)
         return step, covariance
 
-    def smooth(self, start: Solution) -> Solution:
-        """Return the estimates in hindsight, iterated from ``start`` until nothing moves.
+    def smooth(self, calibration: FloatArray, points: FloatArray) -> Solution:
+        """Return all estimates in hindsight, iterated from the present ones until nothing moves.
 
         Raises
         ------
@@ -124,17 +144,16 @@ class Hindsight:
             If the observations don't determine everything.
 
         """
+        history = self.history
+        start = Solution(np.array(history.poses), calibration, points)
         try:
-            return self._smoother().smooth(start, 50, 1e-6).end
+            smoother = Smoother(self._axes, history.prior, history.frames(), self.settings)
+            return smoother.smooth(start, 50, 1e-6).end
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
                 'can not smooth: the observations leave some pose or landmark open, or contradict '
                 'covariances that say they are exact'
             ) from error
-
-    def _smoother(self) -> Smoother:
-        history = self.history
-        return Smoother(self._axes, history.prior, history.frames(), self.settings)
 
 
 class _Warning:

@@ -10,11 +10,9 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.smoothing import Frames, no_frames, Prior
+from slam_observer_ros.prior import Prior
+from slam_observer_ros.smoothing import Frames, no_frames
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-
-ANYWHERE_M = 1e3
-"""Standard deviation of a prior that says nothing, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +52,12 @@ class History:
 
     Attributes
     ----------
-    since : str
+    prior, since : Prior, str
         The same.
+    summary : Prior
+        What was known after the first ``summarised`` frames; at first the prior.
+    summarised : int
+        How many frames these are.
     stamps_ns : list of int
         Stamps of the frames, nanoseconds.
     poses : list of FloatArray
@@ -65,7 +67,8 @@ class History:
 
     def __init__(self, axes: Axes, prior: Prior, since: str) -> None:
         self._axes = axes
-        self.prior = prior
+        self.prior = self.summary = prior
+        self.summarised = 0
         self.since = since
         self.stamps_ns: list[int] = []
         self.poses: list[FloatArray] = [prior.pose]
@@ -118,17 +121,18 @@ class History:
         self._start = None
         self._noise, self._sensitivity = self._at_rest()
 
+    def summarise(self, known: Prior) -> None:
+        """Take ``known`` for all that the frames up to now tell."""
+        self.summary = known
+        self.summarised = len(self.stamps_ns)
+
     def relocate_landmarks(self, indices: IntArray) -> None:
         """Forget all about the landmarks at ``indices`` but their latest observation."""
         frames = self.frames()
         latest = frames.frames == len(self.stamps_ns) - 1
         self._keep(latest | ~np.isin(frames.landmarks, indices))
-        known = indices[indices < len(self.prior.points)]
-        columns = self._prior_columns(known)
-        covariance = self.prior.covariance.copy()
-        covariance[columns] = covariance[:, columns] = 0.0
-        covariance[columns, columns] = ANYWHERE_M**2
-        self.prior = replace(self.prior, covariance=covariance)
+        self.prior = self.prior.with_unknown(self._axes, indices)
+        self.summary = self.summary.with_unknown(self._axes, indices)
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices`` and all observations of them."""
@@ -136,11 +140,8 @@ class History:
         rows = self._frames.landmarks
         rows = rows - np.searchsorted(np.sort(indices), rows)
         self._frames = replace(self._frames, landmarks=rows)
-        known = indices[indices < len(self.prior.points)]
-        columns = self._prior_columns(known)
-        covariance = np.delete(np.delete(self.prior.covariance, columns, 0), columns, 1)
-        points = np.delete(self.prior.points, known, axis=0)
-        self.prior = replace(self.prior, points=points, covariance=covariance)
+        self.prior = self.prior.without(self._axes, indices)
+        self.summary = self.summary.without(self._axes, indices)
 
     def frames(self) -> Frames:
         """Return all frames as arrays."""
@@ -184,11 +185,6 @@ class History:
             points=frames.points[kept],
             information=frames.information[kept],
         )
-
-    def _prior_columns(self, indices: IntArray) -> IntArray:
-        k = self._axes.point
-        first = len(self.prior.covariance) - k * len(self.prior.points)
-        return (first + k * indices[:, None] + np.arange(k)).ravel()
 
     def _at_rest(self) -> tuple[FloatArray, FloatArray]:
         """Return the covariance and the sensitivity of no motion."""

@@ -43,8 +43,9 @@ from slam_observer_ros.gains.robust import (
 )
 from slam_observer_ros.geometry import se3, slam_group, so3
 from slam_observer_ros.observer import Correction, Observer
+from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Prior, Solution, Step
+from slam_observer_ros.smoothing import Solution, Step
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
@@ -281,25 +282,31 @@ class RiccatiGains:
         return self._settings.hindsight_interval > 0 and is_constant
 
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
-        """Note what was seen, and every so often linearise all of it anew.
+        """Note what was seen, and every so often linearise it anew.
 
         The smoother's marginal becomes the filter's covariance, and its solution the observer's
-        new reference ξ°, with â_i = 0.
+        new reference ξ°, with â_i = 0. It sums up all that was seen, for the next time.
         """
         # An empty frame tells nothing: the motions before and after it add up.
         if not (self.looks_back and len(seen.indices)):
             return
         hindsight = self._hindsight
         hindsight.see(seen, observer.A)
-        if in_doubt or hindsight.window_is_full or hindsight.is_due:
-            self._linearise_anew(observer)
+        if not (in_doubt or hindsight.window_is_full or hindsight.is_due):
+            return
+        self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
-        if hindsight.window_is_full and not in_doubt:
-            self.restart(observer, 'the history was cut (hindsight_window=0 keeps all of it)')
+        if in_doubt:
+            return
+        known = self._known(observer).relative(self._axes)
+        if hindsight.window_is_full:
+            hindsight.restart(known, 'the history was cut (hindsight_window=0 keeps all of it)')
+        else:
+            hindsight.history.summarise(known)
 
     def smooth(self, observer: Observer) -> Solution:
         """Return the estimates in hindsight of everything since the history's prior."""
-        return self._hindsight.smooth(self._as_solution(observer))
+        return self._hindsight.smooth(self.calibration.values, observer.y_ref + observer.a)
 
     @property
     def history(self) -> History:
@@ -308,19 +315,17 @@ class RiccatiGains:
 
     def restart(self, observer: Observer, since: str) -> None:
         """Forget the past: what is known now is all that is known when looking back."""
+        self._hindsight.restart(self._known(observer), since)
+
+    def _known(self, observer: Observer) -> Prior:
+        """Return what is known now."""
         points = observer.y_ref + observer.a
         covariance = self._with_pose_error_by(se3.inverse(observer.A), self._joint.P)
-        prior = Prior(observer.A, self.calibration.values, points, covariance)
-        self._hindsight.restart(prior, since)
-
-    def _as_solution(self, observer: Observer) -> Solution:
-        """Return the estimates as they are, for the smoother to start from."""
-        points = observer.y_ref + observer.a
-        poses = np.array(self._hindsight.history.poses)
-        return Solution(poses, self.calibration.values, points)
+        return Prior(observer.A, self.calibration.values, points, covariance)
 
     def _linearise_anew(self, observer: Observer) -> None:
-        found = self._hindsight.linearise_anew(self._as_solution(observer))
+        points = observer.y_ref + observer.a
+        found = self._hindsight.linearise_anew(self.calibration.values, points)
         if found is not None:
             self._rebase(observer, *found)
 

@@ -1,0 +1,132 @@
+"""What was known at one instant of the pose, the calibration and the landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam_observer_ros.axes import Axes
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.types import FloatArray, IntArray
+
+ANYWHERE_M = 1e3
+"""Standard deviation of a landmark of which nothing is known, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Estimates with the covariance of their errors: pose exp(η), c + dc and p_i + dp_i.
+
+    Attributes
+    ----------
+    pose : FloatArray
+        (4, 4) pose P.
+    calibration : FloatArray
+        (c,) estimate of the calibration.
+    points : FloatArray
+        (n, 3) landmarks that were known, metres; the first n of the map.
+    covariance : FloatArray
+        (d + c + k n, d + c + k n) covariance of (η, dc, dp).
+    is_relative : bool
+        Whether it is that of (η, dc, dy) instead, y_i = P⁻¹ p_i being where landmarks lie as seen
+        from the pose.
+
+    """
+
+    pose: FloatArray
+    calibration: FloatArray
+    points: FloatArray
+    covariance: FloatArray
+    is_relative: bool = False
+
+    def relative(self, axes: Axes) -> Prior:
+        """Return the same knowledge, but of where the landmarks lie as seen from the pose.
+
+        It stays true when what follows turns pose and map together. Told of the world it would be
+        bent, to second order in an angle of which far less may be known than of the map.
+        dy_i is Rᵀ dp_i − C_i η, with C_i the output matrix at y_i and R the pose's rotation.
+        """
+        d, k, first = len(axes.pose), axes.point, self._first_point(axes)
+        y = se3.transform(se3.inverse(self.pose), self.points)
+        C, R = axes.output_matrix(y).reshape(-1, d), self.pose[:k, :k]
+        covariance = self.covariance.copy()
+        for rows in (covariance, covariance.T):
+            rows[first:] = _turned(rows[first:], R.T) - C @ rows[:d]
+        return replace(self, covariance=covariance, is_relative=True)
+
+    def without(self, axes: Axes, indices: IntArray) -> Prior:
+        """Return it without the landmarks at ``indices``; those behind move up."""
+        known, columns = self._known(axes, indices)
+        return replace(
+            self,
+            points=np.delete(self.points, known, axis=0),
+            covariance=np.delete(np.delete(self.covariance, columns, 0), columns, 1),
+        )
+
+    def with_unknown(self, axes: Axes, indices: IntArray) -> Prior:
+        """Return it with landmarks at ``indices`` that may be anywhere."""
+        _, columns = self._known(axes, indices)
+        covariance = self.covariance.copy()
+        covariance[columns] = covariance[:, columns] = 0.0
+        covariance[columns, columns] = ANYWHERE_M**2
+        return replace(self, covariance=covariance)
+
+    def normal_equations(
+        self,
+        axes: Axes,
+        information: FloatArray,
+        pose: FloatArray,
+        calibration: FloatArray,
+        points: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return Jᵀ W J and Jᵀ W e of the error e of estimates, by (η, dc, dp) of these.
+
+        Parameters
+        ----------
+        axes : Axes
+            Which axes are estimated: d of the pose, k of a point.
+        information : FloatArray
+            W, the inverse of the covariance.
+        pose, calibration, points : FloatArray
+            (4, 4), (c,) and (n + …, 3) estimates.
+
+        """
+        d, k, first = len(axes.pose), axes.point, self._first_point(axes)
+        eta = se3.log(se3.inverse(self.pose) @ pose)
+        y = self._seen_from(pose, points[: len(self.points)])
+        shifts = (y - self._seen_from(self.pose, self.points))[:, :k].ravel()
+        error = np.concatenate([eta[axes.pose], calibration - self.calibration, shifts])
+        J_eta = se3.left_jacobian_inverse(-eta)[np.ix_(axes.pose, axes.pose)]
+        C, R = np.zeros((len(shifts), d)), np.eye(k)
+        if self.is_relative:
+            C, R = axes.output_matrix(y).reshape(-1, d), pose[:k, :k]
+
+        def pull_back(rows: FloatArray) -> FloatArray:
+            """Return Jᵀ b for rows b, J = [[J_η, 0, 0], [0, I, 0], [−C, 0, Rᵀ for each point]]."""
+            pulled: FloatArray = rows.copy()
+            pulled[:d] = J_eta.T @ rows[:d] - C.T @ rows[first:]
+            pulled[first:] = _turned(rows[first:], R)
+            return pulled
+
+        gradient = pull_back((information @ error)[:, None])[:, 0]
+        return pull_back(pull_back(information).T), gradient
+
+    def _seen_from(self, pose: FloatArray, points: FloatArray) -> FloatArray:
+        """Return points (n, 3) in the frame in which they are known: a pose's or the world."""
+        return se3.transform(se3.inverse(pose), points) if self.is_relative else points
+
+    def _first_point(self, axes: Axes) -> int:
+        """Return the first column of the landmarks."""
+        return len(self.covariance) - axes.point * len(self.points)
+
+    def _known(self, axes: Axes, indices: IntArray) -> tuple[IntArray, IntArray]:
+        """Return those of landmarks (m,) that were known, and their columns."""
+        known, k = indices[indices < len(self.points)], axes.point
+        return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()
+
+
+def _turned(rows: FloatArray, R: FloatArray) -> FloatArray:
+    """Return rows (k n, …), k of each landmark, turned by R (k, k)."""
+    turned: FloatArray = R @ rows.reshape(-1, len(R), rows.shape[1])
+    return turned.reshape(rows.shape)
