@@ -26,10 +26,12 @@ from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.history import History
+from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.observer import Observer
 from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Frames, Smoother, Solution
@@ -357,15 +359,16 @@ def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode, max_landma
 )
 def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
     settings = Settings(hindsight_interval=20, hindsight_turn=0.2)
-    prior = Prior(np.eye(4), np.empty(0), np.empty((0, 3)), np.eye(6))
-    hindsight = Hindsight(SPATIAL, settings, prior)
+    calibration = Calibration(settings, SPATIAL)
+    joint = JointCovariance(SPATIAL, calibration, 0.0)
+    hindsight, observer = Hindsight(SPATIAL, settings, calibration, joint), Observer(np.eye(4))
     nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-    due = []
+    looked_back_at = []
     for turn_rad in turns_rad:
         hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))
-        hindsight.see(nothing, np.eye(4))
-        due.append(hindsight.is_due)
-    assert (due.index(True) + 1 if any(due) else None) == due_after
+        hindsight.look_back(observer, nothing, in_doubt=False)
+        looked_back_at.append(hindsight.history.summarised)
+    assert max(looked_back_at) == (due_after or 0)
 
 
 def test_what_odometry_leaves_open_in_space_is_told_once_with_what_to_do(caplog):

@@ -20,7 +20,11 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.errors import SmoothingError
 from slam_observer_ros.gains.base import Seen
+from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.history import History
+from slam_observer_ros.gains.joint_covariance import JointCovariance
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing import Smoother, Solution, Step
@@ -40,14 +44,14 @@ what is linearised before the next time of looking back is linearised in the wro
 """
 
 ITERATIONS = 2
-"""Steps of looking back at most; the next time it goes on from where they led."""
+"""Steps of looking back at most."""
 
 TOLERANCE = 2e-2
 """Change of pose and map, rad and m, below which one step will do."""
 
 
 class Hindsight:
-    """What was seen since a prior, and whether it is time to look back at it.
+    """What was seen since a prior, and looking back at it.
 
     Parameters
     ----------
@@ -55,8 +59,8 @@ class Hindsight:
         Which axes are estimated.
     settings : Settings
         The settings ``hindsight_*``, and ``huber_threshold``.
-    prior : Prior
-        What was known before.
+    calibration, joint : Calibration, JointCovariance
+        What the gains know, which looking back changes; at first there are no landmarks.
 
     Attributes
     ----------
@@ -67,14 +71,20 @@ class Hindsight:
 
     """
 
-    def __init__(self, axes: Axes, settings: Settings, prior: Prior) -> None:
+    def __init__(
+        self, axes: Axes, settings: Settings, calibration: Calibration, joint: JointCovariance
+    ) -> None:
         self.settings = settings
-        self._axes = axes
+        self._axes, self._calibration, self._joint = axes, calibration, joint
         self._warning = _Warning()
-        self.restart(prior, 'the last start')
+        at_start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), joint.P.copy())
+        self._start(at_start, 'the last start')
 
-    def restart(self, prior: Prior, since: str) -> None:
-        """Forget all but the prior; ``since`` is why, in words."""
+    def restart(self, observer: Observer, since: str) -> None:
+        """Forget all but what is known now; ``since`` is why, in words."""
+        self._start(self._known(observer), since)
+
+    def _start(self, prior: Prior, since: str) -> None:
         self.history = History(self._axes, prior, since)
         self._rest()
 
@@ -82,12 +92,12 @@ class Hindsight:
         self._observations, self._turn_squared, self._largest_turn = 0, 0.0, 0.0
 
     @property
-    def window_is_full(self) -> bool:
+    def _window_is_full(self) -> bool:
         """Whether the history has as many frames as it may have."""
         return 0 < self.settings.hindsight_window <= len(self.history.stamps_ns)
 
     @property
-    def is_due(self) -> bool:
+    def _is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
         settings = self.settings
         least = max(settings.hindsight_interval, GROWTH * len(self.history.stamps_ns))
@@ -102,40 +112,27 @@ class Hindsight:
         self._turn_squared += turn_squared
         self._largest_turn = max(self._largest_turn, math.sqrt(turn_squared))
 
-    def see(self, seen: Seen, pose: FloatArray) -> None:
-        """Add a frame to the history; see :meth:`History.see`."""
-        self.history.see(seen, pose)
-        self._observations += 1
+    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
+        """Add a frame to the history; if it is time, or asked for, linearise the latest ones anew.
 
-    def linearise_anew(
-        self, calibration: FloatArray, points: FloatArray
-    ) -> tuple[Step, FloatArray] | None:
-        """Linearise the frames anew that are not summarised yet, at the present estimates.
-
-        Returns
-        -------
-        step : Step
-            The last step.
-        covariance : FloatArray
-            That of the last pose, calibration and landmarks at the start of the step. None at
-            all, the first time after a warning, if the observations don't determine everything.
-
+        The smoother's marginal becomes the filter's covariance, and its solution the observer's
+        new reference ξ°, with â_i = 0. It sums up all that was seen, for the next time.
         """
-        self._rest()
-        history, first = self.history, self.history.summarised
-        frames = history.frames().since(first)
-        start = Solution(np.array(history.poses[first:]), calibration, points)
-        try:
-            smoother = Smoother(self._axes, history.summary, frames, self.settings)
-            step = smoother.smooth(start, ITERATIONS, TOLERANCE)
-            covariance = step.marginal()
-        except np.linalg.LinAlgError:
-            self._warning.give()
-            return None
-        history.poses[first:] = list(step.end.poses)
-        return step, covariance
+        self.history.see(seen, observer.A)
+        self._observations += 1
+        if not (in_doubt or self._window_is_full or self._is_due):
+            return
+        self._linearise_anew(observer)
+        # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
+        if in_doubt:
+            return
+        known = self._known(observer).relative(self._axes)
+        if self._window_is_full:
+            self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
+        else:
+            self.history.summarise(known)
 
-    def smooth(self, calibration: FloatArray, points: FloatArray) -> Solution:
+    def smooth(self, observer: Observer) -> Solution:
         """Return all estimates in hindsight, iterated from the present ones until nothing moves.
 
         Raises
@@ -145,15 +142,58 @@ class Hindsight:
 
         """
         history = self.history
-        start = Solution(np.array(history.poses), calibration, points)
         try:
             smoother = Smoother(self._axes, history.prior, history.frames(), self.settings)
-            return smoother.smooth(start, 50, 1e-6).end
+            return smoother.smooth(self._solution_from(0, observer), 50, 1e-6).end
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
                 'can not smooth: the observations leave some pose or landmark open, or contradict '
                 'covariances that say they are exact'
             ) from error
+
+    def _linearise_anew(self, observer: Observer) -> None:
+        """Linearise the frames anew that are not summarised yet, at the present estimates.
+
+        Nothing comes of it, the first time after a warning, if these don't determine everything.
+        """
+        self._rest()
+        history, first = self.history, self.history.summarised
+        frames = history.frames().since(first)
+        try:
+            smoother = Smoother(self._axes, history.summary, frames, self.settings)
+            step = smoother.smooth(self._solution_from(first, observer), ITERATIONS, TOLERANCE)
+            covariance = step.marginal()
+        except np.linalg.LinAlgError:
+            self._warning.give()
+            return
+        history.poses[first:] = list(step.end.poses)
+        self._rebase(observer, step, covariance)
+
+    def _rebase(self, observer: Observer, step: Step, covariance: FloatArray) -> None:
+        """Take where all was linearised for the reference; the step from there is a correction.
+
+        ``covariance`` belongs to the step's start. Taken for that of its end it would tell
+        something of the gauge, of which nothing is known; settling carries it over.
+        """
+        start, end = step.start, step.end
+        observer.rebase(start.poses[-1], start.points)
+        self._joint.P = covariance
+        self._joint.P = self._joint.with_pose_error_by(observer.A)
+        self._calibration.shift(end.calibration - self._calibration.values)
+        D = end.poses[-1] @ se3.inverse(start.poses[-1])
+        observer.correct(Correction(D, slice(None), end.points - start.points))
+        self._joint.settle(observer)
+
+    def _solution_from(self, first: int, observer: Observer) -> Solution:
+        """Return the present estimates, of poses those from before frame ``first`` on."""
+        poses = np.array(self.history.poses[first:])
+        return Solution(poses, self._calibration.values, observer.y_ref + observer.a)
+
+    def _known(self, observer: Observer) -> Prior:
+        """Return what is known now."""
+        covariance = self._joint.with_pose_error_by(se3.inverse(observer.A))
+        points = observer.y_ref + observer.a
+        return Prior(observer.A, self._calibration.values, points, covariance)
 
 
 class _Warning:

@@ -8,6 +8,8 @@ from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.prediction import initial_covariance
 from slam_observer_ros.gains.robust import block_diagonal
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray, IntArray
 
 
@@ -119,6 +121,26 @@ class JointCovariance:
         L = self._axes.turn_matrix(vectors).reshape(-1, self._p)
         self.P[columns] += L @ self.P[: self._p]
         self.P[:, columns] += self.P[:, : self._p] @ L.T
+
+    def settle(self, observer: Observer) -> None:
+        """Take the landmarks' estimates for their reference, so that â_i = 0.
+
+        ã_i = â_i − R_Ã a_i turns with the noise of the pose unless a_i is small, which prediction
+        in the pose block alone leaves out. With y_i° + â_i for y_i°, ã_i becomes ã_i − [â_i]× ω.
+        """
+        if not observer.a.any():
+            return
+        self.turn(self.map_columns, observer.a)
+        observer.rebase(observer.A, observer.y_ref + observer.a)
+
+    def with_pose_error_by(self, A: FloatArray) -> FloatArray:
+        """Return the covariance of Ad_A ε and all else."""
+        p, pose = self._p, self._axes.pose
+        Ad = se3.adjoint(A)[np.ix_(pose, pose)]
+        changed: FloatArray = self.P.copy()
+        changed[:p] = Ad @ changed[:p]
+        changed[:, :p] = changed[:, :p] @ Ad.T
+        return changed
 
     def _place_velocities(self, indices: IntArray) -> None:
         """Fill in landmarks whose velocity is not known at all yet."""

@@ -41,11 +41,10 @@ from slam_observer_ros.gains.robust import (
     observation_weights,
     with_blocks,
 )
-from slam_observer_ros.geometry import se3, slam_group, so3
+from slam_observer_ros.geometry import slam_group, so3
 from slam_observer_ros.observer import Correction, Observer
-from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Solution, Step
+from slam_observer_ros.smoothing import Solution
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
@@ -73,9 +72,7 @@ class RiccatiGains:
         self._joint = JointCovariance(
             self._axes, self.calibration, settings.landmark_velocity_error
         )
-        P = self._joint.P.copy()
-        start = Prior(np.eye(4), self.calibration.values, np.empty((0, 3)), P)
-        self._hindsight = Hindsight(self._axes, settings, start)
+        self._hindsight = Hindsight(self._axes, settings, self.calibration, self._joint)
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
@@ -265,15 +262,8 @@ class RiccatiGains:
         return PC, C @ PC - to_pose @ so3.transpose(C) + own
 
     def settle(self, observer: Observer) -> None:
-        """Take the landmarks' estimates for their reference, so that â_i = 0.
-
-        ã_i = â_i − R_Ã a_i turns with the noise of the pose unless a_i is small, which prediction
-        in the pose block alone leaves out. With y_i° + â_i for y_i°, ã_i becomes ã_i − [â_i]× ω.
-        """
-        if not observer.a.any():
-            return
-        self._joint.turn(self._joint.map_columns, observer.a)
-        observer.rebase(observer.A, observer.y_ref + observer.a)
+        """Take the landmarks' estimates for their reference, so that â_i = 0."""
+        self._joint.settle(observer)
 
     @property
     def looks_back(self) -> bool:
@@ -282,31 +272,14 @@ class RiccatiGains:
         return self._settings.hindsight_interval > 0 and is_constant
 
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
-        """Note what was seen, and every so often linearise it anew.
-
-        The smoother's marginal becomes the filter's covariance, and its solution the observer's
-        new reference ξ°, with â_i = 0. It sums up all that was seen, for the next time.
-        """
+        """Note what was seen, and every so often linearise it anew."""
         # An empty frame tells nothing: the motions before and after it add up.
-        if not (self.looks_back and len(seen.indices)):
-            return
-        hindsight = self._hindsight
-        hindsight.see(seen, observer.A)
-        if not (in_doubt or hindsight.window_is_full or hindsight.is_due):
-            return
-        self._linearise_anew(observer)
-        # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
-        if in_doubt:
-            return
-        known = self._known(observer).relative(self._axes)
-        if hindsight.window_is_full:
-            hindsight.restart(known, 'the history was cut (hindsight_window=0 keeps all of it)')
-        else:
-            hindsight.history.summarise(known)
+        if self.looks_back and len(seen.indices):
+            self._hindsight.look_back(observer, seen, in_doubt)
 
     def smooth(self, observer: Observer) -> Solution:
         """Return the estimates in hindsight of everything since the history's prior."""
-        return self._hindsight.smooth(self.calibration.values, observer.y_ref + observer.a)
+        return self._hindsight.smooth(observer)
 
     @property
     def history(self) -> History:
@@ -315,42 +288,7 @@ class RiccatiGains:
 
     def restart(self, observer: Observer, since: str) -> None:
         """Forget the past: what is known now is all that is known when looking back."""
-        self._hindsight.restart(self._known(observer), since)
-
-    def _known(self, observer: Observer) -> Prior:
-        """Return what is known now."""
-        points = observer.y_ref + observer.a
-        covariance = self._with_pose_error_by(se3.inverse(observer.A), self._joint.P)
-        return Prior(observer.A, self.calibration.values, points, covariance)
-
-    def _linearise_anew(self, observer: Observer) -> None:
-        points = observer.y_ref + observer.a
-        found = self._hindsight.linearise_anew(self.calibration.values, points)
-        if found is not None:
-            self._rebase(observer, *found)
-
-    def _rebase(self, observer: Observer, step: Step, covariance: FloatArray) -> None:
-        """Take where all was linearised for the reference; the step from there is a correction.
-
-        ``covariance`` belongs to the step's start. Taken for that of its end it would tell
-        something of the gauge, of which nothing is known; settling carries it over.
-        """
-        start, end = step.start, step.end
-        observer.rebase(start.poses[-1], start.points)
-        self._joint.P = self._with_pose_error_by(observer.A, covariance)
-        self.calibration.shift(end.calibration - self.calibration.values)
-        D = end.poses[-1] @ se3.inverse(start.poses[-1])
-        observer.correct(Correction(D, slice(None), end.points - start.points))
-        self.settle(observer)
-
-    def _with_pose_error_by(self, A: FloatArray, covariance: FloatArray) -> FloatArray:
-        """Return a covariance of Ad_A ε and all else, for one of ε and all else."""
-        p, pose = self._p, self._axes.pose
-        Ad = se3.adjoint(A)[np.ix_(pose, pose)]
-        changed: FloatArray = covariance.copy()
-        changed[:p] = Ad @ changed[:p]
-        changed[:, :p] = changed[:, :p] @ Ad.T
-        return changed
+        self._hindsight.restart(observer, since)
 
     def _as_correction(self, x: FloatArray) -> Correction:
         """Return the group element exp(x); the calibration moves by its own part of x."""
