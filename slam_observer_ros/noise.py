@@ -18,8 +18,10 @@ RELATIVE_RESOLUTION = 1e-6
 LEAST_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
-LARGEST_SPEED_ERROR = 1e4
-"""Standard deviation of a velocity, m/s or rad/s, beyond which a message only says 'unknown'."""
+LARGEST_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
+"""Standard deviations of a velocity (Ω, v), rad/s and m/s, beyond which a message only says
+'unknown': no robot turns or moves as fast.
+"""
 
 SPEED_WINDOW_S = 1.0
 """Time over which a velocity is averaged to tell how large an error in proportion to it is."""
@@ -113,7 +115,7 @@ def _invertible(covariances: FloatArray) -> FloatArray:
 def _limited(covariances: FloatArray) -> FloatArray:
     """Return covariances (k, 6, 6) without variances that would drown all others in rounding."""
     deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    scales = LARGEST_SPEED_ERROR / np.maximum(deviations, LARGEST_SPEED_ERROR)
+    scales = LARGEST_SPEED_ERRORS / np.maximum(deviations, LARGEST_SPEED_ERRORS)
     limited: FloatArray = covariances * scales[:, :, None] * scales[:, None, :]
     return limited
 

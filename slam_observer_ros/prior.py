@@ -13,6 +13,9 @@ from slam_observer_ros.types import FloatArray, IntArray
 ANYWHERE_M = 1e3
 """Standard deviation of a landmark of which nothing is known, metres."""
 
+EXACT_M = 1e-6
+"""Standard deviation of what is said to be exact, metres."""
+
 
 @dataclass(frozen=True, slots=True)
 class Prior:
@@ -43,8 +46,6 @@ class Prior:
     def relative(self, axes: Axes) -> Prior:
         """Return the same knowledge, but of where the landmarks lie as seen from the pose.
 
-        It stays true when what follows turns pose and map together. Told of the world it would be
-        bent, to second order in an angle of which far less may be known than of the map.
         dy_i is Rᵀ dp_i − C_i η, with C_i the output matrix at y_i and R the pose's rotation.
         """
         d, k, first = len(axes.pose), axes.point, self._first_point(axes)
@@ -54,6 +55,20 @@ class Prior:
         for rows in (covariance, covariance.T):
             rows[first:] = _turned(rows[first:], R.T) - C @ rows[:d]
         return replace(self, covariance=covariance, is_relative=True)
+
+    def least_bent(self, axes: Axes) -> Prior:
+        """Return it told of the world or of what is seen from the pose, whichever is more linear.
+
+        A map that the robot has made may yet be turned as a whole, and the pose with it, by more
+        than the one against the other: told of the world it would be bent, to second order in
+        that angle. In a map that was loaded it is the pose alone that may yet be turned.
+        """
+        turns, first = slice(len(axes.pose) - axes.point), self._first_point(axes)
+        with_map, of_map = self.covariance[turns, first:], self.covariance[first:, first:]
+        regular = of_map + EXACT_M**2 * np.eye(len(of_map))
+        of_both = np.trace(with_map @ np.linalg.solve(regular, with_map.T))
+        of_pose = np.trace(self.covariance[turns, turns]) - of_both
+        return self.relative(axes) if of_both > of_pose else self
 
     def without(self, axes: Axes, indices: IntArray) -> Prior:
         """Return it without the landmarks at ``indices``; those behind move up."""

@@ -223,7 +223,8 @@ class Settings:
     support_timeout: float = parameter(
         10.0,
         'Points without id: how long a landmark with too few confirmations is kept that is in '
-        'view, as far as can be told, and not seen',
+        'view, as far as can be told, and not seen; between two observations a second counts at '
+        'most',
         unit='s',
         minimum=0.0,
         maximum=1e6,

@@ -13,7 +13,7 @@ costs O(S n²), not O(S³). Outliers are reweighted in each iteration (Huber).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from slam_observer_ros.bordered_chain import Equations, Factors, landmark_column
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,19 +59,21 @@ class Frames:
     points: FloatArray
     information: FloatArray
 
-    def since(self, first: int) -> Frames:
-        """Return the frames from number ``first`` on."""
-        seen = slice(np.searchsorted(self.frames, first), None)
-        return Frames(
-            motions=self.motions[first:],
-            motion_covariances=self.motion_covariances[first:],
-            sensitivities=self.sensitivities[first:],
-            calibrations=self.calibrations[first:],
-            frames=self.frames[seen] - first,
-            landmarks=self.landmarks[seen],
-            points=self.points[seen],
-            information=self.information[seen],
+    def only(self, kept: BoolArray) -> Frames:
+        """Return the frames with only some of the points (M,)."""
+        return replace(
+            self,
+            frames=self.frames[kept],
+            landmarks=self.landmarks[kept],
+            points=self.points[kept],
+            information=self.information[kept],
         )
+
+
+def joined(parts: list[Frames]) -> Frames:
+    """Return the frames of one or more parts, one after the other."""
+    names = [field.name for field in fields(Frames)]
+    return Frames(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def no_frames(d: int, c: int, k: int) -> Frames:

@@ -150,6 +150,13 @@ def test_nothing_is_lost_after_one_stamp_ahead():
     assert stamps(queue.pop_all()) == sorted([*stamps(dense(9 * SECOND)), 6 * SECOND + 1])
 
 
+def test_what_still_waits_for_others_at_the_end_is_given_out_too():
+    queue = filled(
+        *dense(2 * SECOND), velocity(9 * SECOND), *map(velocity, (2 * SECOND, SECOND * 5 // 2))
+    )
+    assert stamps(queue.pop_all())[-3:] == [2 * SECOND, 5 * SECOND // 2, 9 * SECOND]
+
+
 def test_a_pause_is_believed_when_enough_events_agree_and_none_of_them_is_lost():
     events = [*dense(SECOND), *dense(11 * SECOND)[540:]]
     queue = filled(*events[: 50 + CONFIRMATIONS - 1])

@@ -339,18 +339,52 @@ def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees(
     assert slam.gains.distances(innovation)[0] == pytest.approx(2.0, abs=0.1)
 
 
+class Looks:
+    """How many frames were linearised anew each time, which the first ``failures`` times fails."""
+
+    def __init__(self, monkeypatch, failures=0):
+        self.frames = []
+        smooth = Smoother.smooth
+
+        def noted(smoother, start, *rest):
+            self.frames.append(len(start.poses) - 1)
+            if len(self.frames) <= failures:
+                raise np.linalg.LinAlgError
+            return smooth(smoother, start, *rest)
+
+        monkeypatch.setattr(Smoother, 'smooth', noted)
+
+
 def test_what_was_looked_back_at_once_is_not_looked_back_at_again(monkeypatch):
-    frames = []
-    smooth = Smoother.smooth
-
-    def noted(smoother, start, *rest):
-        frames.append(len(start.poses) - 1)
-        return smooth(smoother, start, *rest)
-
-    monkeypatch.setattr(Smoother, 'smooth', noted)
+    looks = Looks(monkeypatch)
     settings = Settings(hindsight_interval=2, hindsight_turn=0.0)
     world = drive(settings, 30.0)
     estimate(world, settings)
-    assert len(frames) > 10
-    assert np.sum(frames) <= len(world.observations())
-    assert np.all(frames >= np.maximum(2, 0.1 * np.cumsum(frames)))
+    assert len(looks.frames) > 10
+    assert np.sum(looks.frames) <= len(world.observations())
+    assert np.all(looks.frames >= np.maximum(2, 0.1 * np.cumsum(looks.frames)))
+
+
+def test_a_landmark_that_is_often_in_doubt_does_not_keep_the_rest_from_being_summed_up(
+    monkeypatch,
+):
+    looks = Looks(monkeypatch)
+    settings = Settings(hindsight_interval=20, hindsight_turn=0.0)
+
+    def swing(index, event):
+        """Landmark 0, a door, is elsewhere every other ten frames."""
+        is_open = (event.ids == 0) & (index // 10 % 2 == 1)
+        return replace(event, points=event.points + is_open[:, None] * [2.0, 2.0, 0.0])
+
+    world = drive(settings, 60.0, landmarks=4).with_observations(swing)
+    estimator = estimate(world, settings)
+    assert estimator.counts['moved_landmark'] >= 5
+    assert max(looks.frames) < 60
+    assert np.sum(looks.frames) < 4 * len(world.observations())
+
+
+def test_what_looking_back_failed_for_is_looked_back_at_later(monkeypatch):
+    looks = Looks(monkeypatch, failures=2)
+    settings = Settings(hindsight_interval=20, hindsight_turn=0.0)
+    estimate(drive(settings, 30.0), settings)
+    assert looks.frames[:4] == [20, 40, 60, 20]

@@ -130,6 +130,16 @@ def test_an_error_that_lasts_adds_up_however_often_its_motion_is_cut(cuts):
     np.testing.assert_allclose(total, 4.0 * given, rtol=1e-9)
 
 
+def test_a_velocity_of_which_nothing_is_known_is_one_that_a_robot_may_have():
+    """Odometry often states 1e6 or 1e12 for z, roll and pitch."""
+    given = np.diag([1e6, 1e12, 1e-4, 1e-4, 1e-4, 1e12])
+    covariance = NoiseModel(Settings()).motion(
+        held(np.zeros((1, 6)), [0.05], covariances=[given])
+    )[0]
+    expected = [2.5, 2.5, 5e-4, 5e-4, 5e-4, 50.0]
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), expected)
+
+
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 @pytest.mark.parametrize('variance', [1e15, 1e100, np.finfo(np.float64).max])
 def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(gains, variance):

@@ -203,6 +203,22 @@ def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten
 
 
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+@pytest.mark.parametrize('turns_together', [True, False])
+def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_together):
+    d, points = len(axes.pose), axes.full_points(np.arange(4.0 * axes.point))
+    together = np.concatenate([np.eye(d), axes.output_matrix(points).reshape(-1, d)])
+    turn, own = (
+        np.diag(0.1 * (np.arange(d) < d - axes.point)),
+        np.diag(np.full(len(together), 1e-3)),
+    )
+    covariance = together @ turn @ together.T + own
+    if not turns_together:
+        covariance[:d, d:] = covariance[d:, :d] = 0.0
+    prior = Prior(np.eye(4), np.empty(0), points, covariance)
+    assert prior.least_bent(axes).is_relative == turns_together
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
 def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
     """A stretch without observations reaches the history in pieces."""
     rng, d, k = np.random.default_rng(0), len(axes.pose), 6
@@ -309,12 +325,19 @@ def test_hindsight_beats_the_online_estimate(two_d_mode):
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_looking_back_a_piece_at_a_time_comes_to_what_all_of_it_tells(two_d_mode):
+@pytest.mark.parametrize('calibrated', [False, True])
+def test_looking_back_a_piece_at_a_time_comes_to_what_all_of_it_tells(two_d_mode, calibrated):
     settings = Settings(
-        two_d_mode=two_d_mode, hindsight_interval=5, hindsight_turn=0.0, huber_threshold=0.0
+        two_d_mode=two_d_mode,
+        hindsight_interval=5,
+        hindsight_turn=0.0,
+        huber_threshold=0.0,
+        linear_scale_error=(0.3 * calibrated,) * 3,
+        angular_bias_error=(0.1 * calibrated,) * 3,
     )
     for seed in range(3):
-        estimator = estimate(drive(settings, 30.0, seed), settings)
+        world = drive(settings, 30.0, seed, scale=1.0 + 0.2 * calibrated)
+        estimator = estimate(world, settings)
         deviations_m = np.sqrt(np.trace(estimator.landmark_covariances, axis1=1, axis2=2))
         shifts = estimator.world_points - estimator.smooth().world_points
         assert np.all(np.linalg.norm(shifts, axis=1) < 0.2 * deviations_m)

@@ -4,10 +4,9 @@ Covariances that were computed around a poor early estimate stay wrong, so after
 stretch a plain filter closes its loop badly. How much its linearisation can have lost shows in
 how far its corrections have turned the robot.
 
-What was linearised anew stays as it is: from then on a summary stands for it, of where landmarks
-lie as seen from the pose of that time (:meth:`.Prior.relative`), which later corrections hardly
-bend. So the cost of looking back does not grow with the history, of which only
-:meth:`Hindsight.smooth` needs all.
+What was linearised anew stays as it is: from then on a summary stands for it, told so that later
+corrections hardly bend it (:meth:`.Prior.least_bent`). So the cost of looking back does not grow
+with the history, of which only :meth:`Hindsight.smooth` needs all.
 """
 
 from __future__ import annotations
@@ -122,15 +121,16 @@ class Hindsight:
         self._observations += 1
         if not (in_doubt or self._window_is_full or self._is_due):
             return
-        self._linearise_anew(observer)
+        is_done = self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
         if in_doubt:
             return
-        known = self._known(observer).relative(self._axes)
+        self._rest()
         if self._window_is_full:
+            known = self._known(observer).least_bent(self._axes)
             self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
-        else:
-            self.history.summarise(known)
+        elif is_done:
+            self.history.summarise(self._known(observer).least_bent(self._axes))
 
     def smooth(self, observer: Observer) -> Solution:
         """Return all estimates in hindsight, iterated from the present ones until nothing moves.
@@ -151,23 +151,23 @@ class Hindsight:
                 'covariances that say they are exact'
             ) from error
 
-    def _linearise_anew(self, observer: Observer) -> None:
+    def _linearise_anew(self, observer: Observer) -> bool:
         """Linearise the frames anew that are not summarised yet, at the present estimates.
 
-        Nothing comes of it, the first time after a warning, if these don't determine everything.
+        Return whether anything came of it. If they don't determine everything, more may do so
+        later; the first time there is a warning.
         """
-        self._rest()
         history, first = self.history, self.history.summarised
-        frames = history.frames().since(first)
         try:
-            smoother = Smoother(self._axes, history.summary, frames, self.settings)
+            smoother = Smoother(self._axes, history.summary, history.frames_since(), self.settings)
             step = smoother.smooth(self._solution_from(first, observer), ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             self._warning.give()
-            return
+            return False
         history.poses[first:] = list(step.end.poses)
         self._rebase(observer, step, covariance)
+        return True
 
     def _rebase(self, observer: Observer, step: Step, covariance: FloatArray) -> None:
         """Take where all was linearised for the reference; the step from there is a correction.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.prior import Prior
-from slam_observer_ros.smoothing import Frames, no_frames
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.smoothing import Frames, joined, no_frames
+from slam_observer_ros.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,10 @@ class History:
         self._start: FloatArray | None = None
         self._end = prior.pose
         self._noise, self._sensitivity = self._at_rest()
-        self._frames = no_frames(len(axes.pose), len(prior.calibration), axes.point)
+        # Frames as arrays: those that are summarised, in pieces, and those that are not.
+        self._none = no_frames(len(axes.pose), len(prior.calibration), axes.point)
+        self._told: list[Frames] = []
+        self._latest = self._none
         self._new: list[_Frame] = []
 
     def __deepcopy__(self, memo: dict[int, object]) -> History:
@@ -123,37 +127,57 @@ class History:
 
     def summarise(self, known: Prior) -> None:
         """Take ``known`` for all that the frames up to now tell."""
+        self._told.append(self._with_new())
+        self._latest = self._none
         self.summary = known
         self.summarised = len(self.stamps_ns)
 
     def relocate_landmarks(self, indices: IntArray) -> None:
         """Forget all about the landmarks at ``indices`` but their latest observation."""
-        frames = self.frames()
-        latest = frames.frames == len(self.stamps_ns) - 1
-        self._keep(latest | ~np.isin(frames.landmarks, indices))
+        last = len(self.stamps_ns) - 1
+        self._change(
+            lambda frames: frames.only(
+                (frames.frames == last) | ~np.isin(frames.landmarks, indices)
+            )
+        )
         self.prior = self.prior.with_unknown(self._axes, indices)
         self.summary = self.summary.with_unknown(self._axes, indices)
 
     def remove_landmarks(self, indices: IntArray) -> None:
         """Forget the landmarks at ``indices`` and all observations of them."""
-        self._keep(~np.isin(self.frames().landmarks, indices))
-        rows = self._frames.landmarks
-        rows = rows - np.searchsorted(np.sort(indices), rows)
-        self._frames = replace(self._frames, landmarks=rows)
+        in_order = np.sort(indices)
+
+        def without(frames: Frames) -> Frames:
+            kept = frames.only(~np.isin(frames.landmarks, indices))
+            return replace(
+                kept, landmarks=kept.landmarks - np.searchsorted(in_order, kept.landmarks)
+            )
+
+        self._change(without)
         self.prior = self.prior.without(self._axes, indices)
         self.summary = self.summary.without(self._axes, indices)
 
     def frames(self) -> Frames:
-        """Return all frames as arrays."""
+        """Return all frames."""
+        return joined([*self._told, self._with_new()])
+
+    def frames_since(self) -> Frames:
+        """Return those that are not summarised, numbered anew."""
+        latest = self._with_new()
+        return replace(latest, frames=latest.frames - self.summarised)
+
+    def _with_new(self) -> Frames:
+        """Return the frames that are not summarised."""
         if self._new:
-            new = self._as_arrays(self._new, len(self._frames.motions))
-            pairs = [
-                (getattr(self._frames, field.name), getattr(new, field.name))
-                for field in fields(Frames)
-            ]
-            self._frames = Frames(*map(np.concatenate, pairs))
+            first = self.summarised + len(self._latest.motions)
+            self._latest = joined([self._latest, self._as_arrays(self._new, first)])
             self._new = []
-        return self._frames
+        return self._latest
+
+    def _change(self, change: Callable[[Frames], Frames]) -> None:
+        """Change what was seen in the frames."""
+        self._told = [change(frames) for frames in self._told]
+        self._latest = change(self._with_new())
 
     def _as_arrays(self, frames: list[_Frame], first: int) -> Frames:
         """Return frames as arrays; ``first`` is the number of the first one."""
@@ -173,17 +197,6 @@ class History:
             landmarks=np.concatenate([part.indices for part in seen]),
             points=np.concatenate([part.points for part in seen]),
             information=np.asarray(np.linalg.inv(covariances)),
-        )
-
-    def _keep(self, kept: BoolArray) -> None:
-        """Keep only some of the points (M,)."""
-        frames = self._frames
-        self._frames = replace(
-            frames,
-            frames=frames.frames[kept],
-            landmarks=frames.landmarks[kept],
-            points=frames.points[kept],
-            information=frames.information[kept],
         )
 
     def _at_rest(self) -> tuple[FloatArray, FloatArray]:
