@@ -27,6 +27,9 @@ WORST = ', worst draw'
 LEFT_OUT_COLUMN = 'riccati, these points left out'
 GROWTH_COLUMNS = (*OUTLIER_COLUMNS, 'riccati' + WORST, LEFT_OUT_COLUMN)
 
+DRAWN = {column: f'C{i}' for i, column in enumerate((*DESIGNS, EKF, ISAM2))}
+"""Estimators in the figure, with their colours."""
+
 STARRY_NIGHT = 'Starry Night'
 
 Table: TypeAlias = dict[str, dict[str, Scores]]
@@ -331,21 +334,21 @@ def _ratios(values: dict[str, tuple[float, float]]) -> dict[str, str]:
 
 
 def _draw_bars(axes: Axes, table: Table) -> None:
-    shown = (*DESIGNS, EKF, ISAM2)
     places = np.arange(len(table))
-    width = 0.8 / len(shown)
-    for i, column in enumerate(shown):
+    width = 0.8 / len(DRAWN)
+    for i, (column, colour) in enumerate(DRAWN.items()):
         heights = _values(table, table, column, 'configuration_rmse_m')
-        axes.bar(places + (i - 0.5 * (len(shown) - 1)) * width, heights, width, label=column)
+        shifted = places + (i - 0.5 * (len(DRAWN) - 1)) * width
+        axes.bar(shifted, heights, width, label=column, color=colour)
     axes.set_yscale('log')
-    axes.set_xticks(places, [fill(world, 16) for world in table], fontsize=8)
+    axes.set_xticks(places, [fill(world, 12) for world in table], fontsize=8)
     axes.set_ylabel('configuration error, m')
-    axes.legend(ncols=len(shown), fontsize=8, frameon=False)
+    axes.legend(ncols=len(DRAWN), fontsize=8, frameon=False)
 
 
 def _draw_consistency(axes: Axes, loop: str, columns: dict[str, Consistency]) -> None:
     for name, consistency in columns.items():
-        axes.plot(consistency.times_s, consistency.pose, marker='.', label=name)
+        axes.plot(consistency.times_s, consistency.pose, '.-', label=name, color=DRAWN[name])
         axes.axhspan(*consistency.band, color='#DDDDDD', zorder=0)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel('time, s')

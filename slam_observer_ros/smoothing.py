@@ -20,7 +20,7 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.prior import Prior
+from slam_observer_ros.prior import EXACT_M, Prior
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -289,6 +289,6 @@ def _normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray
 
 
 def _inverse(covariances: FloatArray) -> FloatArray:
-    """Return inverses of covariances (…, d, d), taking what is exact to be known to 1e-6."""
-    jitter = 1e-12 * np.eye(covariances.shape[-1])
+    """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
+    jitter = EXACT_M**2 * np.eye(covariances.shape[-1])
     return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)

@@ -127,10 +127,9 @@ class Hindsight:
             return
         self._rest()
         if self._window_is_full:
-            known = self._known(observer).least_bent(self._axes)
-            self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
+            self.restart(observer, 'the history was cut (hindsight_window=0 keeps all of it)')
         elif is_done:
-            self.history.summarise(self._known(observer).least_bent(self._axes))
+            self.history.summarise(self._known(observer))
 
     def smooth(self, observer: Observer) -> Solution:
         """Return all estimates in hindsight, iterated from the present ones until nothing moves.
@@ -159,7 +158,9 @@ class Hindsight:
         """
         history, first = self.history, self.history.summarised
         try:
-            smoother = Smoother(self._axes, history.summary, history.frames_since(), self.settings)
+            smoother = Smoother(
+                self._axes, history.summary, history.latest_frames(), self.settings
+            )
             step = smoother.smooth(self._solution_from(first, observer), ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
@@ -190,10 +191,11 @@ class Hindsight:
         return Solution(poses, self._calibration.values, observer.y_ref + observer.a)
 
     def _known(self, observer: Observer) -> Prior:
-        """Return what is known now."""
+        """Return what is known now, told so that it is least bent."""
         covariance = self._joint.with_pose_error_by(se3.inverse(observer.A))
         points = observer.y_ref + observer.a
-        return Prior(observer.A, self._calibration.values, points, covariance)
+        known = Prior(observer.A, self._calibration.values, points, covariance)
+        return known.least_bent(self._axes)
 
 
 class _Warning:

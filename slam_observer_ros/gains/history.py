@@ -161,7 +161,7 @@ class History:
         """Return all frames."""
         return joined([*self._told, self._with_new()])
 
-    def frames_since(self) -> Frames:
+    def latest_frames(self) -> Frames:
         """Return those that are not summarised, numbered anew."""
         latest = self._with_new()
         return replace(latest, frames=latest.frames - self.summarised)
