@@ -237,8 +237,8 @@ class Settings:
     )
     hindsight_interval: int = parameter(
         20,
-        'Riccati gains: least observations to look back at at once, or a tenth of all so far if '
-        'that is more; 0 for never',
+        'Riccati gains: least observations to look back at at once, or a tenth of all so far up '
+        'to 300; 0 for never',
         minimum=0,
     )
     hindsight_turn: float = parameter(
@@ -251,7 +251,7 @@ class Settings:
     hindsight_window: int = parameter(
         3000,
         'Riccati gains: observations after which smoothing starts anew from what is known then; '
-        '0 to smooth all of them',
+        '0 to smooth all of them, as replay --smooth does unless told otherwise',
         minimum=0,
     )
     localization_mode: str = parameter(

@@ -430,6 +430,16 @@ class TestSmoothing:
         assert ended.code == 0
         assert 'hindsight_window=0' in ended.errors
 
+    def test_all_of_a_long_recording_is_smoothed(self, slam_observer, tmp_path):
+        count, points = 3100, np.array([[2.0, 1.0, 0.0], [0.0, 3.0, 1.0], [-1.0, -2.0, 0.0]])
+        stamps_ns = range(10**9, 10**9 + count * 10**7, 10**7)
+        events = [VelocityEvent(stamp_ns, np.zeros(6)) for stamp_ns in stamps_ns]
+        events += [ObservationEvent(stamp_ns, np.arange(3), points) for stamp_ns in stamps_ns]
+        path = write_events(tmp_path / 'long.mcap', sorted(events, key=lambda e: e.stamp_ns))
+        tum = tmp_path / 'a.tum'
+        slam_observer.succeed('replay', path, '--smooth', '--gains', 'riccati', '--tum', tum)
+        assert len(read_tum(tum)) == count
+
     def test_messages_without_any_point_cut_no_history_short(self, slam_observer, tmp_path):
         path = write_events(tmp_path / 'blind.mcap', blinded(recordings.events(), slice(20, 40)))
         slam_observer.succeed('replay', path, '--smooth', '--gains', 'riccati')

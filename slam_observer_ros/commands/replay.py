@@ -93,7 +93,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(args: argparse.Namespace) -> None:
     """Replay a recording, and write what was asked for."""
-    settings, inputs = read_settings(args, INPUT_NAMES, INSTEAD), read_inputs(args)
+    defaults = {'hindsight_window': 0} if args.smooth else {}
+    settings = read_settings(args, INPUT_NAMES, INSTEAD, **defaults)
+    inputs = read_inputs(args)
     if args.smooth and settings.gains != 'riccati':
         raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
     _check_files(args)

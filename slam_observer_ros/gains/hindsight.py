@@ -32,10 +32,14 @@ from slam_observer_ros.types import FloatArray
 logger = logging.getLogger(__name__)
 
 GROWTH = 0.1
-"""Share of the history that is looked back at at least. As large maps take long histories, the
-O(n³) that looking back costs for n landmarks is shared by so many observations that each costs no
-more than an update, O(n²).
+"""Share of all observations so far that are looked back at at least, but no more than ``MANY``.
+
+As large maps take many observations, the O(n³) that looking back costs for n landmarks is shared
+by so many that each of them costs no more than an update, O(n²).
 """
+
+MANY = 300
+"""Observations that are enough to be looked back at, however many there were before."""
 
 HURRY = 0.1
 """Share of the observations otherwise waited for that will do after a single large correction:
@@ -76,6 +80,7 @@ class Hindsight:
         self.settings = settings
         self._axes, self._calibration, self._joint = axes, calibration, joint
         self._warning = _Warning()
+        self._seen = 0
         at_start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), joint.P.copy())
         self._start(at_start, 'the last start')
 
@@ -99,7 +104,7 @@ class Hindsight:
     def _is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
         settings = self.settings
-        least = max(settings.hindsight_interval, GROWTH * len(self.history.stamps_ns))
+        least = max(settings.hindsight_interval, min(GROWTH * self._seen, MANY))
         if 0.0 < settings.hindsight_turn < self._largest_turn:
             least *= HURRY
         turned_far = self._turn_squared > settings.hindsight_turn**2
@@ -118,6 +123,7 @@ class Hindsight:
         new reference ξ°, with â_i = 0. It sums up all that was seen, for the next time.
         """
         self.history.see(seen, observer.A)
+        self._seen += 1
         self._observations += 1
         if not (in_doubt or self._window_is_full or self._is_due):
             return
