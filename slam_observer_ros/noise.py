@@ -114,7 +114,8 @@ def _invertible(covariances: FloatArray) -> FloatArray:
 
 def _limited(covariances: FloatArray) -> FloatArray:
     """Return covariances (k, 6, 6) without variances that would drown all others in rounding."""
-    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    # Rounding may have left a variance a hair below zero.
+    deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
     scales = LARGEST_SPEED_ERRORS / np.maximum(deviations, LARGEST_SPEED_ERRORS)
     limited: FloatArray = covariances * scales[:, :, None] * scales[:, None, :]
     return limited

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -56,19 +57,37 @@ class Prior:
             rows[first:] = _turned(rows[first:], R.T) - C @ rows[:d]
         return replace(self, covariance=covariance, is_relative=True)
 
-    def least_bent(self, axes: Axes) -> Prior:
-        """Return it told of the world or of what is seen from the pose, whichever is more linear.
+    def least_bent(self, axes: Axes) -> tuple[Prior, float]:
+        """Return it told so that it is bent less: of the world, or of what is seen from the pose.
 
         A map that the robot has made may yet be turned as a whole, and the pose with it, by more
         than the one against the other: told of the world it would be bent, to second order in
-        that angle. In a map that was loaded it is the pose alone that may yet be turned.
+        that angle. In a map that was loaded it is the pose alone that may yet be turned. After a
+        blind stretch it may be that either way bends it far.
+
+        Returns
+        -------
+        prior : Prior
+            The same knowledge.
+        angle_rad : float
+            By what angle it may yet be bent, a standard deviation.
+
         """
+        turns = slice(len(axes.pose) - axes.point)
+        together = self._turned_together(axes)
+        alone = float(np.trace(self.covariance[turns, turns])) - together
+        if together < alone:
+            return self, math.sqrt(together)
+        relative = self.relative(axes)
+        return relative, math.sqrt(relative._turned_together(axes))
+
+    def _turned_together(self, axes: Axes) -> float:
+        """Return the variance of the pose's angle as far as landmarks are turned with it, rad²."""
         turns, first = slice(len(axes.pose) - axes.point), self._first_point(axes)
-        with_map, of_map = self.covariance[turns, first:], self.covariance[first:, first:]
-        regular = of_map + EXACT_M**2 * np.eye(len(of_map))
-        of_both = np.trace(with_map @ np.linalg.solve(regular, with_map.T))
-        of_pose = np.trace(self.covariance[turns, turns]) - of_both
-        return self.relative(axes) if of_both > of_pose else self
+        shared, own = self.covariance[turns, first:], self.covariance[first:, first:]
+        least = EXACT_M**2 + np.finfo(np.float64).eps * np.trace(own)
+        regular = own + least * np.eye(len(own))
+        return max(float(np.trace(shared @ np.linalg.solve(regular, shared.T))), 0.0)
 
     def without(self, axes: Axes, indices: IntArray) -> Prior:
         """Return it without the landmarks at ``indices``; those behind move up."""

@@ -140,6 +140,14 @@ def test_a_velocity_of_which_nothing_is_known_is_one_that_a_robot_may_have():
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), expected)
 
 
+def test_a_variance_that_rounding_left_below_zero_is_taken_for_zero():
+    given = np.diag([0.01, 0.01, 0.01, 0.01, 0.01, -1e-12])
+    covariance = NoiseModel(Settings()).motion(held(np.zeros((1, 6)), [1.0], covariances=[given]))[
+        0
+    ]
+    np.testing.assert_allclose(covariance, given, atol=1e-11)
+
+
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 @pytest.mark.parametrize('variance', [1e15, 1e100, np.finfo(np.float64).max])
 def test_a_velocity_of_which_nothing_is_known_ends_no_estimator(gains, variance):

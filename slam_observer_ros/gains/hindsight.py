@@ -5,7 +5,8 @@ stretch a plain filter closes its loop badly. How much its linearisation can hav
 how far its corrections have turned the robot.
 
 What was linearised anew stays as it is: from then on a summary stands for it, told so that later
-corrections hardly bend it (:meth:`.Prior.least_bent`). So the cost of looking back does not grow
+corrections hardly bend it (:meth:`.Prior.least_bent`). After a blind stretch there may be no such
+summary until landmarks seen before are seen again. Else the cost of looking back does not grow
 with the history, of which only :meth:`Hindsight.smooth` needs all.
 """
 
@@ -37,6 +38,9 @@ GROWTH = 0.1
 As large maps take many observations, the O(n³) that looking back costs for n landmarks is shared
 by so many that each of them costs no more than an update, O(n²).
 """
+
+MOST_BENT_RAD = 0.2
+"""Angle by which a summary may yet be bent, see :meth:`.Prior.least_bent`; else there is none."""
 
 MANY = 300
 """Observations that are enough to be looked back at, however many there were before."""
@@ -94,6 +98,7 @@ class Hindsight:
 
     def _rest(self) -> None:
         self._observations, self._turn_squared, self._largest_turn = 0, 0.0, 0.0
+        self._is_owed = False
 
     @property
     def _window_is_full(self) -> bool:
@@ -102,7 +107,12 @@ class Hindsight:
 
     @property
     def _is_due(self) -> bool:
-        """Whether corrections have turned far, with enough observations since it last was due."""
+        """Whether corrections have turned far, with enough observations since it last was due.
+
+        Or whether what was looked back at could not be summed up for a landmark in doubt.
+        """
+        if self._is_owed:
+            return True
         settings = self.settings
         least = max(settings.hindsight_interval, min(GROWTH * self._seen, MANY))
         if 0.0 < settings.hindsight_turn < self._largest_turn:
@@ -129,13 +139,15 @@ class Hindsight:
             return
         is_done = self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
+        self._is_owed = in_doubt
         if in_doubt:
             return
         self._rest()
+        known, angle_rad = self._known(observer).least_bent(self._axes)
         if self._window_is_full:
-            self.restart(observer, 'the history was cut (hindsight_window=0 keeps all of it)')
-        elif is_done:
-            self.history.summarise(self._known(observer))
+            self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
+        elif is_done and angle_rad < MOST_BENT_RAD:
+            self.history.summarise(known)
 
     def smooth(self, observer: Observer) -> Solution:
         """Return all estimates in hindsight, iterated from the present ones until nothing moves.
@@ -197,11 +209,10 @@ class Hindsight:
         return Solution(poses, self._calibration.values, observer.y_ref + observer.a)
 
     def _known(self, observer: Observer) -> Prior:
-        """Return what is known now, told so that it is least bent."""
+        """Return what is known now."""
         covariance = self._joint.with_pose_error_by(se3.inverse(observer.A))
         points = observer.y_ref + observer.a
-        known = Prior(observer.A, self._calibration.values, points, covariance)
-        return known.least_bent(self._axes)
+        return Prior(observer.A, self._calibration.values, points, covariance)
 
 
 class _Warning:
