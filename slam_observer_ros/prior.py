@@ -73,7 +73,7 @@ class Prior:
             By what angle it may yet be bent, a standard deviation.
 
         """
-        turns = slice(len(axes.pose) - axes.point)
+        turns = self._turns(axes)
         together = self._turned_together(axes)
         alone = float(np.trace(self.covariance[turns, turns])) - together
         if together < alone:
@@ -83,7 +83,7 @@ class Prior:
 
     def _turned_together(self, axes: Axes) -> float:
         """Return the variance of the pose's angle as far as landmarks are turned with it, rad²."""
-        turns, first = slice(len(axes.pose) - axes.point), self._first_point(axes)
+        turns, first = self._turns(axes), self._first_point(axes)
         shared, own = self.covariance[turns, first:], self.covariance[first:, first:]
         least = EXACT_M**2 + np.finfo(np.float64).eps * np.trace(own)
         regular = own + least * np.eye(len(own))
@@ -149,6 +149,10 @@ class Prior:
     def _seen_from(self, pose: FloatArray, points: FloatArray) -> FloatArray:
         """Return points (n, 3) in the frame in which they are known: a pose's or the world."""
         return se3.transform(se3.inverse(pose), points) if self.is_relative else points
+
+    def _turns(self, axes: Axes) -> slice:
+        """Return the columns of the pose's angles, which come before its shifts."""
+        return slice(len(axes.pose) - axes.point)
 
     def _first_point(self, axes: Axes) -> int:
         """Return the first column of the landmarks."""

@@ -133,18 +133,16 @@ def test_an_error_that_lasts_adds_up_however_often_its_motion_is_cut(cuts):
 def test_a_velocity_of_which_nothing_is_known_is_one_that_a_robot_may_have():
     """Odometry often states 1e6 or 1e12 for z, roll and pitch."""
     given = np.diag([1e6, 1e12, 1e-4, 1e-4, 1e-4, 1e12])
-    covariance = NoiseModel(Settings()).motion(
-        held(np.zeros((1, 6)), [0.05], covariances=[given])
-    )[0]
+    still = held(np.zeros((1, 6)), [0.05], covariances=[given])
+    (covariance,) = NoiseModel(Settings()).motion(still)
     expected = [2.5, 2.5, 5e-4, 5e-4, 5e-4, 50.0]
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), expected)
 
 
 def test_a_variance_that_rounding_left_below_zero_is_taken_for_zero():
     given = np.diag([0.01, 0.01, 0.01, 0.01, 0.01, -1e-12])
-    covariance = NoiseModel(Settings()).motion(held(np.zeros((1, 6)), [1.0], covariances=[given]))[
-        0
-    ]
+    still = held(np.zeros((1, 6)), [1.0], covariances=[given])
+    (covariance,) = NoiseModel(Settings()).motion(still)
     np.testing.assert_allclose(covariance, given, atol=1e-11)
 
 

@@ -39,11 +39,11 @@ As large maps take many observations, the O(n³) that looking back costs for n l
 by so many that each of them costs no more than an update, O(n²).
 """
 
-MOST_BENT_RAD = 0.2
-"""Angle by which a summary may yet be bent, see :meth:`.Prior.least_bent`; else there is none."""
-
 MANY = 300
 """Observations that are enough to be looked back at, however many there were before."""
+
+MOST_BENT_RAD = 0.2
+"""Angle by which a summary may yet be bent, see :meth:`.Prior.least_bent`; else there is none."""
 
 HURRY = 0.1
 """Share of the observations otherwise waited for that will do after a single large correction:
@@ -139,8 +139,8 @@ class Hindsight:
             return
         is_done = self._linearise_anew(observer)
         # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
-        self._is_owed = in_doubt
         if in_doubt:
+            self._is_owed = True
             return
         self._rest()
         known, angle_rad = self._known(observer).least_bent(self._axes)
