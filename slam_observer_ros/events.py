@@ -1,4 +1,7 @@
-"""Time-stamped events: what the estimator takes in, and the truth that it is compared with."""
+"""Time-stamped events: what the estimator takes in, and the truth that it is compared with.
+
+Their arrays are not copied: who has added an event must not change them any more.
+"""
 
 from __future__ import annotations
 

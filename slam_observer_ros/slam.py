@@ -362,19 +362,24 @@ class Slam:
 
         The noise model is told where a landmark should be, not where it was measured: a landmark
         measured too near would be believed more than one measured too far, and all would be
-        drawn towards the robot. Where it should be is not known of one that is new (row −1), that
-        is in doubt, or that was seen so seldom that it may itself be an outlier.
+        drawn towards the robot.
         """
-        if event.covariances is not None or not len(self.landmarks):
+        if event.covariances is not None:
             return self.noise.observation(event)
+        return self.noise.at(self._expected(event, rows))
+
+    def _expected(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+        """Return where points should be (m, 3), metres, body frame: where measured, if unknown.
+
+        As it is of a landmark that is new (row −1), that is in doubt, or that was seen so seldom
+        that it may itself be an outlier.
+        """
+        if not len(self.landmarks):
+            return event.points
         is_confirmed = self.landmarks.counts[rows] >= self.settings.confirmations
-        is_sure = (
-            (rows >= 0)
-            & is_confirmed
-            & ~self.landmarks.in_doubt(rows, self.settings.max_rejections)
-        )
-        points = np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
-        return self.noise.at(points)
+        in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections)
+        is_sure = (rows >= 0) & is_confirmed & ~in_doubt
+        return np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
 
     def _look_back(self, event: ObservationEvent, rows: IntArray) -> None:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
@@ -385,15 +390,16 @@ class Slam:
         some_are = bool(in_doubt.any())
         if not (some_are or self.gains.looks_back):
             return
-        covariances = self._covariances(event, rows)
-        seen = Seen(event.stamp_ns, rows, event.points, covariances)
+        stated = None if event.covariances is None else self.noise.observation(event)
+        expected = self._expected(event, rows)
+        seen = Seen(event.stamp_ns, rows, event.points, expected, stated)
         self.gains.look_back(self.observer, seen, some_are)
         if some_are:
-            self._relocate(event.select(in_doubt), rows[in_doubt], covariances[in_doubt])
+            self._relocate(event.select(in_doubt), rows[in_doubt])
 
-    def _relocate(self, event: ObservationEvent, rows: IntArray, covariances: FloatArray) -> None:
-        """Start landmarks anew that are still far from where they were expected."""
-        innovation = self._innovation(event, rows, covariances)
+    def _relocate(self, event: ObservationEvent, rows: IntArray) -> None:
+        """Start landmarks in doubt anew that are still far from where they were expected."""
+        innovation = self._innovation(event, rows, self.noise.observation(event))
         far = self.gains.distances(innovation) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():

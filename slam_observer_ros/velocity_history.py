@@ -83,6 +83,8 @@ class VelocityHistory:
         # In force from each stamp to the next; the first is what is known before any event.
         self._stamps_ns = [NEVER_NS]
         self._joined = _Joined.with_room_for(FIRST_CAPACITY)
+        # Those that nobody has asked for yet: written together they cost a fifth.
+        self._unwritten: list[tuple[VelocityEvent, AngularVelocityEvent | None]] = []
         self._velocity: VelocityEvent | None = None
         self._angular: AngularVelocityEvent | None = None
 
@@ -100,19 +102,16 @@ class VelocityHistory:
         angular = self._angular
         if angular is not None and not 0 <= event.stamp_ns - angular.stamp_ns <= self._timeout_ns:
             angular = None
-        count = len(self._stamps_ns)
-        if count == self._joined.capacity:
-            self._joined = self._joined.copied(slice(count), 2 * count)
-        self._joined.write(count, self._velocity, angular)
+        self._unwritten.append((self._velocity, angular))
         self._stamps_ns.append(event.stamp_ns)
         return True
 
     def latest(self, stamp_ns: int) -> FloatArray | None:
         """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
-        place = bisect_right(self._stamps_ns, stamp_ns) - 1
-        if stamp_ns - self._joined.since_ns[place, 1] > self._timeout_ns:
+        place, joined = bisect_right(self._stamps_ns, stamp_ns) - 1, self._written()
+        if stamp_ns - joined.since_ns[place, 1] > self._timeout_ns:
             return None
-        return self._counting(self._joined.body_velocities[place])
+        return self._counting(joined.body_velocities[place])
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
@@ -120,7 +119,7 @@ class VelocityHistory:
         last = bisect_left(self._stamps_ns, end_ns)
         stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
         begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
-        joined, rows = self._joined, slice(first, last)
+        joined, rows = self._written(), slice(first, last)
         since = joined.since_ns[rows]
         stops = np.minimum(np.maximum(since[:, 1] + self._timeout_ns, begins), ends)
         return HeldVelocities(
@@ -145,9 +144,19 @@ class VelocityHistory:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
         first, count = bisect_right(self._stamps_ns, stamp_ns) - 1, len(self._stamps_ns)
         if first > count // 2:
-            kept = np.append(0, np.arange(first, count))
-            self._joined = self._joined.copied(kept, self._joined.capacity)
+            kept, joined = np.append(0, np.arange(first, count)), self._written()
+            self._joined = joined.copied(kept, joined.capacity)
             del self._stamps_ns[1:first]
+
+    def _written(self) -> _Joined:
+        """Return all velocities, those that have come since the last time among them."""
+        count = len(self._stamps_ns)
+        if count > self._joined.capacity:
+            self._joined = self._joined.copied(slice(None), 2 * count)
+        if self._unwritten:
+            self._joined.write(count - len(self._unwritten), self._unwritten)
+            self._unwritten = []
+        return self._joined
 
     def _counting(self, body_velocities: FloatArray) -> FloatArray:
         """Return what counts of velocities (…, 6), as a copy: for all of a step at once."""
@@ -202,16 +211,20 @@ class _Joined:
         return roomy
 
     def write(
-        self, row: int, velocity: VelocityEvent, angular: AngularVelocityEvent | None
+        self, first: int, events: list[tuple[VelocityEvent, AngularVelocityEvent | None]]
     ) -> None:
-        """Fill in a row with a velocity, with the other sensor's angular part if it has one."""
-        is_stated = velocity.covariance is not None
-        self.body_velocities[row] = velocity.body_velocity
-        self.covariances[row] = velocity.covariance if is_stated else 0.0
-        self.is_stated[row] = is_stated
-        self.since_ns[row] = velocity.stamp_ns
-        if angular is None:
-            return
+        """Fill in rows from ``first`` on, which are zero: velocities, and what goes with them."""
+        rows = slice(first, first + len(events))
+        self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
+        self.since_ns[rows] = [[velocity.stamp_ns] for velocity, _ in events]
+        for row, (velocity, angular) in enumerate(events, first):
+            if velocity.covariance is not None:
+                self.covariances[row], self.is_stated[row] = velocity.covariance, True
+            if angular is not None:
+                self._write_angular(row, angular)
+
+    def _write_angular(self, row: int, angular: AngularVelocityEvent) -> None:
+        """Put the other sensor's angular velocity in place of the velocity's own."""
         is_stated = angular.covariance is not None
         self.body_velocities[row, :3] = angular.angular_velocity
         self.covariances[row, :3] = self.covariances[row, :, :3] = 0.0

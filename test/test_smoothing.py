@@ -236,13 +236,13 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
         calibration = Calibration(settings, axes)
         count = d + calibration.count
         start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
-        history = History(axes, start, 'the start')
+        history = History(axes, NoiseModel(settings), start, 'the start')
         for a, b in pairwise((0, *cuts, k)):
             no_gaps, at_ends = np.zeros(b - a), np.zeros((2, 6))
             part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], no_gaps, covariances[a:b], at_ends)
             P = initial_covariance(axes, calibration)
             history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
-        nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+        nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None)
         history.see(nothing, path[-1])
         return history.frames()
 
@@ -282,7 +282,8 @@ def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkey
         estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
         estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))
     there = NoiseModel(settings).observation(ObservationEvent(0, np.arange(3), turned))
-    np.testing.assert_allclose(noted[-1].covariances, there, atol=0.1 * np.max(there))
+    taken = NoiseModel(settings).at(noted[-1].expected)
+    np.testing.assert_allclose(taken, there, atol=0.1 * np.max(there))
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -387,7 +388,7 @@ def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad
     calibration = Calibration(settings, SPATIAL)
     joint = JointCovariance(SPATIAL, calibration, 0.0)
     hindsight, observer = Hindsight(SPATIAL, settings, calibration, joint), Observer(np.eye(4))
-    nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None)
     looked_back_at = []
     for turn_rad in turns_rad:
         hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))

@@ -67,15 +67,18 @@ class Seen:
         (m,) which landmarks were seen.
     points : FloatArray
         (m, 3) where, metres, body frame.
-    covariances : FloatArray
-        (m, 3, 3) covariance of the points, body frame, m².
+    expected : FloatArray
+        (m, 3) where they should have been, as far as that is known; the noise model is told this.
+    covariances : FloatArray or None
+        (m, 3, 3) covariance of the points, body frame, m²; None where the noise model has it.
 
     """
 
     stamp_ns: int
     indices: IntArray
     points: FloatArray
-    covariances: FloatArray
+    expected: FloatArray
+    covariances: FloatArray | None
 
 
 class GainDesign(Protocol):

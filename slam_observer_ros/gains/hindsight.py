@@ -24,6 +24,7 @@ from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
@@ -65,7 +66,7 @@ class Hindsight:
     axes : Axes
         Which axes are estimated.
     settings : Settings
-        The settings ``hindsight_*``, and ``huber_threshold``.
+        The settings ``hindsight_*``, ``huber_threshold``, and the noise of observations.
     calibration, joint : Calibration, JointCovariance
         What the gains know, which looking back changes; at first there are no landmarks.
 
@@ -83,6 +84,7 @@ class Hindsight:
     ) -> None:
         self.settings = settings
         self._axes, self._calibration, self._joint = axes, calibration, joint
+        self._noise = NoiseModel(settings)
         self._warning = _Warning()
         self._seen = 0
         at_start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), joint.P.copy())
@@ -93,7 +95,7 @@ class Hindsight:
         self._start(self._known(observer), since)
 
     def _start(self, prior: Prior, since: str) -> None:
-        self.history = History(self._axes, prior, since)
+        self.history = History(self._axes, self._noise, prior, since)
         self._rest()
 
     def _rest(self) -> None:

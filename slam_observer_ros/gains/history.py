@@ -11,6 +11,7 @@ import numpy as np
 from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.prior import Prior
 from slam_observer_ros.smoothing import Frames, joined, no_frames
 from slam_observer_ros.types import FloatArray, IntArray
@@ -46,6 +47,8 @@ class History:
     ----------
     axes : Axes
         Which axes are estimated.
+    noise : NoiseModel
+        Noise of the observations.
     prior : Prior
         What was known before the first frame.
     since : str
@@ -66,8 +69,8 @@ class History:
 
     """
 
-    def __init__(self, axes: Axes, prior: Prior, since: str) -> None:
-        self._axes = axes
+    def __init__(self, axes: Axes, noise: NoiseModel, prior: Prior, since: str) -> None:
+        self._axes, self._observation_noise = axes, noise
         self.prior = self.summary = prior
         self.summarised = 0
         self.since = since
@@ -186,7 +189,6 @@ class History:
         starts = np.array([frame.start for frame in frames])
         to_body = se3.adjoint(back)[:, pose][:, :, pose]
         noises = np.array([frame.noise for frame in frames])
-        covariances = np.concatenate([part.covariances for part in seen])[:, :k, :k]
         numbers = np.arange(first, first + len(frames))
         return Frames(
             motions=se3.inverse(back @ starts),
@@ -196,8 +198,19 @@ class History:
             frames=np.repeat(numbers, [len(part.indices) for part in seen]),
             landmarks=np.concatenate([part.indices for part in seen]),
             points=np.concatenate([part.points for part in seen]),
-            information=np.asarray(np.linalg.inv(covariances)),
+            information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
         )
+
+    def _covariances(self, seen: list[Seen]) -> FloatArray:
+        """Return the covariances (M, 3, 3) of all points, body frame, m²."""
+        covariances = self._observation_noise.at(np.concatenate([part.expected for part in seen]))
+        stated = [part.covariances for part in seen if part.covariances is not None]
+        if stated:
+            is_stated = [part.covariances is not None for part in seen]
+            covariances[np.repeat(is_stated, [len(part.indices) for part in seen])] = (
+                np.concatenate(stated)
+            )
+        return covariances
 
     def _at_rest(self) -> tuple[FloatArray, FloatArray]:
         """Return the covariance and the sensitivity of no motion."""
