@@ -42,7 +42,8 @@ class Estimator:
     settings : Settings
         All settings.
     initial_pose : FloatArray, optional
-        (4, 4) pose at the first event, body to world; also the reference P°. Default identity.
+        (4, 4) pose at the first event, body to world; also the reference P°. Default: that of
+        the settings, or identity.
     on_update : callable, optional
         Called with an :class:`Update` after each observation that was used.
     on_motion : callable, optional
@@ -88,11 +89,12 @@ class Estimator:
         Parameters
         ----------
         pose : FloatArray, optional
-            (4, 4) body to world. By default identity, or unknown in a map that was loaded.
+            (4, 4) body to world. By default the one of the settings, if there is one; otherwise
+            identity, or unknown in a map that was loaded.
 
         """
         self._start_pose = pose
-        self._frame.start(pose)
+        self._frame.begin(pose)
         self._forget_time()
         self._last: Update | None = None
 
@@ -132,7 +134,8 @@ class Estimator:
             What is known. It takes the place of a map loaded before.
         pose : FloatArray, optional
             (4, 4) pose in the map's frame; what was mapped until now is forgotten. By default
-            the pose is unknown: it follows from landmarks of the map that are seen, three in
+            the pose is that of the settings if nothing has happened yet and they have one.
+            Otherwise it is unknown: it follows from landmarks of the map that are seen, three in
             space or two in a plane, and what was mapped until then is carried into the map's
             frame. See :attr:`is_localised`.
         pose_covariance : FloatArray, optional
@@ -142,6 +145,8 @@ class Estimator:
         self._frame.load(landmark_map)
         if pose is not None:
             self.set_pose(pose, pose_covariance)
+        elif not self._counts and self.settings.set_initial_pose:
+            self._frame.begin(None)
         elif self._slam.is_mapping:
             self._frame.enter()
         else:  # in a map that does not grow there is nothing to carry into another one

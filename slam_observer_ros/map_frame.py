@@ -7,7 +7,7 @@ import logging
 
 import numpy as np
 
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.hypotheses import Hypotheses
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.localisation import (
@@ -21,6 +21,9 @@ from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
+
+GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
+"""Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
 
 NEWS = 0.1
 """Share of the observations that is new when the same landmarks are compared with a map again:
@@ -56,6 +59,11 @@ class MapFrame:
         self.states = Hypotheses(Slam(settings, np.eye(4)), settings)
         self._counts: Counter[str] = Counter()
         self._begin_search()
+        is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
+        if is_given and not settings.set_initial_pose:
+            logger.warning(
+                'initial_position and initial_yaw have no effect (use set_initial_pose: true).'
+            )
 
     @property
     def slam(self) -> Slam:
@@ -83,6 +91,15 @@ class MapFrame:
         """Use other gains from now on."""
         self.settings = settings
         self.states.change_settings(settings)
+
+    def begin(self, pose: FloatArray | None) -> None:
+        """Start a run at ``pose`` (4, 4), exactly; by default where the settings have it start."""
+        settings, covariance = self.settings, None
+        if pose is None and settings.set_initial_pose:
+            turn = so3.exp(np.array([0.0, 0.0, settings.initial_yaw]))
+            pose = se3.pose(turn, np.array(settings.initial_position))
+            covariance = np.diag(GIVEN_POSE_STD**2)
+        self.start(pose, covariance)
 
     def start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
         """Start again with an empty map, or with the one that was loaded.

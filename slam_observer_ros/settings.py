@@ -260,6 +260,17 @@ class Settings:
         'are refined within their covariance, with no new ones added; fixed, exact',
         choices=('off', 'uncertain', 'fixed'),
     )
+    set_initial_pose: bool = parameter(
+        False,
+        'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded '
+        'map within 0.5 m and 0.26 rad, instead of looking for its place there',
+    )
+    initial_position: Vector3 = parameter(
+        (0.0, 0.0, 0.0), 'Where the robot starts, x y z, with set_initial_pose', unit='m'
+    )
+    initial_yaw: float = parameter(
+        0.0, 'How the robot is turned at the start, with set_initial_pose', unit='rad'
+    )
     map_noise: float = parameter(
         0.05,
         'Standard deviation of each coordinate of loaded landmarks whose file tells none',

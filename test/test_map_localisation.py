@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import logging
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.stats import chi2
 from slam_observer_ros import map_frame
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.landmark_map import LandmarkMap
@@ -501,3 +502,75 @@ def test_a_map_can_be_saved_where_some_landmarks_are_exact_and_others_hardly_kno
         estimator.add(ObservationEvent((step + 1) * 3 * 10**9, seen, points[seen], covariances))
         variances = np.linalg.eigvalsh(estimator.landmark_map.covariances)
         assert (variances >= -1e-9 * variances.max()).all()
+
+
+class TestInitialPoseOfTheSettings:
+    """``set_initial_pose``: where the robot's dock is, roughly."""
+
+    @staticmethod
+    def docked(world, offset_m=0.3, **changes):
+        x, y, _ = world.start[:3, 3]
+        yaw = float(np.arctan2(world.start[1, 0], world.start[0, 0]))
+        return world.settings(
+            set_initial_pose=True,
+            initial_position=(x + offset_m, y - offset_m, 0.0),
+            initial_yaw=yaw + 0.1,
+            **changes,
+        )
+
+    @pytest.mark.parametrize('mode', MODES)
+    def test_landmarks_without_ids_will_do_then(self, mode):
+        world = World(3, is_planar=True)
+        estimator = Estimator(self.docked(world, localization_mode=mode))
+        estimator.load_map(world.map())
+        assert estimator.is_localised
+        std = np.sqrt(np.diag(estimator.pose_covariance))
+        assert_allclose(std, [0.0, 0.0, 0.26, 0.5, 0.5, 0.0], atol=1e-9)
+        for event in world.drive(0.0, 5.0):
+            is_seen = isinstance(event, ObservationEvent)
+            estimator.add(replace(event, ids=np.full(6, UNKNOWN_ID)) if is_seen else event)
+        assert world.nees(estimator, 4.9) < chi2.ppf(0.9973, 3)
+        assert np.linalg.norm(world.error(estimator, 4.9)[3:]) < 0.1
+
+    def test_without_a_map_it_is_exact(self):
+        world = World(3, is_planar=True)
+        settings = self.docked(world)
+        estimator = add(Estimator(settings), [world.see(0.0, range(6))])
+        assert_array_equal(estimator.pose[:3, 3], settings.initial_position)
+        assert_array_equal(estimator.pose_covariance, 0.0)
+
+    def test_each_run_starts_there(self):
+        world = World(3, is_planar=True)
+        estimator = Estimator(self.docked(world, offset_m=0.0))
+        estimator.load_map(world.map())
+        start = estimator.pose
+        add(estimator, world.drive(0.0, 3.0))
+        assert not np.allclose(estimator.pose, start, atol=0.5)
+        estimator.restart_time()  # as a recording that is looped
+        assert_array_equal(estimator.pose, start)
+        assert estimator.is_localised
+
+    def test_who_is_lost_looks_elsewhere_too(self):
+        world = World(14)
+        estimator = Estimator(self.docked(world, localization_mode='fixed'))
+        estimator.load_map(world.map())
+        offset = se3.exp(np.array([0.0, 0.0, 1.5, 3.0, -4.0, 0.0]))
+        add(estimator, world.drive(0.0, 2.0) + world.drive(2.0, 6.0, offset=offset))
+        assert estimator.counts['lost'] == 1
+        error = se3.log(estimator.pose @ se3.inverse(offset @ world.pose(5.9)))
+        assert np.linalg.norm(error) < 0.1
+
+    @pytest.mark.parametrize('mode', MODES)
+    def test_in_a_map_loaded_on_the_way_the_place_is_searched(self, mode):
+        world = World(3, is_planar=True)
+        estimator = Estimator(self.docked(world, offset_m=5.0, localization_mode=mode))
+        add(estimator, world.drive(0.0, 3.0))
+        estimator.load_map(world.map())
+        add(estimator, world.drive(3.0, 4.0))
+        assert estimator.is_localised
+        assert np.linalg.norm(world.error(estimator, 3.9)[3:]) < 0.1
+
+    def test_one_that_is_not_asked_for_is_told_to_have_no_effect(self, caplog):
+        estimator = Estimator(Settings(initial_yaw=0.5))
+        assert_array_equal(estimator.pose, np.eye(4))
+        assert 'use set_initial_pose: true' in caplog.text

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from command_line import CommandLine
 import numpy as np
+from numpy.testing import assert_allclose
 import pytest
 from tum_files import read_tum
 
-from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, PoseTruth, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.map_file import read_map, write_map
@@ -26,7 +27,13 @@ def slam_observer(capsys):
 
 
 def record(
-    path, start, seed, first_id=lambda s: 0, stamp_ns=lambda s: s * 10**8, scale=lambda s: 1.0
+    path,
+    start,
+    seed,
+    first_id=lambda s: 0,
+    stamp_ns=lambda s: s * 10**8,
+    scale=lambda s: 1.0,
+    has_ids=True,
 ):
     """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
 
@@ -43,9 +50,8 @@ def record(
             seen, points = np.flatnonzero(near), scale(step) * LANDMARKS
             points = se3.transform(se3.inverse(pose), points)
             points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
-            writer.write_observation(
-                ObservationEvent(stamp_ns(step), first_id(step) + seen, points)
-            )
+            ids = first_id(step) + seen if has_ids else np.full(len(seen), UNKNOWN_ID)
+            writer.write_observation(ObservationEvent(stamp_ns(step), ids, points))
     return path
 
 
@@ -107,7 +113,7 @@ def test_covariances_of_a_smoothed_map_are_those_in_hindsight(slam_observer, tmp
     slam_observer.succeed('replay', path, '--map', looked_back, *SETTINGS, *at_the_end)
     online, exact = read_map(smoothed), read_map(looked_back)
     np.testing.assert_array_equal(online.ids, exact.ids)
-    np.testing.assert_allclose(
+    assert_allclose(
         np.trace(online.covariances, axis1=1, axis2=2),
         np.trace(exact.covariances, axis1=1, axis2=2),
         rtol=0.15,
@@ -146,6 +152,23 @@ class TestPlaceNotKnown:
         assert saved.read_bytes() == before
         assert not poses.exists()
         assert not figures.exists()
+
+    def test_a_start_that_is_told_takes_no_ids(self, slam_observer, tmp_path, saved):
+        start = se3.exp(np.array([0.0, 0.0, 1.0, 1.0, -2.0, 0.0]))
+        path = record(tmp_path / 'run.mcap', start, seed=2, has_ids=False)
+        poses = tmp_path / 'poses.tum'
+        arguments = (
+            'replay', path, '--load-map', saved, '--json', '--tum', poses, *SETTINGS,
+            '--set', 'localization_mode=fixed',
+        )  # fmt: skip
+        assert '--set set_initial_pose=true' in slam_observer.fail(*arguments)
+        x, y, z = (start[:3, 3] + [0.2, -0.1, 0.0]).tolist()
+        told = ('--set', f'initial_position=[{x},{y},{z}]', '--set', 'initial_yaw=0.9')
+        report = slam_observer(*arguments, '--set', 'set_initial_pose=true', *told).json
+        assert report['localised_after_s'] == 0.0
+        estimate = read_tum(poses)
+        true = start @ se3.exp(BODY_VELOCITY * (estimate.stamps_ns * 1e-9)[:, None])
+        assert_allclose(estimate.poses[1:], true[1:], atol=0.1)
 
     def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
         late = record(tmp_path / 'late.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s < 40))

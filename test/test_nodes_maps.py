@@ -209,6 +209,20 @@ def test_the_initial_pose_places_the_robot_in_the_map(ros, robot, tmp_path):
         assert nees(estimate, covariance, pose) < chi2.ppf(0.9973, 6)
 
 
+def test_a_robot_that_starts_at_its_dock_is_placed_at_once(ros, robot, tmp_path):
+    surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml')
+    pose = se3.exp(np.array([0.0, 0.0, 0.5, -1.0, 2.0, 0.0]))
+    x, y, z = (pose[:3, 3] + [0.1, -0.2, 0.0]).tolist()
+    dock = {'initial_position': f'[{x}, {y}, {z}]', 'initial_yaw': 0.4, 'set_initial_pose': True}
+    with running(
+        'observer_node', tmp_path / 'log', map_file=surveyed, **dock, **PARAMETERS
+    ) as node:
+        node.wait_for_output(rf'loaded 50 landmarks .*; the robot starts at \({x:.2f}, {y:.2f}')
+        robot.connect()
+        estimate, covariance = robot.see_until_published(pose, [3])
+        assert nees(estimate, covariance, pose) < chi2.ppf(0.9973, 6)
+
+
 def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
     broken = tmp_path / 'broken.yaml'

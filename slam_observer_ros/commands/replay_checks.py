@@ -99,5 +99,7 @@ def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
     return (
         f'the place in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
-        f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(known.ids)} were seen'
+        f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(known.ids)} were '
+        'seen. Where the start is known: --set set_initial_pose=true '
+        '--set initial_position=[X,Y,Z] --set initial_yaw=YAW'
     )

@@ -10,17 +10,12 @@ from rclpy.node import Node
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.map_frame import GIVEN_POSE_STD
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
 from slam_observer_ros.recording.messages import decode_pose_with_covariance_stamped, PoseMessage
 from slam_observer_ros.types import FloatArray
 
 TOPICS = ('initialpose', '~/set_pose')
-
-ASSUMED_STD = np.array([0.26, 0.26, 0.26, 0.5, 0.5, 0.5])
-"""Standard deviation of what the message leaves open, rad and m; the same as RViz's.
-
-RViz's 2D Pose Estimate, for one, gives the variances of x, y and yaw only, and zeros else.
-"""
 
 
 class InitialPose:
@@ -77,7 +72,10 @@ class InitialPose:
 
 
 def filled_in(covariance: FloatArray | None) -> FloatArray:
-    """Return a covariance (6, 6) with variances assumed where the message gives none."""
+    """Return a covariance (6, 6) with variances assumed where the message gives none.
+
+    RViz's 2D Pose Estimate, for one, gives those of x, y and yaw only, and zeros else.
+    """
     given = np.zeros((6, 6)) if covariance is None else covariance
-    assumed: FloatArray = np.where(np.diagonal(given) == 0.0, ASSUMED_STD**2, 0.0)
+    assumed: FloatArray = np.where(np.diagonal(given) == 0.0, GIVEN_POSE_STD**2, 0.0)
     return given + np.diag(assumed)

@@ -117,11 +117,17 @@ class Maps:
         self._estimator.release()  # what has come before belongs to the old frame
         self._estimator.load_map(landmark_map)
         self._on_load()
-        place = 'the robot has found its place in it'
-        if not self._estimator.is_localised:
-            count = 'two' if self._estimator.settings.two_d_mode else 'three'
-            place = f'the pose is unknown until {count} of them are seen or it is given'
-        return f'loaded {len(landmark_map.ids)} landmarks from {path}; {place}'
+        return f'loaded {len(landmark_map.ids)} landmarks from {path}; {self._place()}'
+
+    def _place(self) -> str:
+        estimator = self._estimator
+        if not estimator.is_localised:
+            count = 'two' if estimator.settings.two_d_mode else 'three'
+            return f'the pose is unknown until {count} of them are seen or it is given'
+        if estimator.stamp_ns is None:
+            x, y, z = estimator.pose[:3, 3].tolist()
+            return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
+        return 'the robot has found its place in it'
 
 
 def _absolute(path: str) -> Path:
