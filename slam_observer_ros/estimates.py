@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from slam_observer_ros.types import FloatArray, IntArray
 
-UNUSED_POINTS = ('rejected_landmark', 'unknown_id', 'unmapped_landmark')
+UNUSED_POINTS = ('rejected_landmark', 'unknown_id', 'repeated_id', 'unmapped_landmark')
 """Names under which points are counted that were observed and are not used."""
 
 

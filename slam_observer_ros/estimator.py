@@ -8,6 +8,7 @@ import logging
 
 import numpy as np
 
+from slam_observer_ros.counted_warnings import CountedWarnings
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
 from slam_observer_ros.event_queue import EventQueue
@@ -58,8 +59,8 @@ class Estimator:
         (``'observed_point'``), observations made before the place in a loaded map was found
         (``'not_localised'``), how often it was lost again (``'lost'``), and what became of
         landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``, which are not
-        used).
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'`` and
+        ``'repeated_id'``, which are not used).
     dropped : Counter
         Events refused, by reason.
     jumps : int
@@ -78,7 +79,7 @@ class Estimator:
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
-        self._times_moved = 0
+        self._warnings = CountedWarnings(logger)
         self._on_update, self._on_motion = on_update, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
@@ -343,13 +344,7 @@ class Estimator:
 
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
-        if _is_power_of_ten(self.dropped[error.reason]):
-            logger.warning(
-                'Dropped an event (%s, %d so far): %s',
-                error.reason,
-                self.dropped[error.reason],
-                error,
-            )
+        self._warnings.warn(error.reason, f'Dropped an event, {error.reason}: {error}')
 
     def _process(self, event: Event) -> None:
         if isinstance(event, ObservationEvent):
@@ -366,13 +361,17 @@ class Estimator:
             return
         self._counts['velocity'] += is_used
         if is_late:
-            self._tell_of_late()
+            self._counts['late_velocity'] += 1
+            text = 'A velocity came later than reorder_window allows and counts only from then on'
+            self._warnings.warn('late_velocity', text)
         if self._timeline.is_full:
             self._catch_up()
 
     def _process_observation(self, event: ObservationEvent) -> None:
         if self.settings.two_d_mode:
             event = flatten(event)
+        self._counts['observed_point'] += len(event.ids)
+        event = self._without_repeated(event)
         timeline = self._timeline
         timeline.begin(event.stamp_ns)
         if event.stamp_ns < (timeline.state_ns or 0):
@@ -380,9 +379,9 @@ class Estimator:
             self._counts['late_observation'] += 1
         timeline.advance(self._frame.states, event.stamp_ns)
         ids, residuals = self._frame.states.observe(event)
-        self._tell_of_moved(self._slam.moved_ids)
+        if len(moved_ids := self._slam.moved_ids):
+            self._warnings.warn('moved_landmark', f'Landmarks {moved_ids.tolist()} have moved')
         self._counts['observation'] += 1
-        self._counts['observed_point'] += len(event.ids)
         self._frame.find_place()
         level = lyapunov(self.settings.gain_k, residuals)
         observer = self._slam.observer
@@ -391,21 +390,16 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self._last)
 
-    def _tell_of_late(self) -> None:
-        self._counts['late_velocity'] += 1
-        if _is_power_of_ten(self._counts['late_velocity']):
-            logger.warning(
-                'A velocity came later than reorder_window allows and counts only from then on '
-                '(%d so far).',
-                self._counts['late_velocity'],
-            )
-
-    def _tell_of_moved(self, ids: IntArray) -> None:
-        if not len(ids):
-            return
-        self._times_moved += 1
-        if _is_power_of_ten(self._times_moved):
-            logger.warning('Landmarks %s have moved (%d so far).', ids.tolist(), self._times_moved)
+    def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:
+        """Leave out points with one id: nobody knows which of them is right."""
+        repeated = event.repeated_ids()
+        if not repeated:
+            return event
+        left = event.select(~np.isin(event.ids, repeated))
+        self._counts['repeated_id'] += len(event.ids) - len(left.ids)
+        text = f'Not used, as more than one point of an observation has them: ids {repeated}'
+        self._warnings.warn('repeated_id', text)
+        return left
 
     def _catch_up(self) -> None:
         """Move the states on to the last event that was used."""
@@ -421,7 +415,3 @@ class Estimator:
             late_limit_ns=round(settings.late_limit * 1e9),
         )
         self._timeline = Timeline(settings, self._on_motion)
-
-
-def _is_power_of_ten(count: int) -> bool:
-    return str(count).rstrip('0') == '1'

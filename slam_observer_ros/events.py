@@ -5,6 +5,7 @@ Their arrays are not copied: who has added an event must not change them any mor
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -88,6 +89,13 @@ class ObservationEvent:
     points: FloatArray
     covariances: FloatArray | None = None
     velocities: FloatArray | None = None
+
+    def repeated_ids(self) -> list[int]:
+        """Return the ids that more than one of the points has."""
+        ids = [landmark_id for landmark_id in self.ids.tolist() if landmark_id != UNKNOWN_ID]
+        if len(set(ids)) == len(ids):  # as nearly always
+            return []
+        return [landmark_id for landmark_id, count in Counter(ids).items() if count > 1]
 
     def select(self, mask: BoolArray) -> ObservationEvent:
         """Return the part of it that ``mask`` (m,) picks."""

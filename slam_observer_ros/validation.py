@@ -28,7 +28,7 @@ def check_event(event: Event) -> None:
     ------
     InvalidEventError
         With the reason ``'negative_stamp'``, ``'wrong_shape'``, ``'not_finite'``,
-        ``'too_large'``, ``'repeated_id'``, ``'negative_id'`` or ``'bad_covariance'``.
+        ``'too_large'``, ``'negative_id'`` or ``'bad_covariance'``.
 
     """
     if event.stamp_ns < 0:
@@ -53,14 +53,9 @@ def _check_observation(event: ObservationEvent) -> None:
     _check_coordinates('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'{len(event.ids)} ids for {m} landmark points')
-    known = [landmark_id for landmark_id in event.ids.tolist() if landmark_id != UNKNOWN_ID]
-    if known and min(known) < 0:
-        raise InvalidEventError('negative_id', f'landmark id {min(known)} is negative')
-    if len(set(known)) != len(known):
-        repeated = next(landmark_id for landmark_id in known if known.count(landmark_id) > 1)
-        raise InvalidEventError(
-            'repeated_id', f'landmark id {repeated} is more than once in one observation'
-        )
+    negative = [i for i in event.ids.tolist() if i < 0 and i != UNKNOWN_ID]
+    if negative:
+        raise InvalidEventError('negative_id', f'landmark id {negative[0]} is negative')
     if event.covariances is not None:
         _check_array('landmark covariances', event.covariances, (m, 3, 3))
         _check_definite('landmark covariances', event.covariances)

@@ -520,7 +520,8 @@ class TestTroubledRecordings:
                 )
         ended = slam_observer('replay', path, '--json')
         assert ended.code == 0
-        assert ended.json['dropped'] == {'not_finite': 1, 'repeated_id': 1, 'malformed': 1}
+        assert ended.json['dropped'] == {'not_finite': 1, 'malformed': 1}
+        assert ended.json['used']['repeated_id'] == 2
         assert ended.json['events'] == 5
         assert ended.errors.count('slam-observer: warning: ') == 3
 

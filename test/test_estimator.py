@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
@@ -272,7 +273,6 @@ def bad_events():
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points[:, :2])),
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids[:1], points)),
         ('not_finite', ObservationEvent(stamp_ns, good.ids, points * np.inf)),
-        ('repeated_id', ObservationEvent(stamp_ns, np.array([7, 7]), points)),
         ('negative_id', ObservationEvent(stamp_ns, np.array([7, -2]), points)),
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points, np.ones((2, 3)))),
         ('not_finite', ObservationEvent(stamp_ns, good.ids, points, np.full((2, 3, 3), np.nan))),
@@ -295,9 +295,21 @@ def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason,
     assert_same_state(estimator, untouched)
 
 
-def test_an_id_that_is_repeated_is_named(caplog):
-    Estimator(Settings()).add(observation(0.0, [4, 1, 2, 1]))
-    assert 'repeated_id, 1 so far): landmark id 1 is more than once' in caplog.text
+@pytest.mark.parametrize('repeated', [[1, 1], [1, 1, 1], [1, 3, 3, 1]])
+def test_points_with_one_id_are_left_out_counted_and_named(caplog, repeated):
+    estimator, without = Estimator(Settings()), Estimator(Settings())
+    for step in range(5):
+        assert estimator.add(observation(0.1 * step, [4, *repeated, 2]))
+        without.add(observation(0.1 * step, [4, 2]))
+    estimator.flush()
+    without.flush()
+    assert_same_state(estimator, without)
+    assert estimator.counts['repeated_id'] == 5 * len(repeated)
+    assert used_points(estimator.counts) == 10
+    assert f'more than one point of an observation has them: ids {sorted(set(repeated))}' in (
+        caplog.text
+    )
+    assert len(caplog.records) == 1
 
 
 def test_one_stray_stamp_is_refused_but_a_clock_that_jumped_is_followed():

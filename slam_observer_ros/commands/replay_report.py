@@ -21,7 +21,9 @@ from slam_observer_ros.replay import Replay
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
 
-POINT_FATES = dict(zip(UNUSED_POINTS, ('rejected', 'without id', 'not mapped'), strict=True))
+POINT_FATES = dict(
+    zip(UNUSED_POINTS, ('rejected', 'without id', 'of a repeated id', 'not mapped'), strict=True)
+)
 """What befalls points that were observed and are not used, and how it is told."""
 
 LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
