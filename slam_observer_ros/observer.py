@@ -98,6 +98,12 @@ class Observer:
         points: FloatArray = arms @ self.A[:3, :3]
         return points
 
+    def turned(self, covariances: FloatArray) -> FloatArray:
+        """Return covariances (m, 3, 3) from the body frame in the reference frame."""
+        R = self.A[:3, :3]
+        turned: FloatArray = R @ covariances @ R.T
+        return turned
+
     def add_landmarks(self, points: FloatArray) -> None:
         """Append landmarks seen for the first time, so that their residual is zero.
 

@@ -19,7 +19,8 @@ from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.joint_compatibility import joint_cost, RESOLUTION, unpaired_cost
-from slam_observer_ros.slam import Sighting, Slam
+from slam_observer_ros.sighting import Sighting
+from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import IntArray
 
 
@@ -118,7 +119,7 @@ def _named(
         gains,
         slam.index,
         se3.transform(slam.observer.A, judged.points),
-        slam.turned(slam.noise.observation(judged)),
+        slam.observer.turned(slam.noise.observation(judged)),
         slam.landmarks.indices_of(judged.ids),
         slam.settings,
         budget - new_cost,

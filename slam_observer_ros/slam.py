@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.field_of_view import FieldOfView
 from slam_observer_ros.gains import make_gains
-from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.base import Innovation
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
@@ -23,34 +22,12 @@ from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.odometry import motion
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.sighting import Outlook, Sighting
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.velocity_history import VelocityHistory
 
 SAME_PLACE = 4.0
 """Rejections within this many standard deviations of each other are at one place."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sighting:
-    """What an observation tells a state.
-
-    Attributes
-    ----------
-    event : ObservationEvent
-        The observation without points that have no id, or are of no landmark that is mapped.
-    rows : IntArray
-        (m,) row of the landmark that each of them is, −1 where it is new.
-    covariances : FloatArray
-        (m, 3, 3) their covariances, body frame, m².
-    innovation : Innovation
-        Of those that are not new.
-
-    """
-
-    event: ObservationEvent
-    rows: IntArray
-    covariances: FloatArray
-    innovation: Innovation
 
 
 class Slam:
@@ -98,6 +75,7 @@ class Slam:
         self.moved_ids = np.empty(0, dtype=np.int64)
         self.rejected_in_a_row = 0
         self.noise = NoiseModel(settings)
+        self._outlook = Outlook(self.observer, self.landmarks, self.noise, settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
@@ -205,11 +183,8 @@ class Slam:
         rows = self.landmarks.indices_of(event.ids)
         if not self.is_mapping:
             event, rows = event.select(rows >= 0), rows[rows >= 0]
-        known = rows >= 0
-        self.gains.recall(self.observer, rows[known])
-        covariances = self._covariances(event, rows)
-        innovation = self._innovation(event.select(known), rows[known], covariances[known])
-        return Sighting(event, rows, covariances, innovation)
+        self.gains.recall(self.observer, rows[rows >= 0])
+        return self._outlook.sighting(event, rows)
 
     def observe(
         self, event: ObservationEvent, sighting: Sighting | None = None
@@ -310,12 +285,6 @@ class Slam:
                 self.counts['unsupported_landmark'] += len(forgotten)
         self.field_of_view.include(event.points)
 
-    def turned(self, covariances: FloatArray) -> FloatArray:
-        """Return covariances (m, 3, 3) from the body frame in the reference frame."""
-        R = self.observer.A[:3, :3]
-        turned: FloatArray = R @ covariances @ R.T
-        return turned
-
     def _turn_to_world(self, A: FloatArray) -> FloatArray:
         """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
         R = self.observer.reference_pose[:3, :3]
@@ -342,45 +311,6 @@ class Slam:
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return np.asarray(~rejected)
 
-    def _innovation(
-        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
-    ) -> Innovation:
-        """Return what the landmarks ``rows`` (m,), seen with ``covariances`` (m, 3, 3), tell."""
-        e, r = self.observer.errors(rows, event.points)
-        unseen_ns = event.stamp_ns - self.landmarks.last_seen_ns[rows]
-        return Innovation(
-            rows,
-            e,
-            r,
-            self.observer.a[rows],
-            self.turned(covariances),
-            unseen_ns.astype(np.float64) * 1e-9,
-        )
-
-    def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
-        """Return the covariances (m, 3, 3) of observed points, body frame, m².
-
-        The noise model is told where a landmark should be, not where it was measured: a landmark
-        measured too near would be believed more than one measured too far, and all would be
-        drawn towards the robot.
-        """
-        if event.covariances is not None:
-            return self.noise.observation(event)
-        return self.noise.at(self._expected(event, rows))
-
-    def _expected(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
-        """Return where points should be (m, 3), metres, body frame: where measured, if unknown.
-
-        As it is of a landmark that is new (row −1), that is in doubt, or that was seen so seldom
-        that it may itself be an outlier.
-        """
-        if not len(self.landmarks):
-            return event.points
-        is_confirmed = self.landmarks.counts[rows] >= self.settings.confirmations
-        in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections)
-        is_sure = (rows >= 0) & is_confirmed & ~in_doubt
-        return np.where(is_sure[:, None], self.observer.body_points(rows), event.points)
-
     def _look_back(self, event: ObservationEvent, rows: IntArray) -> None:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
 
@@ -390,16 +320,13 @@ class Slam:
         some_are = bool(in_doubt.any())
         if not (some_are or self.gains.looks_back):
             return
-        stated = None if event.covariances is None else self.noise.observation(event)
-        expected = self._expected(event, rows)
-        seen = Seen(event.stamp_ns, rows, event.points, expected, stated)
-        self.gains.look_back(self.observer, seen, some_are)
+        self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
         if some_are:
             self._relocate(event.select(in_doubt), rows[in_doubt])
 
     def _relocate(self, event: ObservationEvent, rows: IntArray) -> None:
         """Start landmarks in doubt anew that are still far from where they were expected."""
-        innovation = self._innovation(event, rows, self.noise.observation(event))
+        innovation = self._outlook.innovation(event, rows, self.noise.observation(event))
         far = self.gains.distances(innovation) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():
@@ -439,5 +366,5 @@ class Slam:
             return
         event = event.select(np.arange(new) < m)
         self.observer.add_landmarks(event.points)
-        self.gains.add_landmarks(self.observer.y_ref[-m:], self.turned(covariances[:m]))
+        self.gains.add_landmarks(self.observer.y_ref[-m:], self.observer.turned(covariances[:m]))
         self.landmarks.add(event.ids, event.stamp_ns)

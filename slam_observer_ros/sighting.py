@@ -1,0 +1,114 @@
+"""What an observation tells a state: residuals of known landmarks, and how far to believe them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.landmark_table import LandmarkTable
+from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.observer import Observer
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What an observation tells a state.
+
+    Attributes
+    ----------
+    event : ObservationEvent
+        The observation without points that have no id, or are of no landmark that is mapped.
+    rows : IntArray
+        (m,) row of the landmark that each of them is, −1 where it is new.
+    covariances : FloatArray
+        (m, 3, 3) their covariances, body frame, m².
+    innovation : Innovation
+        Of those that are not new.
+
+    """
+
+    event: ObservationEvent
+    rows: IntArray
+    covariances: FloatArray
+    innovation: Innovation
+
+
+class Outlook:
+    """Where a state expects its landmarks, and what comes of comparing that with what is seen.
+
+    Rows are those of the landmarks, −1 where one is new.
+
+    Parameters
+    ----------
+    observer, landmarks : Observer, LandmarkTable
+        The state.
+    noise : NoiseModel
+        Noise of observations.
+    settings : Settings
+        ``confirmations`` and ``max_rejections``.
+
+    """
+
+    def __init__(
+        self, observer: Observer, landmarks: LandmarkTable, noise: NoiseModel, settings: Settings
+    ) -> None:
+        self._observer, self._landmarks, self._noise = observer, landmarks, noise
+        self._settings = settings
+
+    def sighting(self, event: ObservationEvent, rows: IntArray) -> Sighting:
+        """Return what the points of ``event``, which are landmarks ``rows`` (m,), tell."""
+        known = rows >= 0
+        covariances = self._covariances(event, rows)
+        innovation = self.innovation(event.select(known), rows[known], covariances[known])
+        return Sighting(event, rows, covariances, innovation)
+
+    def innovation(
+        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
+    ) -> Innovation:
+        """Return what landmarks ``rows`` (m,) tell that were seen with ``covariances``, m²."""
+        observer = self._observer
+        e, r = observer.errors(rows, event.points)
+        unseen_ns = event.stamp_ns - self._landmarks.last_seen_ns[rows]
+        return Innovation(
+            rows,
+            e,
+            r,
+            observer.a[rows],
+            observer.turned(covariances),
+            unseen_ns.astype(np.float64) * 1e-9,
+        )
+
+    def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:
+        """Return what there is to look back at later."""
+        stated = None if event.covariances is None else self._noise.observation(event)
+        return Seen(event.stamp_ns, rows, event.points, self._expected(event, rows), stated)
+
+    def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+        """Return the covariances (m, 3, 3) of observed points, body frame, m².
+
+        The noise model is told where a landmark should be, not where it was measured: a landmark
+        measured too near would be believed more than one measured too far, and all would be
+        drawn towards the robot.
+        """
+        if event.covariances is not None:
+            return self._noise.observation(event)
+        return self._noise.at(self._expected(event, rows))
+
+    def _expected(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+        """Return where points should be (m, 3), metres, body frame: where measured, if unknown.
+
+        As it is of a landmark that is new, that is in doubt, or that was seen so seldom that it
+        may itself be an outlier.
+        """
+        landmarks = self._landmarks
+        if not len(landmarks):
+            return event.points
+        is_confirmed = landmarks.counts[rows] >= self._settings.confirmations
+        in_doubt = landmarks.in_doubt(rows, self._settings.max_rejections)
+        is_sure = (rows >= 0) & is_confirmed & ~in_doubt
+        return np.where(is_sure[:, None], self._observer.body_points(rows), event.points)
