@@ -81,6 +81,9 @@ class ObservationEvent:
     velocities : FloatArray or None
         (m, 3) velocity of each landmark itself, expressed in the base frame, m/s (the paper's
         v_i (19)); None for static landmarks.
+    sensor : FloatArray or None
+        (m, 3) where each was measured from, in the base frame, metres: noise grows with the
+        distance from there. None for the base itself.
 
     """
 
@@ -89,6 +92,12 @@ class ObservationEvent:
     points: FloatArray
     covariances: FloatArray | None = None
     velocities: FloatArray | None = None
+    sensor: FloatArray | None = None
+
+    @property
+    def sights(self) -> FloatArray:
+        """(m, 3) from the sensor to the points, metres, axes of the base frame."""
+        return self.points if self.sensor is None else self.points - self.sensor
 
     def repeated_ids(self) -> list[int]:
         """Return the ids that more than one of the points has."""
@@ -107,6 +116,7 @@ class ObservationEvent:
             points=self.points[mask],
             covariances=None if self.covariances is None else self.covariances[mask],
             velocities=None if self.velocities is None else self.velocities[mask],
+            sensor=None if self.sensor is None else self.sensor[mask],
         )
 
 
@@ -155,9 +165,11 @@ def is_automatic(ids: IntArray) -> BoolArray:
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:
-    """Return the observation without what leaves the plane z = 0."""
+    """Return the observation without what leaves the plane z = 0; the sights stay as they are."""
+    points = event.points * _PLANAR_POINT
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
-    return replace(event, points=event.points * _PLANAR_POINT, velocities=velocities)
+    sensor = points - event.sights if event.points[:, 2].any() else event.sensor
+    return replace(event, points=points, velocities=velocities, sensor=sensor)
 
 
 def flatten_velocities(body_velocities: FloatArray) -> FloatArray:

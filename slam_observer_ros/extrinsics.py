@@ -30,11 +30,13 @@ def move_observation(event: ObservationEvent, pose: FloatArray) -> ObservationEv
 
     """
     R = pose[:3, :3]
+    sensor = np.zeros_like(event.points) if event.sensor is None else event.sensor
     return replace(
         event,
         points=se3.transform(pose, event.points),
         covariances=None if event.covariances is None else R @ event.covariances @ R.T,
         velocities=None if event.velocities is None else se3.rotate(pose, event.velocities),
+        sensor=se3.transform(pose, sensor),
     )
 
 

@@ -82,19 +82,22 @@ class NoiseModel:
         some direction is known exactly.
         """
         if event.covariances is None:
-            return self.at(event.points)
+            return self.at(event.sights)
         # Else far points that are said to be exact are lost beside an uncertain heading.
         squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
         least = RELATIVE_RESOLUTION**2 * squared_m2
         return _invertible(event.covariances + least[:, None, None] * _IDENTITY)
 
-    def at(self, points: FloatArray) -> FloatArray:
-        """Return what the settings say of points (m, 3) that a message has no covariances for."""
+    def at(self, sights: FloatArray) -> FloatArray:
+        """Return what the settings say of points that a message has no covariances for.
+
+        ``sights`` (m, 3) lead to them from the sensor, metres, body frame.
+        """
         s = self._settings
         if s.observation_model == 'cartesian':
-            each = np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(points), 3, 3))
+            each = np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(sights), 3, 3))
             return _invertible(each)
-        range_squared = np.einsum('ij,ij->i', points, points)
+        range_squared = np.einsum('ij,ij->i', sights, sights)
         if s.observation_model == 'stereo':
             parallax = s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
             along = (range_squared * parallax) ** 2
@@ -102,7 +105,7 @@ class NoiseModel:
         else:
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2
-        return _invertible(_along_and_across(points, range_squared, along, across))
+        return _invertible(_along_and_across(sights, range_squared, along, across))
 
 
 def _invertible(covariances: FloatArray) -> FloatArray:
@@ -122,7 +125,7 @@ def _limited(covariances: FloatArray) -> FloatArray:
 
 
 def _along_and_across(
-    points: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
+    sights: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
 ) -> FloatArray:
     """Return covariances (m, 3, 3) with given variances along and across the line of sight.
 
@@ -130,6 +133,6 @@ def _along_and_across(
     """
     across = np.where(range_squared > 0.0, across, along)
     excess = (along - across) / np.maximum(range_squared, _TINY)
-    outer = points[:, :, None] * points[:, None, :]
+    outer = sights[:, :, None] * sights[:, None, :]
     spread: FloatArray = excess[:, None, None] * outer
     return spread + across[:, None, None] * _IDENTITY

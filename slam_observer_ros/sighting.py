@@ -86,7 +86,7 @@ class Outlook:
     def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:
         """Return what there is to look back at later."""
         stated = None if event.covariances is None else self._noise.observation(event)
-        return Seen(event.stamp_ns, rows, event.points, self._expected(event, rows), stated)
+        return Seen(event.stamp_ns, rows, event.points, self._sights(event, rows), stated)
 
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return the covariances (m, 3, 3) of observed points, body frame, m².
@@ -97,18 +97,19 @@ class Outlook:
         """
         if event.covariances is not None:
             return self._noise.observation(event)
-        return self._noise.at(self._expected(event, rows))
+        return self._noise.at(self._sights(event, rows))
 
-    def _expected(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
-        """Return where points should be (m, 3), metres, body frame: where measured, if unknown.
+    def _sights(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+        """Return where points should be (m, 3), from the sensor, metres, body frame.
 
-        As it is of a landmark that is new, that is in doubt, or that was seen so seldom that it
-        may itself be an outlier.
+        Of a landmark that is new, that is in doubt, or that was seen so seldom that it may itself
+        be an outlier, this is where it was measured.
         """
         landmarks = self._landmarks
         if not len(landmarks):
-            return event.points
+            return event.sights
         is_confirmed = landmarks.counts[rows] >= self._settings.confirmations
         in_doubt = landmarks.in_doubt(rows, self._settings.max_rejections)
         is_sure = (rows >= 0) & is_confirmed & ~in_doubt
-        return np.where(is_sure[:, None], self._observer.body_points(rows), event.points)
+        points = np.where(is_sure[:, None], self._observer.body_points(rows), event.points)
+        return points if event.sensor is None else points - event.sensor

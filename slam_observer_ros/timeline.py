@@ -141,4 +141,5 @@ class Timeline:
             points=se3.transform(back, points),
             covariances=turn @ covariances @ turn.T,
             velocities=None if event.velocities is None else se3.rotate(back, event.velocities),
+            sensor=None,  # the covariances are stated now
         )

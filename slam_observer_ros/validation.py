@@ -61,6 +61,8 @@ def _check_observation(event: ObservationEvent) -> None:
         _check_definite('landmark covariances', event.covariances)
     if event.velocities is not None:
         _check_coordinates('landmark velocities', event.velocities, (m, 3))
+    if event.sensor is not None:
+        _check_coordinates("sensor's positions", event.sensor, (m, 3))
 
 
 def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:

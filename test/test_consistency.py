@@ -15,7 +15,10 @@ from slam_observer_ros.evaluation.consistency import (
     normalised_squared_errors,
 )
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.settings import Settings
 
 RUNS = 30
@@ -66,3 +69,34 @@ def test_a_filter_that_is_told_half_of_the_noise_is_found_out(two_d_mode, degree
     errors, covariances, _ = map(np.array, zip(*runs, strict=True))
     _, upper = average_nees_band(degrees_of_freedom, len(runs))
     assert np.all(pose_anees(errors, covariances) > upper)
+
+
+def under_a_ceiling(settings, seed):
+    """Error (6,) and covariance (6, 6) after 15 s below 40 tags, and how many were rejected."""
+    rng = np.random.default_rng(seed)
+    tags = np.column_stack([rng.uniform(-6.0, 6.0, (40, 2)), np.full(40, 3.0)])
+    camera = se3.pose(np.eye(3), np.array([0.2, 0.0, 0.4]))
+    V, estimator = np.array([0.0, 0.0, 0.25, 0.8, 0.0, 0.0]), Estimator(settings)
+    for step in range(301):
+        stamp_ns, true_pose = step * 50_000_000, se3.exp(V * 0.05 * step)
+        noise = np.array([0.0, 0.0, 0.03, 0.02, 0.02, 0.0]) / np.sqrt(0.05)
+        estimator.add(VelocityEvent(stamp_ns, V + noise * rng.normal(size=6)))
+        if step % 4 == 0:
+            points = se3.transform(se3.inverse(true_pose @ camera), tags)
+            seen = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < 1.7 * points[:, 2])
+            roots = np.linalg.cholesky(NoiseModel(settings).at(points[seen]))
+            noisy = points[seen] + (roots @ rng.normal(size=(len(seen), 3, 1)))[:, :, 0]
+            estimator.add(move_observation(ObservationEvent(stamp_ns, seen, noisy), camera))
+    errors = pose_errors(estimator.pose, true_pose)
+    return errors, estimator.pose_covariance, estimator.counts['rejected_landmark']
+
+
+def test_a_planar_robot_below_its_landmarks_stays_honest():
+    """A bearing errs in proportion to how far up a landmark is, too."""
+    settings = Settings(two_d_mode=True, reorder_window=0.0, range_noise=0.05, bearing_noise=0.02)
+    errors, covariances, rejected = map(
+        np.array, zip(*(under_a_ceiling(settings, seed) for seed in range(RUNS)), strict=True)
+    )
+    lower, upper = average_nees_band(3, RUNS)
+    assert lower < pose_anees(errors[:, None], covariances[:, None])[0] < upper
+    assert rejected.sum() <= 2

@@ -12,7 +12,8 @@ from strategies import generators
 
 from slam_observer_ros.axes import SPATIAL
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel
@@ -234,6 +235,30 @@ def test_cartesian_noise_is_the_same_everywhere():
 def test_a_point_at_the_sensor_is_known_as_well_as_its_range():
     covariance = observed([[0.0, 0.0, 0.0]], range_noise=0.3)[0]
     np.testing.assert_allclose(covariance, 0.09 * np.eye(3), rtol=1e-5)
+
+
+@pytest.mark.parametrize('model', ['range_bearing', 'stereo', 'cartesian'])
+@given(rng=generators())
+def test_what_counts_is_the_way_from_the_sensor_wherever_that_sits(model, rng):
+    noise, sensor = NoiseModel(Settings(observation_model=model)), se3.exp(rng.normal(size=6))
+    event = ObservationEvent(0, np.arange(4), rng.normal(scale=3.0, size=(4, 3)))
+    moved, R = move_observation(event, sensor), sensor[:3, :3]
+    np.testing.assert_allclose(
+        noise.observation(moved), R @ noise.observation(event) @ R.T, atol=1e-9
+    )
+    back = move_observation(moved, se3.inverse(sensor))
+    np.testing.assert_allclose(back.sights, event.points, atol=1e-9)
+
+
+def test_in_a_plane_a_landmark_overhead_is_as_far_away_as_it_is():
+    event = ObservationEvent(0, np.arange(2), np.array([[0.1, 0.0, 3.0], [4.0, 0.0, 0.0]]))
+    flat = flatten(event)
+    np.testing.assert_array_equal(flat.points[:, 2], 0.0)
+    noise = NoiseModel(Settings(bearing_noise=0.02))
+    np.testing.assert_allclose(noise.observation(flat), noise.observation(event))
+    assert deviation(noise.observation(flat)[0], [0, 1, 0]) == pytest.approx(0.06, rel=0.01)
+    one = flat.select(np.array([False, True]))
+    np.testing.assert_allclose(noise.observation(one)[0], noise.observation(flat)[1])
 
 
 def test_covariances_of_messages_are_used_as_they_are():

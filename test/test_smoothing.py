@@ -282,7 +282,7 @@ def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkey
         estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
         estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))
     there = NoiseModel(settings).observation(ObservationEvent(0, np.arange(3), turned))
-    taken = NoiseModel(settings).at(noted[-1].expected)
+    taken = NoiseModel(settings).at(noted[-1].sights)
     np.testing.assert_allclose(taken, there, atol=0.1 * np.max(there))
 
 

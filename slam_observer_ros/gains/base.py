@@ -67,8 +67,8 @@ class Seen:
         (m,) which landmarks were seen.
     points : FloatArray
         (m, 3) where, metres, body frame.
-    expected : FloatArray
-        (m, 3) where they should have been, as far as that is known; the noise model is told this.
+    sights : FloatArray
+        (m, 3) from the sensor to where they should have been, metres, body frame.
     covariances : FloatArray or None
         (m, 3, 3) covariance of the points, body frame, m²; None where the noise model has it.
 
@@ -77,7 +77,7 @@ class Seen:
     stamp_ns: int
     indices: IntArray
     points: FloatArray
-    expected: FloatArray
+    sights: FloatArray
     covariances: FloatArray | None
 
 

@@ -203,7 +203,7 @@ class History:
 
     def _covariances(self, seen: list[Seen]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""
-        covariances = self._observation_noise.at(np.concatenate([part.expected for part in seen]))
+        covariances = self._observation_noise.at(np.concatenate([part.sights for part in seen]))
         stated = [part.covariances for part in seen if part.covariances is not None]
         if stated:
             is_stated = [part.covariances is not None for part in seen]
