@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import FloatArray, Immutable, IntArray
 
 
-class Axes:
+class Axes(Immutable):
     """Coordinates of the pose error and of each landmark error that are estimated.
 
     Attributes

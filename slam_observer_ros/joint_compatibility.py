@@ -15,7 +15,9 @@ at 6 σ, and by d² it would outweigh much that speaks for it.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, replace
+from itertools import accumulate
 import math
 
 import numpy as np
@@ -172,12 +174,17 @@ class JointSearch:
         """
         if not extensions:
             return []
-        places = [(some, *place) for some in extensions for place in np.ndindex(some.costs.shape)]
         costs = np.concatenate([some.costs.ravel() for some in extensions])
         order = np.argsort(costs, kind='stable')[:MAX_PARTIAL]
         worst = min(self._budget, costs[order[0]] + self._margin)
         kept = order[np.isfinite(costs[order]) & (costs[order] <= worst)]
-        return [some.extended(i, j) for some, i, j in (places[place] for place in kept)]
+        starts = list(accumulate((some.costs.size for some in extensions), initial=0))
+        pairings = []
+        for place in kept.tolist():
+            group = bisect_right(starts, place) - 1
+            i, j = divmod(place - starts[group], extensions[group].costs.shape[1])
+            pairings.append(extensions[group].extended(i, j))
+        return pairings
 
     def _extensions(self, pairings: list[Pairing], options: IntArray) -> _Extensions:
         """Return how pairings (b,) of one size may go on with the pairs ``options`` (o,)."""

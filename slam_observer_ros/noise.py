@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.types import FloatArray, Immutable
 from slam_observer_ros.velocity_history import HeldVelocities
 
 RESOLUTION_M = 1e-6
@@ -31,7 +31,7 @@ _IDENTITY = np.eye(3)
 _IDENTITY_6 = np.eye(6)
 
 
-class NoiseModel:
+class NoiseModel(Immutable):
     """Covariances in physical units.
 
     Parameters

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam_observer_ros.parameters import parameter
+from slam_observer_ros.types import Immutable
 
 Vector3 = tuple[float, float, float]
 
@@ -14,7 +15,7 @@ MAX_DELAY_S = 1.0
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(Immutable):
     """Settings of the estimator; each field is a parameter."""
 
     gains: str = parameter('riccati', 'Gain design', choices=('constant', 'scheduled', 'riccati'))
