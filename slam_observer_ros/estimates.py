@@ -7,8 +7,13 @@ from dataclasses import dataclass
 
 from slam_observer_ros.types import FloatArray, IntArray
 
-UNUSED_POINTS = ('rejected_landmark', 'unknown_id', 'repeated_id', 'unmapped_landmark')
-"""Names under which points are counted that were observed and are not used."""
+UNUSED_POINTS = {
+    'rejected_landmark': 'rejected',
+    'unknown_id': 'without id',
+    'repeated_id': 'of a repeated id',
+    'unmapped_landmark': 'not mapped',
+}
+"""Names under which points are counted that were observed and are not used, and what they are."""
 
 
 def used_points(counts: Counter[str]) -> int:

@@ -31,6 +31,9 @@ from slam_observer_ros.validation import check_event
 
 logger = logging.getLogger(__name__)
 
+MOST_NAMED = 10
+"""Ids that a warning lists at most."""
+
 
 class Estimator:
     """Pose and landmark map from time-stamped velocities and observations.
@@ -95,6 +98,7 @@ class Estimator:
 
         """
         self._start_pose = pose
+        self._is_placed = pose is not None
         self._frame.begin(pose)
         self._forget_time()
         self._last: Update | None = None
@@ -102,8 +106,8 @@ class Estimator:
     def restart_time(self) -> None:
         """Begin anew in time, after a jump of the clock, as ``on_time_jump`` says.
 
-        ``reset`` starts again where the run began, or anywhere in a loaded map; ``hold`` keeps
-        pose and map, and goes on from there.
+        ``reset`` starts again where the run began; in a loaded map where the settings say, or
+        anywhere. ``hold`` keeps pose and map, and goes on from there.
         """
         newest_ns = self.newest_stamp_ns
         after = '' if newest_ns is None else f' after {newest_ns * 1e-9:.3f} s'
@@ -119,6 +123,7 @@ class Estimator:
             self._catch_up()
             self._frame.states.restart_time()
             self._forget_time()
+            self._is_placed = True
         self.jumps += 1
 
     def load_map(
@@ -135,7 +140,7 @@ class Estimator:
             What is known. It takes the place of a map loaded before.
         pose : FloatArray, optional
             (4, 4) pose in the map's frame; what was mapped until now is forgotten. By default
-            the pose is that of the settings if nothing has happened yet and they have one.
+            the pose is that of the settings if they have one and the robot is still there.
             Otherwise it is unknown: it follows from landmarks of the map that are seen, three in
             space or two in a plane, and what was mapped until then is carried into the map's
             frame. See :attr:`is_localised`.
@@ -146,7 +151,7 @@ class Estimator:
         self._frame.load(landmark_map)
         if pose is not None:
             self.set_pose(pose, pose_covariance)
-        elif not self._counts and self.settings.set_initial_pose:
+        elif self.settings.set_initial_pose and self.stamp_ns is None and not self._is_placed:
             self._frame.begin(None)
         elif self._slam.is_mapping:
             self._frame.enter()
@@ -165,6 +170,7 @@ class Estimator:
 
         """
         self._catch_up()
+        self._is_placed = True
         self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
@@ -176,7 +182,7 @@ class Estimator:
         """Take an event; return whether it was accepted.
 
         A bad event is dropped whole, counted in ``dropped`` by its reason and logged; the state
-        is untouched.
+        is untouched. The event's arrays are not copied: don't change them any more.
         """
         try:
             check_event(event)
@@ -397,7 +403,9 @@ class Estimator:
             return event
         left = event.select(~np.isin(event.ids, repeated))
         self._counts['repeated_id'] += len(event.ids) - len(left.ids)
-        text = f'Not used, as more than one point of an observation has them: ids {repeated}'
+        named = ', '.join(str(landmark_id) for landmark_id in repeated[:MOST_NAMED])
+        more = ' and others' if len(repeated) > MOST_NAMED else ''
+        text = f'Not used: an observation has several points of the ids {named}{more}'
         self._warnings.warn('repeated_id', text)
         return left
 

@@ -32,6 +32,9 @@ Three of them in a line leave the roll about it open; two that are close togethe
 ROUNDING = 1e-14
 """Least variance that can be told from zero, as a share of the sum of all variances."""
 
+CONFIRMED = 20
+"""Points of a map's landmarks, used and not rejected, that confirm a place that was told."""
+
 CONTRADICTION_SIGMAS = 4.0
 """Landmarks whose misfit is as improbable as this contradict each other."""
 
@@ -94,6 +97,41 @@ def is_lost(slam: Slam) -> bool:
     moved = np.sum(slam.landmarks.rejections >= often)
     needed = axes_of(slam.settings.two_d_mode).point
     return bool(not slam.is_mapping and slam.rejected_in_a_row >= often and moved >= needed)
+
+
+class Told:
+    """A place in a map that someone has told, until landmarks of the map confirm it.
+
+    With a wrong one the map's landmarks would be rejected, and where mapping goes on be taken to
+    have moved, all of them. Where more of them are rejected than seen, it is wrong.
+
+    Parameters
+    ----------
+    slam : Slam
+        Started there.
+    known : LandmarkMap
+        The map.
+
+    """
+
+    def __init__(self, slam: Slam, known: LandmarkMap) -> None:
+        self._ids = known.ids
+        self._is_confirmed = False
+        self._at_start = self._count(slam)
+
+    def is_contradicted(self, slam: Slam) -> bool:
+        """Return whether what was seen since says that it is wrong."""
+        if self._is_confirmed:
+            return False
+        seen = self._count(slam) - self._at_start
+        rejected = slam.counts['rejected_landmark']
+        self._is_confirmed = seen >= CONFIRMED and seen > rejected
+        return rejected >= slam.settings.max_rejections and rejected > seen
+
+    def _count(self, slam: Slam) -> int:
+        """Return how often the map's landmarks were seen; placed anew, one was seen once."""
+        rows = slam.landmarks.indices_of(self._ids)
+        return int(slam.landmarks.counts[rows[rows >= 0]].sum())
 
 
 def shape_covariances(slam: Slam) -> FloatArray | None:

@@ -15,6 +15,7 @@ from slam_observer_ros.localisation import (
     is_lost,
     shape_covariances,
     start_in_map,
+    Told,
 )
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
@@ -58,6 +59,7 @@ class MapFrame:
         self.is_localised = True
         self.states = Hypotheses(Slam(settings, np.eye(4)), settings)
         self._counts: Counter[str] = Counter()
+        self._told: Told | None = None
         self._begin_search()
         is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
         if is_given and not settings.set_initial_pose:
@@ -117,8 +119,10 @@ class MapFrame:
         self.states = Hypotheses(slam, self.settings)
         self._begin_search()
         self.is_localised = self.loaded is None or pose is not None
+        self._told = None
         if self.loaded is not None and pose is not None:
             start_in_map(self.slam, self.loaded, covariance)
+            self._told = Told(self.slam, self.loaded)
 
     def load(self, landmark_map: LandmarkMap) -> None:
         """Take a map in the place of one loaded before; the place in it is not known yet."""
@@ -138,13 +142,18 @@ class MapFrame:
         if self.loaded is None:
             return
         if self.is_localised and is_lost(self.slam):
-            logger.warning('All landmarks are far from where they should be; localising anew.')
-            self._counts['lost'] += 1
-            self.start(None)
+            self._search_anew('All landmarks are far from where they should be')
+        elif self._told is not None and self._told.is_contradicted(self.slam):
+            self._search_anew('Most landmarks contradict the pose that was told')
         if not self.is_localised:
             if self._is_news(self.loaded):
                 self.enter()
             self._counts['not_localised'] += not self.is_localised
+
+    def _search_anew(self, why: str) -> None:
+        logger.warning('%s; localising anew.', why)
+        self._counts['lost'] += 1
+        self.start(None)
 
     def _begin_search(self) -> None:
         self._shared = self._searched = self._compared = 0

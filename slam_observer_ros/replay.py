@@ -41,7 +41,7 @@ class Replay:
         (k, 6, 6) their covariances, as :attr:`Estimator.pose_covariance` gives them; None
         without truth to compare their errors with.
     dead_reckoning : Trajectory
-        What the velocities alone give, from the same start.
+        What the velocities alone give, from the identity pose.
     configuration : ConfigurationError
         Gauge-free error after each observation; empty without truth.
     residual_stamps_ns : IntArray
@@ -91,7 +91,7 @@ def replay(
     truth: Truth | None = None,
     landmark_map: LandmarkMap | None = None,
 ) -> Replay:
-    """Run events through an estimator, from the identity pose or anywhere in a known map.
+    """Run events through an estimator, from where the settings say or anywhere in a known map.
 
     Parameters
     ----------

@@ -267,10 +267,18 @@ class Settings(Immutable):
         'map within 0.5 m and 0.26 rad, instead of looking for its place there',
     )
     initial_position: Vector3 = parameter(
-        (0.0, 0.0, 0.0), 'Where the robot starts, x y z, with set_initial_pose', unit='m'
+        (0.0, 0.0, 0.0),
+        'Where the robot starts, x y z, with set_initial_pose',
+        unit='m',
+        minimum=-1e7,
+        maximum=1e7,
     )
     initial_yaw: float = parameter(
-        0.0, 'How the robot is turned at the start, with set_initial_pose', unit='rad'
+        0.0,
+        'How the robot is turned at the start, with set_initial_pose',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
     )
     map_noise: float = parameter(
         0.05,

@@ -59,7 +59,7 @@ class SimulatedRun:
 def run_simulation(
     simulation: Simulation, events: Iterable[SimulatedEvent], settings: Settings
 ) -> SimulatedRun:
-    """Run a simulation's events through an estimator that starts at the identity pose.
+    """Run a simulation's events through an estimator, from where the settings say.
 
     Parameters
     ----------

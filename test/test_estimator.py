@@ -306,9 +306,8 @@ def test_points_with_one_id_are_left_out_counted_and_named(caplog, repeated):
     assert_same_state(estimator, without)
     assert estimator.counts['repeated_id'] == 5 * len(repeated)
     assert used_points(estimator.counts) == 10
-    assert f'more than one point of an observation has them: ids {sorted(set(repeated))}' in (
-        caplog.text
-    )
+    named = ', '.join(str(landmark_id) for landmark_id in sorted(set(repeated)))
+    assert f'several points of the ids {named} (1 so far)' in caplog.text
     assert len(caplog.records) == 1
 
 

@@ -13,7 +13,12 @@ from scipy.stats import chi2
 from slam_observer_ros import map_frame
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    ObservationEvent,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.landmark_map import LandmarkMap
@@ -551,14 +556,52 @@ class TestInitialPoseOfTheSettings:
         assert estimator.is_localised
 
     def test_who_is_lost_looks_elsewhere_too(self):
-        world = World(14)
+        world = World(14, is_planar=True)
         estimator = Estimator(self.docked(world, localization_mode='fixed'))
         estimator.load_map(world.map())
         offset = se3.exp(np.array([0.0, 0.0, 1.5, 3.0, -4.0, 0.0]))
-        add(estimator, world.drive(0.0, 2.0) + world.drive(2.0, 6.0, offset=offset))
+        add(estimator, world.drive(0.0, 5.0) + world.drive(5.0, 6.0, offset=offset))
         assert estimator.counts['lost'] == 1
         error = se3.log(estimator.pose @ se3.inverse(offset @ world.pose(5.9)))
         assert np.linalg.norm(error) < 0.1
+
+    @pytest.mark.parametrize('mode', MODES)
+    @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+    @pytest.mark.parametrize('offset_m', [4.0, 8.0])
+    def test_a_wrong_one_is_noticed_and_does_no_harm(self, gains, mode, offset_m, caplog):
+        for seed in range(5):
+            world = World(seed, is_planar=True)
+            settings = self.docked(world, offset_m, gains=gains, localization_mode=mode)
+            estimator = Estimator(replace(settings, initial_yaw=settings.initial_yaw + 1.0))
+            known = world.map()
+            estimator.load_map(known)
+            add(estimator, world.drive(0.0, 5.0))
+            assert estimator.is_localised
+            assert np.linalg.norm(world.error(estimator, 4.9)[3:]) < 0.3
+            rows = [list(estimator.landmark_ids).index(i) for i in known.ids]
+            assert_allclose(estimator.world_points[rows], known.world_points, atol=0.3)
+        assert 'the pose that was told; localising anew' in caplog.text
+
+    @pytest.mark.parametrize('mode', MODES)
+    def test_a_pose_given_since_is_not_taken_back_by_loading_a_map(self, mode):
+        world = World(3, is_planar=True)
+        estimator = Estimator(self.docked(world, localization_mode=mode))
+        pose = se3.exp(np.array([0.0, 0.0, 1.0, 5.0, -1.0, 0.0]))
+        estimator.set_pose(pose)
+        estimator.load_map(world.map())
+        assert not estimator.is_localised
+
+    @pytest.mark.parametrize('mode', MODES)
+    def test_after_a_reset_a_map_finds_the_robot_there(self, mode):
+        world = World(3, is_planar=True)
+        estimator = Estimator(self.docked(world, localization_mode=mode))
+        add(estimator, world.drive(0.0, 1.0))
+        estimator.reset()
+        estimator.load_map(world.map())
+        assert estimator.is_localised
+        add(estimator, [AngularVelocityEvent(0, np.zeros(3))])
+        estimator.load_map(world.map())
+        assert estimator.is_localised
 
     @pytest.mark.parametrize('mode', MODES)
     def test_in_a_map_loaded_on_the_way_the_place_is_searched(self, mode):

@@ -158,17 +158,32 @@ class TestPlaceNotKnown:
         path = record(tmp_path / 'run.mcap', start, seed=2, has_ids=False)
         poses = tmp_path / 'poses.tum'
         arguments = (
-            'replay', path, '--load-map', saved, '--json', '--tum', poses, *SETTINGS,
+            'replay', path, '--load-map', saved, '--tum', poses, '--force', *SETTINGS,
             '--set', 'localization_mode=fixed',
         )  # fmt: skip
         assert '--set set_initial_pose=true' in slam_observer.fail(*arguments)
         x, y, z = (start[:3, 3] + [0.2, -0.1, 0.0]).tolist()
         told = ('--set', f'initial_position=[{x},{y},{z}]', '--set', 'initial_yaw=0.9')
-        report = slam_observer(*arguments, '--set', 'set_initial_pose=true', *told).json
-        assert report['localised_after_s'] == 0.0
+        arguments += ('--set', 'set_initial_pose=true', *told)
+        assert slam_observer(*arguments, '--json').json['localised_after_s'] == 0.0
+        assert 'given at the start' in slam_observer(*arguments).output
         estimate = read_tum(poses)
         true = start @ se3.exp(BODY_VELOCITY * (estimate.stamps_ns * 1e-9)[:, None])
         assert_allclose(estimate.poses[1:], true[1:], atol=0.1)
+
+    def test_a_start_that_is_told_is_of_no_use_without_points(
+        self, slam_observer, tmp_path, saved
+    ):
+        path = record(tmp_path / 'run.mcap', np.eye(4), seed=2, has_ids=False)
+        again = tmp_path / 'again.yaml'
+        arguments = (
+            'replay', path, '--load-map', saved, '--map', again, *SETTINGS, '--gains', 'constant'
+        )  # fmt: skip
+        assert 'points without id take --gains riccati' in slam_observer.fail(*arguments)
+        told = slam_observer.fail(*arguments, '--set', 'set_initial_pose=true')
+        assert 'no observation was used' in told
+        assert 'points without id' in told
+        assert not again.exists()
 
     def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
         late = record(tmp_path / 'late.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s < 40))

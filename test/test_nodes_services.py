@@ -155,6 +155,14 @@ def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
         assert int(values['used: observation']) > 5
         assert values['calibration: velocity_delay'].endswith(' s')
         now_ns = time.time_ns()
+        twins = np.array([7, 7]), np.ones((2, 3))
+        diagnostics.wait(
+            lambda d: (
+                robot.send(ObservationEvent(time.time_ns(), *twins))
+                or 'points left out: several in a message have one id' in d.status.message
+            ),
+            'a warning of points with one id',
+        )
         bad = VelocityEvent(now_ns, np.full(6, np.nan))
         diagnostics.wait(
             lambda d: robot.send(bad) or d.status.level == DiagnosticStatus.ERROR,

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.commands.errors import UsageError
+from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.replay import Replay
@@ -55,9 +56,10 @@ def check_used(args: argparse.Namespace, result: Replay, dropped: Mapping[str, i
             list_dropped(dropped),
         )
     # In a map that was loaded there may be none because the place was not found: told elsewhere.
-    if result.observations or (args.load_map is not None and counts['observed_point']):
+    if result.observations or (counts['observed_point'] and not result.estimator.is_localised):
         return
     unused = Counter({'without a point that is used': counts['observation']})
+    unused += Counter({f'points {fate}': counts[name] for name, fate in UNUSED_POINTS.items()})
     why = f'observation was used (dropped: {list_dropped(unused + Counter(dropped))})'
     if args.smooth or args.load_map is not None:
         raise UsageError(f'no {why}; --smooth and --load-map need some')
@@ -100,6 +102,20 @@ def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
         f'the place in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
         f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(known.ids)} were '
-        'seen. Where the start is known: --set set_initial_pose=true '
+        f'seen{_advice(result)}'
+    )
+
+
+def _advice(result: Replay) -> str:
+    """Return what to do if the landmarks seen did not tell the place."""
+    counts, settings = result.estimator.counts, result.estimator.settings
+    if counts['unknown_id'] and settings.gains != 'riccati':
+        return f'; {counts["unknown_id"]} points without id take --gains riccati'
+    if counts['repeated_id']:
+        return f'; {counts["repeated_id"]} points were {UNUSED_POINTS["repeated_id"]}'
+    if settings.set_initial_pose:
+        return '; they contradict the pose that was told'
+    return (
+        '. Where the start is known: --set set_initial_pose=true '
         '--set initial_position=[X,Y,Z] --set initial_yaw=YAW'
     )

@@ -21,9 +21,6 @@ from slam_observer_ros.replay import Replay
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
 
-POINT_FATES = dict(
-    zip(UNUSED_POINTS, ('rejected', 'without id', 'of a repeated id', 'not mapped'), strict=True)
-)
 """What befalls points that were observed and are not used, and how it is told."""
 
 LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
@@ -217,13 +214,19 @@ def print_summary(
         'dropped': list_dropped(report.dropped),
     }
     if report.localised_after_s is not None:
-        rows['place in the map'] = (
-            f'found after {report.localised_after_s:.1f} s, where the trajectory begins'
-        )
+        rows['place in the map'] = _told_place(outcome.result, report.localised_after_s)
     rows |= {part.name: str(part) for part in outcome.result.estimator.calibration}
     rows |= _accuracy_rows(outcome)
     rows |= {name: str(path) for name, path in written.items()}
     print_table(str(recording), rows)
+
+
+def _told_place(result: Replay, localised_after_s: float) -> str:
+    told = f'found after {localised_after_s:.1f} s, where the trajectory begins'
+    if result.estimator.settings.set_initial_pose:
+        told = 'given at the start'
+    lost = result.estimator.counts['lost']
+    return f'{told}; then lost ({lost} times)' if lost else told
 
 
 def _told_landmarks(landmarks: int, counts: Counter[str]) -> str:
@@ -237,7 +240,7 @@ def _told_points(counts: Counter[str]) -> str:
     told = [f'{used_points(counts)} used']
     told += [
         f'{counts[name]} {fate} ({100.0 * counts[name] / counts["observed_point"]:.1f} %)'
-        for name, fate in POINT_FATES.items()
+        for name, fate in UNUSED_POINTS.items()
         if counts[name]
     ]
     return ', '.join(told)

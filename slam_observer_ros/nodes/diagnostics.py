@@ -47,8 +47,7 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
-        self._last_dropped = 0
-        self._last_used = 0
+        self._last_dropped = self._last_used = self._last_repeated = 0
 
     def publish(self) -> None:
         """Publish one status; call it about once a second."""
@@ -111,6 +110,9 @@ class Diagnostics:
             warnings.append('paused')
         elif dropped:
             warnings.append(f'{dropped} messages dropped')
+        if repeated := self._estimator.counts['repeated_id'] - self._last_repeated:
+            self._last_repeated += repeated
+            warnings.append(f'{repeated} points left out: several in a message have one id')
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
         if not self._estimator.is_localised:

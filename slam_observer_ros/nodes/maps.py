@@ -124,7 +124,7 @@ class Maps:
         if not estimator.is_localised:
             count = 'two' if estimator.settings.two_d_mode else 'three'
             return f'the pose is unknown until {count} of them are seen or it is given'
-        if estimator.stamp_ns is None:
+        if estimator.last_update is None:
             x, y, z = estimator.pose[:3, 3].tolist()
             return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
         return 'the robot has found its place in it'
