@@ -108,7 +108,7 @@ class Told:
     Parameters
     ----------
     slam : Slam
-        Started there.
+        Just put there.
     known : LandmarkMap
         The map.
 
@@ -117,14 +117,15 @@ class Told:
     def __init__(self, slam: Slam, known: LandmarkMap) -> None:
         self._ids = known.ids
         self._is_confirmed = False
-        self._at_start = self._count(slam)
+        self._seen_before = self._count(slam)
+        self._rejected_before = slam.counts['rejected_landmark']
 
     def is_contradicted(self, slam: Slam) -> bool:
         """Return whether what was seen since says that it is wrong."""
         if self._is_confirmed:
             return False
-        seen = self._count(slam) - self._at_start
-        rejected = slam.counts['rejected_landmark']
+        seen = self._count(slam) - self._seen_before
+        rejected = slam.counts['rejected_landmark'] - self._rejected_before
         self._is_confirmed = seen >= CONFIRMED and seen > rejected
         return rejected >= slam.settings.max_rejections and rejected > seen
 

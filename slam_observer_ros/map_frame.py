@@ -133,7 +133,9 @@ class MapFrame:
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the place in a loaded map was not known, it is now."""
         if self.is_localised:
-            self.states.decide().set_pose(self._allowed(pose), covariance)
+            slam = self.states.decide()
+            slam.set_pose(self._allowed(pose), covariance)
+            self._told = None if self.loaded is None else Told(slam, self.loaded)
         else:
             self.start(pose, covariance)
 

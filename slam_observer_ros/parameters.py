@@ -87,6 +87,8 @@ class Parameter:
         if isinstance(default, float):
             return self._in_range(self._number(value))
         if isinstance(default, str):
+            if value is False and 'off' in self.choices:
+                value = 'off'  # YAML 1.1 reads off as false
             self._expect(value, isinstance(value, str), 'a string')
             return self._choice(str(value))
         return self._vector(value, len(default))
@@ -190,6 +192,21 @@ def suggestion(name: str, names: Collection[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else ''
 
 
+def misspelt(name: str, names: Collection[str]) -> str:
+    """Return as :func:`suggestion` what a name is that has a mistake; empty for another name.
+
+    Parameters
+    ----------
+    name : str
+        What was written. Names of other nodes, which may share a parameter file, come near to
+        ours, too, as ``base_frame_id`` does: only a single mistake is one.
+    names : Collection of str
+        What may be meant.
+
+    """
+    return suggestion(name, [ours for ours in names if _is_misspelt(name, ours)])
+
+
 def read_parameter_file(path: Path) -> dict[str, object]:
     """Return the name → value mapping of a ROS 2 parameter file.
 
@@ -229,6 +246,15 @@ def read_parameter_file(path: Path) -> dict[str, object]:
             f"'{OBSERVER_NODE}: ros__parameters:' section"
         )
     return values
+
+
+def _is_misspelt(name: str, ours: str) -> bool:
+    """Return whether a letter of ``ours`` is wrong, missing, too many or behind the next one."""
+    same = [one == other for one, other in zip(name, ours, strict=False)]
+    start = [*same, False].index(False)
+    rest, right = name[start:], ours[start:]
+    swapped = right[1:2] + right[:1] + right[2:]
+    return rest in (right[1:], swapped) or rest[1:] in (right, right[1:])
 
 
 class _RosLoader(yaml.SafeLoader):

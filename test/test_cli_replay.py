@@ -393,6 +393,25 @@ class TestOutputs:
         assert "can't write figures to /proc/figures: " in errors
         assert '.writing-' not in errors
 
+    def test_figures_of_an_earlier_replay_are_not_left_among_the_new_ones(
+        self, slam_observer, simulated, tmp_path
+    ):
+        slam_observer.succeed('replay', simulated, '--plot', tmp_path)
+        assert (tmp_path / 'errors.png').exists()
+        without_truth = write_events(tmp_path / 'run.mcap', recordings.events())
+        slam_observer.succeed('replay', without_truth, '--plot', tmp_path, '--force')
+        assert not (tmp_path / 'errors.png').exists()
+        assert (tmp_path / 'map.png').exists()
+
+    @pytest.mark.parametrize('option', ['--tum', '--map', '--plot'])
+    def test_where_nothing_may_be_written_is_told_before_the_work(
+        self, slam_observer, simulated, tmp_path, option, monkeypatch
+    ):
+        monkeypatch.setattr(os, 'access', lambda *_: False)  # root may write anywhere
+        ended = slam_observer('replay', simulated, option, tmp_path / 'new')
+        assert (ended.code, ended.output) == (2, '')
+        assert f'nothing may be written to {tmp_path}' in ended.errors
+
     def test_figures_leave_other_files_alone(self, slam_observer, simulated, tmp_path):
         (tmp_path / 'notes.txt').write_text('mine')
         slam_observer.succeed('replay', simulated, '--plot', tmp_path)
@@ -499,6 +518,23 @@ class TestSettings:
             '--set', 'angular_velocity_noise=[1e-3, 0.01, 1]', '--set', 'step_mode=paper',
         )  # fmt: skip
 
+    def test_names_of_other_nodes_in_the_file_are_ignored(
+        self, slam_observer, simulated, tmp_path
+    ):
+        config = self.config(tmp_path, 'gain_k: 2.0, world_frame: odom, frequency: 30.0')
+        ended = slam_observer('replay', simulated, '--config', config)
+        assert ended.code == 0
+        assert 'Unknown parameters of --config are ignored: world_frame, frequency' in ended.errors
+        others = self.config(tmp_path, 'world_frame: odom')
+        assert "none of the parameters of --config is the observer's" in slam_observer.fail(
+            'replay', simulated, '--config', others
+        )
+
+    def test_angles_in_degrees(self, slam_observer, simulated):
+        for name, value in (('sensor_pose', '[0, 0, 0, 0, 0, 90]'), ('initial_yaw', '90')):
+            error = slam_observer.fail('replay', simulated, '--set', f'{name}={value}')
+            assert f"'{name}'" in error
+
     def test_misspelt_name_in_the_file(self, slam_observer, simulated, tmp_path):
         config = self.config(tmp_path, 'gain_q: 4.0')
         error = slam_observer.fail('replay', simulated, '--config', config)
@@ -578,6 +614,14 @@ class TestTroubledRecordings:
         landmarks.write_text('a good map')
         ended = slam_observer('replay', path, '--map', landmarks, '--force')
         assert 'dropped: 1 without a point that is used, 49 no_transform' in ended.errors
+        assert 'no observation was used' in ended.errors
+        assert landmarks.read_text() == 'a good map'
+
+    def test_a_map_without_landmarks_replaces_none(self, slam_observer, simulated, tmp_path):
+        landmarks = tmp_path / 'map.yaml'
+        landmarks.write_text('a good map')
+        unconfirmed = ('--set', 'confirmations=1000', '--map', landmarks, '--force')
+        ended = slam_observer('replay', simulated, *unconfirmed)
         assert f'{landmarks} is left as it is: the map is empty' in ended.errors
         assert ended.code == 2
         assert landmarks.read_text() == 'a good map'

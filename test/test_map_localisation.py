@@ -280,6 +280,24 @@ def test_a_pose_that_is_set_moves_the_robot_and_keeps_the_map():
     assert_allclose(estimator.landmark_covariances, covariances, atol=1e-12)
 
 
+@pytest.mark.parametrize('mode', MODES)
+def test_a_pose_that_is_set_wrong_by_mistake_does_the_map_no_harm(mode):
+    world = World(8)
+    estimator = Estimator(world.settings(localization_mode=mode))
+    known = world.map()
+    estimator.load_map(known)
+    add(estimator, world.drive(0.0, 3.0))
+    estimator.set_pose(
+        world.pose(2.9) @ se3.exp(np.array([0.0, 0.0, 0.8, 6.0, 2.0, 0.0])),
+        np.diag([0.26, 0.26, 0.26, 0.5, 0.5, 0.5]) ** 2,
+    )
+    add(estimator, world.drive(3.0, 6.0))
+    assert estimator.counts['lost'] == 1
+    assert np.linalg.norm(world.error(estimator, 5.9)[3:]) < 0.15
+    rows = [list(estimator.landmark_ids).index(i) for i in known.ids]
+    assert_allclose(estimator.world_points[rows], known.world_points, atol=0.3)
+
+
 def test_a_robot_set_down_elsewhere_finds_back_once_its_pose_is_set():
     world = World(9)
     estimator = add(Estimator(world.settings(), world.start), world.drive(0.0, 4.0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from command_line import CommandLine
 import numpy as np
 from numpy.testing import assert_allclose
@@ -195,6 +197,15 @@ class TestPlaceNotKnown:
         assert (
             f'found after {report["localised_after_s"]:.1f} s' in slam_observer(*arguments).output
         )
+
+    def test_more_rejections_than_a_sensor_has_outliers_are_told(
+        self, slam_observer, tmp_path, saved
+    ):
+        growing = record(
+            tmp_path / 'run.mcap', np.eye(4), seed=2, scale=lambda s: 3.0 if s % 4 else 1.0
+        )
+        ended = slam_observer('replay', growing, *SETTINGS)
+        assert re.search('[0-9]+ % of the points were rejected: look at the signs', ended.errors)
 
     def test_a_place_lost_at_the_end_gives_poses_but_no_map(self, slam_observer, tmp_path, saved):
         misled = record(

@@ -254,8 +254,33 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        (None, r"Couldn't parse params file: '--params-file .*'. Error: Error opening YAML file"),
+        ('map_frame: hall', 'Cannot have a value before ros__parameters at line 1'),
+    ],
+)
+def test_with_a_wrong_parameter_file_the_node_says_why_in_a_line(tmp_path, text, reason):
+    file = tmp_path / 'file.yaml'
+    if text is not None:
+        file.write_text(text)
+    node = NodeProcess('observer_node', tmp_path / 'log', '--params-file', str(file))
+    assert node.wait() == 2
+    assert re.search(reason, node.output.splitlines()[-1])
+    assert 'Traceback' not in node.output
+
+
+def test_off_is_a_mode_that_yaml_takes_for_false(ros, tmp_path):
+    file = tmp_path / 'file.yaml'
+    file.write_text('/**: {ros__parameters: {localization_mode: off}}')
+    with running('observer_node', tmp_path / 'log', '--params-file', str(file)) as node:
+        node.wait_for_output("estimating 'base_link' in 'map'")
+
+
+@pytest.mark.parametrize(
     ('parameters', 'reason'),
     [
+        ({'sensor_pose': [0, 0, 0, 0, 0, 90]}, "'sensor_pose': roll, pitch and yaw are radians"),
         ({'map_file': '/no/such/map.yaml'}, "can't read map /no/such/map.yaml"),
         ({'autosave_map': True}, "'autosave_map' needs a file in 'map_path'"),
         (

@@ -262,6 +262,13 @@ def test_a_missing_file_or_a_folder_is_refused(tmp_path):
         read_parameter_file(tmp_path)
 
 
+def test_off_in_a_file_is_no_false(tmp_path):
+    file = tmp_path / 'mode.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    localization_mode: off\n')
+    settings = from_parameters(Settings, read_parameter_file(file))
+    assert settings.localization_mode == 'off'
+
+
 def test_numbers_in_a_file_are_read_as_ros_reads_them(tmp_path):
     file = tmp_path / 'numbers.yaml'
     file.write_text('/**:\n  ros__parameters:\n    gain_k: 1e-3\n    gain_l: 2\n')

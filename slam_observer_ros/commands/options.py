@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 import json
+import logging
 import os
 from pathlib import Path
 import sys
@@ -16,12 +17,15 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.parameters import (
     from_parameters,
+    misspelt,
     Parameter,
     read_parameter_file,
     table,
     Value,
 )
 from slam_observer_ros.settings import Settings
+
+logger = logging.getLogger(__name__)
 
 _PACKAGE = 'slam_observer_ros'
 _ESTIMATOR_NAMES = frozenset(row.name for row in table(Settings))
@@ -75,9 +79,7 @@ def read_settings(
 
     """
     values: dict[str, object] = dict(defaults)
-    values |= {
-        name: value for name, value in read_config(args).items() if not _is_only_for_node(name)
-    }
+    values |= _for_estimator(read_config(args))
     for name, value in read_assignments(args).items():
         if name in other_names:
             continue
@@ -107,6 +109,24 @@ def _is_only_for_node(name: str) -> bool:
         name.startswith(ros_name) if ros_name.endswith('.') else name == ros_name
         for ros_name in _ROS_NAMES
     )
+
+
+def _for_estimator(values: Mapping[str, object]) -> dict[str, object]:
+    """Return what of a parameter file is for the estimator.
+
+    Other names than the observer's are ignored with a warning, as by the node: they may be other
+    nodes'.
+    """
+    ours = _ESTIMATOR_NAMES | _NODE_NAMES
+    unknown = [name for name in values if name not in ours and not _is_only_for_node(name)]
+    for name in unknown:
+        if near := misspelt(name, ours):
+            raise ParameterError(f"unknown parameter '{name}'{near}")
+    if unknown and len(unknown) == len(values):
+        raise ParameterError("none of the parameters of --config is the observer's")
+    if unknown:
+        logger.warning('Unknown parameters of --config are ignored: %s.', ', '.join(unknown))
+    return {name: value for name, value in values.items() if name in _ESTIMATOR_NAMES}
 
 
 def find_config(name: str) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+import os
 from pathlib import Path
 import tempfile
 
@@ -39,7 +40,7 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
     ------
     UsageError
         If a file exists and may not be replaced, is a directory, a pipe or a device, or would
-        lie in no directory, or two are the same.
+        lie in no directory or one that may not be written to, or two are the same.
 
     """
     wanted = [file for file in files if file is not None]
@@ -52,6 +53,8 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
             raise UsageError(f'{file} exists already; give another name, or --force to replace it')
         if not file.parent.is_dir():
             raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
+        if not os.access(file.parent, os.W_OK):
+            raise UsageError(f'{file}: nothing may be written to {file.parent}')
         if file.resolve() in [other.resolve() for other in wanted[:number]]:
             raise UsageError(f'{file} is named for two outputs')
 
@@ -96,7 +99,8 @@ def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> No
     Raises
     ------
     UsageError
-        If it is a file, lies in no directory, or holds one of the figures already.
+        If it is a file, lies in no directory or one that may not be written to, or holds one of
+        the figures already.
 
     """
     if directory is None:
@@ -107,11 +111,15 @@ def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> No
         raise UsageError(f'{directory} is a file; give a directory for the figures')
     elif not directory.parent.is_dir():
         raise UsageError(f'{directory}: there is no directory {directory.parent}; make it first')
+    elif not os.access(directory.parent, os.W_OK):
+        raise UsageError(f'{directory}: nothing may be written to {directory.parent}')
 
 
 @contextmanager
-def filled_directory(directory: Path) -> Iterator[Path]:
+def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """Give a directory to write in, whose files go to ``directory`` when all are written.
+
+    Of ``names`` those that were not written this time are removed from there.
 
     Raises
     ------
@@ -124,8 +132,11 @@ def filled_directory(directory: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(dir=beside, prefix='.writing-') as unfinished:
             yield Path(unfinished)
             directory.mkdir(exist_ok=True)
+            written = {file.name for file in Path(unfinished).iterdir()}
             for file in sorted(Path(unfinished).iterdir()):
                 file.replace(destination(directory / file.name))
+            for name in set(names) - written:
+                (directory / name).unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or error  # its whole text names a directory that is gone by now
         raise OutputError(f"can't write figures to {directory}: {reason}") from error

@@ -190,7 +190,7 @@ def _save(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
 def _draw(
     outcome: Outcome, trajectory: Trajectory, landmark_map: LandmarkMap, directory: Path
 ) -> None:
-    with filled_directory(directory) as unfinished:
+    with filled_directory(directory, FIGURES) as unfinished:
         _draw_figures(outcome, trajectory, landmark_map, unfinished)
 
 

@@ -46,7 +46,7 @@ def check_used(args: argparse.Namespace, result: Replay, dropped: Mapping[str, i
     Raises
     ------
     UsageError
-        If no observation was used though ``--smooth`` or ``--load-map`` needs some.
+        If no observation was used though ``--smooth``, ``--map`` or ``--load-map`` needs some.
 
     """
     counts = result.estimator.counts
@@ -61,8 +61,8 @@ def check_used(args: argparse.Namespace, result: Replay, dropped: Mapping[str, i
     unused = Counter({'without a point that is used': counts['observation']})
     unused += Counter({f'points {fate}': counts[name] for name, fate in UNUSED_POINTS.items()})
     why = f'observation was used (dropped: {list_dropped(unused + Counter(dropped))})'
-    if args.smooth or args.load_map is not None:
-        raise UsageError(f'no {why}; --smooth and --load-map need some')
+    if args.smooth or args.map is not None or args.load_map is not None:
+        raise UsageError(f'no {why}; --smooth, --map and --load-map need some')
     logger.warning('No %s; the trajectory is that of the velocities alone.', why)
 
 

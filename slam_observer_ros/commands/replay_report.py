@@ -21,7 +21,8 @@ from slam_observer_ros.replay import Replay
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
 
-"""What befalls points that were observed and are not used, and how it is told."""
+MOST_REJECTED = 0.1
+"""Share of the points beyond which they are more than a sensor's outliers."""
 
 LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
 """What befalls landmarks that are in the map."""
@@ -127,6 +128,7 @@ def outcome_of(
         )
     _warn_of_missing_stamps(recording)
     _warn_of_unknown_ids(result)
+    _warn_of_rejections(result)
     _warn_of_unused_poses(recording, selected, result)
     return Outcome(result, truth, accuracy, report, recording.missing_ids(selected.landmarks))
 
@@ -147,6 +149,18 @@ def _warn_of_unknown_ids(result: Replay) -> None:
     if unknown and gains != 'riccati':
         logger.warning(
             '%d points without id are not used by %s gains; use --gains riccati.', unknown, gains
+        )
+
+
+def _warn_of_rejections(result: Replay) -> None:
+    """Say what may be wrong if more points were rejected than a sensor has outliers."""
+    counts = result.estimator.counts
+    share = counts['rejected_landmark'] / max(counts['observed_point'], 1)
+    if share > MOST_REJECTED:
+        logger.warning(
+            '%.0f %% of the points were rejected: look at the signs, units and frames of the '
+            'velocity and of the points, then at their noise.',
+            100.0 * share,
         )
 
 
@@ -226,7 +240,7 @@ def _told_place(result: Replay, localised_after_s: float) -> str:
     if result.estimator.settings.set_initial_pose:
         told = 'given at the start'
     lost = result.estimator.counts['lost']
-    return f'{told}; then lost ({lost} times)' if lost else told
+    return f'{told}; lost {lost} × and searched anew' if lost else told
 
 
 def _told_landmarks(landmarks: int, counts: Counter[str]) -> str:

@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> None:
     if args.output is not None:
         _record(simulation, args.output, args.force)
     if args.plot is not None:
-        with filled_directory(args.plot) as unfinished:
+        with filled_directory(args.plot, FIGURES) as unfinished:
             _draw(simulation, result, unfinished)
     if args.json:
         print_json(_as_json(args, result))

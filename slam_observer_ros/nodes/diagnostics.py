@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 import time
 from typing import Any
@@ -9,12 +10,16 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
 
 SILENT_S = 2.0
 """An input without messages for this long is a warning."""
+
+LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id')
+"""Points not used for something that is wrong; those that a known map lacks may well be there."""
 
 
 class Diagnostics:
@@ -47,7 +52,8 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
-        self._last_dropped = self._last_used = self._last_repeated = 0
+        self._last_dropped = self._last_used = 0
+        self._last_counts: Counter[str] = Counter()
 
     def publish(self) -> None:
         """Publish one status; call it about once a second."""
@@ -110,14 +116,22 @@ class Diagnostics:
             warnings.append('paused')
         elif dropped:
             warnings.append(f'{dropped} messages dropped')
-        if repeated := self._estimator.counts['repeated_id'] - self._last_repeated:
-            self._last_repeated += repeated
-            warnings.append(f'{repeated} points left out: several in a message have one id')
+        warnings.append(self._points_warning())
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
         if not self._estimator.is_localised:
             warnings.append('the place in the loaded map is not known yet: no pose is published')
         return [warning for warning in warnings if warning]
+
+    def _points_warning(self) -> str:
+        """Tell of points left out since the last time: most of them, or such with one id."""
+        counts = self._estimator.counts
+        new, self._last_counts = counts - self._last_counts, counts
+        left_out = {name: new[name] for name in LEFT_OUT if new[name]}
+        if not (new['repeated_id'] or 2 * sum(left_out.values()) > new['observed_point']):
+            return ''
+        told = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())
+        return f'of {new["observed_point"]} points seen {told}'
 
     @staticmethod
     def _input_warning(source: Input[Any]) -> str:

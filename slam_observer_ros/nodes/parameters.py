@@ -17,9 +17,9 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import (
     Dataclass,
     from_parameters,
+    misspelt,
     Parameter,
     SettingsT,
-    suggestion,
     table,
 )
 
@@ -105,24 +105,11 @@ def _check_names(node: Node, names: Collection[str]) -> None:
         is_of_ros = node.has_parameter(name) or name.startswith('qos_overrides.')
         if is_of_ros or name in names:
             continue
-        if near := suggestion(name, [ours for ours in names if _is_misspelt(name, ours)]):
+        if near := misspelt(name, names):
             raise ParameterError(f"unknown parameter '{name}'{near}")
         ignored.append(name)
     if ignored:
         node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
-
-
-def _is_misspelt(name: str, ours: str) -> bool:
-    """Return whether a letter of ``ours`` is wrong, missing, too many or behind the next one.
-
-    No more than that: names of other nodes, which may share the parameter file, come near, too,
-    as ``base_frame_id`` does.
-    """
-    same = [one == other for one, other in zip(name, ours, strict=False)]
-    start = [*same, False].index(False)
-    rest, right = name[start:], ours[start:]
-    swapped = right[1:2] + right[:1] + right[2:]
-    return rest in (right[1:], swapped) or rest[1:] in (right, right[1:])
 
 
 def _check_changes(

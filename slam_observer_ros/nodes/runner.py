@@ -49,15 +49,20 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int
     Returns
     -------
     int
-        Exit code: 0 after a clean stop, 2 where the node refused to start.
+        Exit code: 0 after a clean stop, 2 where ROS or the node refused to start.
 
     """
     use_one_thread()
     stop = StopSignal()
-    rclpy.init(
-        args=list(args) if args is not None else None,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    try:
+        rclpy.init(
+            args=list(args) if args is not None else None,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except RuntimeError as error:  # of which rclpy makes its own, as of a file that is missing
+        reason = str(error).partition(', at /')[0]
+        get_logger('slam_observer_ros').fatal(f'{type(error).__name__}: {reason}')
+        return 2
     try:
         return _spin(make_node, stop)
     finally:

@@ -7,7 +7,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from slam_observer_ros.errors import TransformError
+from slam_observer_ros.errors import ParameterError, TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
 from slam_observer_ros.recording.detections import TagDetections
@@ -73,6 +73,11 @@ class BaseFrame:
     name : str
         Name of the base frame.
 
+    Raises
+    ------
+    ParameterError
+        If ``sensor_pose`` can't be one.
+
     """
 
     def __init__(self, settings: InputSettings, transforms: TransformSource) -> None:
@@ -83,7 +88,10 @@ class BaseFrame:
         self._tag_frame_prefix = settings.tag_frame_prefix
         self._sensor_pose: FloatArray | None = None
         if any(settings.sensor_pose):
-            self._sensor_pose = pose_from_rpy(settings.sensor_pose)
+            try:
+                self._sensor_pose = pose_from_rpy(settings.sensor_pose)
+            except ParameterError as error:
+                raise ParameterError(f"parameter 'sensor_pose': {error}") from error
 
     def observation(self, message: ObservationMessage) -> ObservationEvent:
         """Return landmarks in the base frame.
