@@ -42,16 +42,19 @@ STYLE: Any = {
 
 # The true path is wide and pale, so that an estimate that lies on it hides nothing.
 TRUE_PATH: Any = {'color': '#7FB8DA', 'linestyle': '-', 'linewidth': 3.0, 'label': 'true path'}
-TRUE_END: Any = {'color': BLUE, 'marker': '*', 'markersize': 12, 'linestyle': 'none', 'zorder': 4}
 PATH: Any = {'color': RED, 'linestyle': '-.', 'label': 'estimated path'}
-END: Any = {
-    'color': RED, 'marker': 'o', 'markersize': 8, 'markerfacecolor': 'none',
+TRUE_END: Any = {'color': '#7FB8DA', 'marker': 's', 'linestyle': 'none', 'zorder': 4}
+END: Any = {**TRUE_END, 'color': RED, 'markerfacecolor': 'none', 'zorder': 5, 'label': 'its end'}
+TRUE_LANDMARKS: Any = {
+    'color': BLUE, 'marker': '*', 'markersize': 10, 'linestyle': 'none', 'zorder': 4,
+    'label': 'true landmarks',
+}  # fmt: skip
+TRACKS: Any = {'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2, 'label': 'landmark estimates'}
+LANDMARKS: Any = {
+    'color': GREEN, 'marker': 'o', 'markersize': 9, 'markerfacecolor': 'none',
     'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5,
 }  # fmt: skip
-TRUE_LANDMARKS: Any = {**TRUE_END, 'markersize': 10, 'label': 'true landmarks'}
-TRACKS: Any = {'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2, 'label': 'landmark estimates'}
-LANDMARKS: Any = {**END, 'color': GREEN, 'markersize': 9}
-LEGEND_BELOW: Any = {'loc': 'outside lower center', 'ncols': 4}  # of a figure, not of its axes
+LEGEND_BELOW: Any = {'loc': 'outside lower center', 'ncols': 5}  # of a figure, not of its axes
 LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
 
 _PLANAR_RATIO = 0.01
