@@ -98,6 +98,7 @@ class Estimator:
 
         """
         self._start_pose = pose
+        # By somebody, so that the settings don't say any more where it is.
         self._is_placed = pose is not None
         self._frame.begin(pose)
         self._forget_time()

@@ -83,7 +83,7 @@ class VelocityHistory:
         # In force from each stamp to the next; the first is what is known before any event.
         self._stamps_ns = [NEVER_NS]
         self._joined = _Joined.with_room_for(FIRST_CAPACITY)
-        # Those that nobody has asked for yet: written together they cost a fifth.
+        # Those that nobody has asked for yet: many written at once cost less than one by one.
         self._unwritten: list[tuple[VelocityEvent, AngularVelocityEvent | None]] = []
         self._velocity: VelocityEvent | None = None
         self._angular: AngularVelocityEvent | None = None
