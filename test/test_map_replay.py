@@ -73,6 +73,8 @@ def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path
     distance = np.linalg.norm(estimate.poses[:, :3, 3] - true[:, :3, 3], axis=1)
     assert len(distance) > 70
     assert np.median(distance) < 0.1
+    report = slam_observer('replay', second, '--load-map', saved, *SETTINGS, '--json').json
+    assert report['ate_rmse_m'] < report['unaligned_rmse_m'] < 0.15
     known, after = read_map(saved), read_map(again)
     assert set(known.ids) <= set(after.ids)
     assert (len(after.ids) > len(known.ids)) == (mode == 'off')
@@ -99,6 +101,7 @@ def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
 ):
     path, saved = record(tmp_path / 'run.mcap', np.eye(4), seed=1), tmp_path / 'map.yaml'
     report = slam_observer.succeed('replay', path, '--map', saved, '--json', *SETTINGS).json
+    assert report['unaligned_rmse_m'] is None
     assert 0.2 < report['anees'] < 5.0
     arguments = ('replay', path, '--load-map', saved, *SETTINGS)
     again = slam_observer(*arguments, '--json').json

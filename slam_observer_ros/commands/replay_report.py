@@ -57,6 +57,8 @@ class Report:
     localised_after_s : float or None
         Time until the place in a loaded map was found, from when on the trajectory has poses,
         seconds; None without such a map.
+    unaligned_rmse_m : float or None
+        See :class:`.TrajectoryErrors`; None without truth or such a map.
 
     """
 
@@ -72,6 +74,7 @@ class Report:
     configuration_rmse_m: float | None = None
     anees: float | None = None
     localised_after_s: float | None = None
+    unaligned_rmse_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +129,8 @@ def outcome_of(
             rotation_rmse_rad=accuracy.pose_errors.rotation_rmse_rad,
             heading_rmse_rad=accuracy.pose_errors.heading_rmse_rad,
         )
+        if result.in_known_map:
+            report = replace(report, unaligned_rmse_m=accuracy.pose_errors.unaligned_rmse_m)
     _warn_of_missing_stamps(recording)
     _warn_of_unknown_ids(result)
     _warn_of_rejections(result)
@@ -267,6 +272,10 @@ def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
         'of the velocities alone': (
             _ate_rmse_m(outcome.accuracy.dead_reckoning_errors),
             'm after alignment',
+        ),
+        'position error, not aligned': (
+            report.unaligned_rmse_m,
+            "m if the truth is in the map's frame",
         ),
         'heading error, RMS': (report.heading_rmse_rad, 'rad after alignment'),
         'landmark error, RMS': (report.landmark_rmse_m, 'm after alignment'),

@@ -57,6 +57,12 @@ class TrajectoryErrors:
         return root_mean_square(self.errors[:, 3:])
 
     @property
+    def unaligned_rmse_m(self) -> float:
+        """The same without the alignment, for an estimate in the truth's frame, metres."""
+        positions = se3.transform(se3.inverse(self.alignment), self.estimate.positions)
+        return root_mean_square(positions - self.truth.positions)
+
+    @property
     def rotation_rmse_rad(self) -> float:
         """RMSE of the angle between estimated and true attitude, radians."""
         return root_mean_square(self.errors[:, :3])
