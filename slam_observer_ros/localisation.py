@@ -32,8 +32,8 @@ Three of them in a line leave the roll about it open; two that are close togethe
 ROUNDING = 1e-14
 """Least variance that can be told from zero, as a share of the sum of all variances."""
 
-CONFIRMED = 20
-"""Points of a map's landmarks, used and not rejected, that confirm a place that was told."""
+CONFIRMATIONS = 10
+"""Observations that confirm a place that was told."""
 
 CONTRADICTION_SIGMAS = 4.0
 """Landmarks whose misfit is as improbable as this contradict each other."""
@@ -100,39 +100,32 @@ def is_lost(slam: Slam) -> bool:
 
 
 class Told:
-    """A place in a map that someone has told, until landmarks of the map confirm it.
+    """A place in a map that someone has told, on trial until landmarks of the map confirm it.
 
     With a wrong one the map's landmarks would be rejected, and where mapping goes on be taken to
-    have moved, all of them. Where more of them are rejected than seen, it is wrong.
+    have moved, all of them. Observations vote: against it, if more of the map's landmarks in them
+    were rejected than believed. One alone may be garbled, and some landmarks have moved.
 
     Parameters
     ----------
-    slam : Slam
-        Just put there.
     known : LandmarkMap
         The map.
 
     """
 
-    def __init__(self, slam: Slam, known: LandmarkMap) -> None:
+    def __init__(self, known: LandmarkMap) -> None:
         self._ids = known.ids
-        self._is_confirmed = False
-        self._seen_before = self._count(slam)
-        self._rejected_before = slam.counts['rejected_landmark']
+        self._for = self._against = 0
 
     def is_contradicted(self, slam: Slam) -> bool:
-        """Return whether what was seen since says that it is wrong."""
-        if self._is_confirmed:
+        """Count the vote of the last observation; return whether the place is wrong."""
+        if self._for >= CONFIRMATIONS and self._for > self._against:
             return False
-        seen = self._count(slam) - self._seen_before
-        rejected = slam.counts['rejected_landmark'] - self._rejected_before
-        self._is_confirmed = seen >= CONFIRMED and seen > rejected
-        return rejected >= slam.settings.max_rejections and rejected > seen
-
-    def _count(self, slam: Slam) -> int:
-        """Return how often the map's landmarks were seen; placed anew, one was seen once."""
-        rows = slam.landmarks.indices_of(self._ids)
-        return int(slam.landmarks.counts[rows[rows >= 0]].sum())
+        believed = np.isin(slam.believed_ids, self._ids).sum()
+        rejected = np.isin(slam.rejected_ids, self._ids).sum()
+        self._for += int(believed > 0 and believed >= rejected)
+        self._against += int(rejected > believed)
+        return self._against >= slam.settings.max_rejections and self._against > self._for
 
 
 def shape_covariances(slam: Slam) -> FloatArray | None:

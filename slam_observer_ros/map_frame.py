@@ -122,20 +122,20 @@ class MapFrame:
         self._told = None
         if self.loaded is not None and pose is not None:
             start_in_map(self.slam, self.loaded, covariance)
-            self._told = Told(self.slam, self.loaded)
+            self._told = Told(self.loaded)
 
     def load(self, landmark_map: LandmarkMap) -> None:
         """Take a map in the place of one loaded before; the place in it is not known yet."""
         self.loaded = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
         self.is_localised = False
+        self._told = None
         self._begin_search()
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the place in a loaded map was not known, it is now."""
         if self.is_localised:
-            slam = self.states.decide()
-            slam.set_pose(self._allowed(pose), covariance)
-            self._told = None if self.loaded is None else Told(slam, self.loaded)
+            self.states.decide().set_pose(self._allowed(pose), covariance)
+            self._told = None if self.loaded is None else Told(self.loaded)
         else:
             self.start(pose, covariance)
 
@@ -143,10 +143,10 @@ class MapFrame:
         """Find the place in the loaded map if it is not known, or not any more."""
         if self.loaded is None:
             return
-        if self.is_localised and is_lost(self.slam):
-            self._search_anew('All landmarks are far from where they should be')
-        elif self._told is not None and self._told.is_contradicted(self.slam):
+        if self._told is not None and self._told.is_contradicted(self.slam):
             self._search_anew('Most landmarks contradict the pose that was told')
+        elif self.is_localised and is_lost(self.slam):
+            self._search_anew('All landmarks are far from where they should be')
         if not self.is_localised:
             if self._is_news(self.loaded):
                 self.enter()

@@ -58,6 +58,8 @@ class Slam:
         Where points were seen, to know where one without an id should have been.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
+    believed_ids, rejected_ids : IntArray
+        Known landmarks in the last observation, by what it was taken for.
     moved_ids : IntArray
         Landmarks that the last observation showed to have moved.
     rejected_in_a_row : int
@@ -72,7 +74,10 @@ class Slam:
         self.landmarks = LandmarkTable()
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
-        self.moved_ids = np.empty(0, dtype=np.int64)
+        nothing = np.empty(0, dtype=np.int64)
+        self.believed_ids: IntArray = nothing
+        self.rejected_ids: IntArray = nothing
+        self.moved_ids: IntArray = nothing
         self.rejected_in_a_row = 0
         self.noise = NoiseModel(settings)
         self._outlook = Outlook(self.observer, self.landmarks, self.noise, settings)
@@ -297,11 +302,14 @@ class Slam:
         """Correct the state by the landmarks of ``event``; return which (m,) were not rejected."""
         rows = innovation.indices
         if not len(rows):
+            self.believed_ids = self.rejected_ids = rows
             return np.empty(0, dtype=np.bool_)
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
         rejected = weights == 0.0
+        ids = self.landmarks.ids[rows]
+        self.believed_ids, self.rejected_ids = ids[~rejected], ids[rejected]
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
         if rejected.any():

@@ -280,6 +280,51 @@ def test_a_pose_that_is_set_moves_the_robot_and_keeps_the_map():
     assert_allclose(estimator.landmark_covariances, covariances, atol=1e-12)
 
 
+class TestRightPoseThatIsTold:
+    """Neither outliers nor moved landmarks nor one bad observation speak against it."""
+
+    @staticmethod
+    def told(world, known, mode='off', **changes):
+        estimator = Estimator(world.settings(localization_mode=mode, **changes))
+        estimator.load_map(known, world.start, np.diag([0.05, 0.05, 0.1, 0.2, 0.2, 0.2]) ** 2)
+        return estimator
+
+    def test_outliers_of_landmarks_that_are_not_in_the_map(self):
+        world = World(4)
+        estimator = self.told(world, world.map(range(40, 50)))
+        for step in range(100):
+            event = world.see(0.1 * step, range(6), pose=world.start)
+            is_off = world.random.random((6, 1)) < 0.2
+            away = world.random.normal(scale=5.0, size=(6, 3))
+            estimator.add(VelocityEvent(event.stamp_ns, np.zeros(6)))
+            estimator.add(replace(event, points=event.points + is_off * away))
+        assert estimator.counts['rejected_landmark'] > 20
+        assert estimator.counts['lost'] == 0
+
+    @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+    def test_one_of_three_landmarks_that_were_seen_often_has_moved(self, gains):
+        world = World(4)
+        known = replace(world.map(), counts=np.full(50, 500))
+        estimator = self.told(world, known, gains=gains)
+        seen = world.near(0.0, 3)
+        world.points[seen[0]] += [0.0, 3.0, 0.0]
+        for step in range(30):
+            estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+            estimator.add(world.see(0.1 * step, seen, pose=world.start))
+        assert estimator.counts['moved_landmark'] == 1
+        assert estimator.counts['lost'] == 0
+
+    @pytest.mark.parametrize('mode', MODES)
+    def test_the_first_observation_is_garbled(self, mode):
+        world = World(4)
+        estimator = self.told(world, world.map(), mode)
+        garbled = world.see(0.0, world.near(0.0, 6))
+        estimator.add(replace(garbled, points=garbled.points[::-1] * 2.0))
+        add(estimator, world.drive(0.1, 3.0, count=2))
+        assert estimator.counts['lost'] == 0
+        assert np.linalg.norm(world.error(estimator, 2.9)[3:]) < 0.3
+
+
 @pytest.mark.parametrize('mode', MODES)
 def test_a_pose_that_is_set_wrong_by_mistake_does_the_map_no_harm(mode):
     world = World(8)

@@ -111,7 +111,7 @@ def _advice(result: Replay) -> str:
     counts, settings = result.estimator.counts, result.estimator.settings
     if counts['unknown_id'] and settings.gains != 'riccati':
         return f'; {counts["unknown_id"]} points without id take --gains riccati'
-    if counts['repeated_id']:
+    if 2 * counts['repeated_id'] > counts['observed_point']:
         return f'; {counts["repeated_id"]} points were {UNUSED_POINTS["repeated_id"]}'
     if settings.set_initial_pose:
         return '; they contradict the pose that was told'

@@ -164,8 +164,9 @@ def _warn_of_rejections(result: Replay) -> None:
     if share > MOST_REJECTED:
         logger.warning(
             '%.0f %% of the points were rejected: look at the signs, units and frames of the '
-            'velocity and of the points, then at their noise.',
+            'velocity and of the points, then at their noise%s.',
             100.0 * share,
+            ', and whether the map is still true' if result.in_known_map else '',
         )
 
 
