@@ -192,19 +192,21 @@ def suggestion(name: str, names: Collection[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else ''
 
 
-def misspelt(name: str, names: Collection[str]) -> str:
-    """Return as :func:`suggestion` what a name is that has a mistake; empty for another name.
+def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
+    """Return the names that are not ours: a parameter file may be shared with other nodes.
 
-    Parameters
-    ----------
-    name : str
-        What was written. Names of other nodes, which may share a parameter file, come near to
-        ours, too, as ``base_frame_id`` does: only a single mistake is one.
-    names : Collection of str
-        What may be meant.
+    Raises
+    ------
+    ParameterError
+        If one is one of ours with a single mistake. With more of them it may well be another
+        node's: ``base_frame_id`` comes near, too.
 
     """
-    return suggestion(name, [ours for ours in names if _is_misspelt(name, ours)])
+    others = [name for name in written if name not in ours]
+    for name in others:
+        if near := suggestion(name, [our for our in ours if _is_misspelt(name, our)]):
+            raise ParameterError(f"unknown parameter '{name}'{near}")
+    return others
 
 
 def read_parameter_file(path: Path) -> dict[str, object]:

@@ -302,14 +302,13 @@ class Slam:
         """Correct the state by the landmarks of ``event``; return which (m,) were not rejected."""
         rows = innovation.indices
         if not len(rows):
-            self.believed_ids = self.rejected_ids = rows
+            self.believed_ids = self.rejected_ids = event.ids
             return np.empty(0, dtype=np.bool_)
         correction, weights = self.gains.correct(innovation)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
         rejected = weights == 0.0
-        ids = self.landmarks.ids[rows]
-        self.believed_ids, self.rejected_ids = ids[~rejected], ids[rejected]
+        self.believed_ids, self.rejected_ids = event.ids[~rejected], event.ids[rejected]
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
         if rejected.any():

@@ -17,7 +17,7 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.parameters import (
     from_parameters,
-    misspelt,
+    names_of_others,
     Parameter,
     read_parameter_file,
     table,
@@ -117,11 +117,8 @@ def _for_estimator(values: Mapping[str, object]) -> dict[str, object]:
     Other names than the observer's are ignored with a warning, as by the node: they may be other
     nodes'.
     """
-    ours = _ESTIMATOR_NAMES | _NODE_NAMES
-    unknown = [name for name in values if name not in ours and not _is_only_for_node(name)]
-    for name in unknown:
-        if near := misspelt(name, ours):
-            raise ParameterError(f"unknown parameter '{name}'{near}")
+    written = [name for name in values if not _is_only_for_node(name)]
+    unknown = names_of_others(written, _ESTIMATOR_NAMES | _NODE_NAMES)
     if unknown and len(unknown) == len(values):
         raise ParameterError("none of the parameters of --config is the observer's")
     if unknown:

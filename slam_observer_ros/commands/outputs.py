@@ -132,10 +132,10 @@ def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(dir=beside, prefix='.writing-') as unfinished:
             yield Path(unfinished)
             directory.mkdir(exist_ok=True)
-            written = {file.name for file in Path(unfinished).iterdir()}
-            for file in sorted(Path(unfinished).iterdir()):
+            files = sorted(Path(unfinished).iterdir())
+            for file in files:
                 file.replace(destination(directory / file.name))
-            for name in set(names) - written:
+            for name in set(names) - {file.name for file in files}:
                 (directory / name).unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or error  # its whole text names a directory that is gone by now

@@ -17,6 +17,7 @@ from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.types import FloatArray
 
 BLUE, RED, GREEN, GREY = '#0072B2', '#D55E00', '#009E73', '#7F7F7F'
+PALE_BLUE = '#7FB8DA'
 
 # The dictionaries are Any: matplotlib's types list the settings of its own version only.
 STYLE: Any = {
@@ -41,9 +42,9 @@ STYLE: Any = {
 }
 
 # The true path is wide and pale, so that an estimate that lies on it hides nothing.
-TRUE_PATH: Any = {'color': '#7FB8DA', 'linestyle': '-', 'linewidth': 3.0, 'label': 'true path'}
+TRUE_PATH: Any = {'color': PALE_BLUE, 'linestyle': '-', 'linewidth': 3.0, 'label': 'true path'}
 PATH: Any = {'color': RED, 'linestyle': '-.', 'label': 'estimated path'}
-TRUE_END: Any = {'color': '#7FB8DA', 'marker': 's', 'linestyle': 'none', 'zorder': 4}
+TRUE_END: Any = {'color': PALE_BLUE, 'marker': 's', 'linestyle': 'none', 'zorder': 4}
 END: Any = {**TRUE_END, 'color': RED, 'markerfacecolor': 'none', 'zorder': 5, 'label': 'its end'}
 TRUE_LANDMARKS: Any = {
     'color': BLUE, 'marker': '*', 'markersize': 10, 'linestyle': 'none', 'zorder': 4,

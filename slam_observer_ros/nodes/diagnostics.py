@@ -52,13 +52,14 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
-        self._last_dropped = self._last_used = 0
+        self._last_dropped = 0
         self._last_counts: Counter[str] = Counter()
 
     def publish(self) -> None:
         """Publish one status; call it about once a second."""
-        dropped, used = self._progress()
-        warnings = self._warnings(dropped)
+        dropped, new = self._progress()
+        warnings = self._warnings(dropped, new)
+        used = new['velocity'] + new['observation']
         level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
         if dropped and not used and not self._intake.is_paused:
             level = DiagnosticStatus.ERROR
@@ -100,33 +101,32 @@ class Diagnostics:
         values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
         return values
 
-    def _progress(self) -> tuple[int, int]:
-        """Return how many messages were dropped and how many used since the last time."""
+    def _progress(self) -> tuple[int, Counter[str]]:
+        """Return how many messages were dropped since the last time, and what else was counted."""
         dropped = self._estimator.dropped.total() + self._intake.dropped.total()
         dropped += sum(source.malformed for source in self._inputs)
-        used = sum(self._estimator.counts[kind] for kind in ('velocity', 'observation'))
-        since_last = dropped - self._last_dropped, used - self._last_used
-        self._last_dropped, self._last_used = dropped, used
+        counts = self._estimator.counts
+        since_last = dropped - self._last_dropped, counts - self._last_counts
+        self._last_dropped, self._last_counts = dropped, counts
         return since_last
 
-    def _warnings(self, dropped: int) -> list[str]:
+    def _warnings(self, dropped: int, new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
         warnings += [clock.trouble(name) for name, clock in self._intake.clocks.items()]
         if self._intake.is_paused:
             warnings.append('paused')
         elif dropped:
             warnings.append(f'{dropped} messages dropped')
-        warnings.append(self._points_warning())
+        warnings.append(self._points_warning(new))
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
         if not self._estimator.is_localised:
             warnings.append('the place in the loaded map is not known yet: no pose is published')
         return [warning for warning in warnings if warning]
 
-    def _points_warning(self) -> str:
+    @staticmethod
+    def _points_warning(new: Counter[str]) -> str:
         """Tell of points left out since the last time: most of them, or such with one id."""
-        counts = self._estimator.counts
-        new, self._last_counts = counts - self._last_counts, counts
         left_out = {name: new[name] for name in LEFT_OUT if new[name]}
         if not (new['repeated_id'] or 2 * sum(left_out.values()) > new['observed_point']):
             return ''

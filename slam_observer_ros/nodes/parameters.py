@@ -17,7 +17,7 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import (
     Dataclass,
     from_parameters,
-    misspelt,
+    names_of_others,
     Parameter,
     SettingsT,
     table,
@@ -99,16 +99,13 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
 
 def _check_names(node: Node, names: Collection[str]) -> None:
     """Raise ParameterError if a name that is set is misspelt; warn of those that are unlike."""
-    ignored = []
     # rclpy, unlike rclcpp, has no public name for what the command line and files set.
-    for name in sorted(node._parameter_overrides):
-        is_of_ros = node.has_parameter(name) or name.startswith('qos_overrides.')
-        if is_of_ros or name in names:
-            continue
-        if near := misspelt(name, names):
-            raise ParameterError(f"unknown parameter '{name}'{near}")
-        ignored.append(name)
-    if ignored:
+    written = [
+        name
+        for name in sorted(node._parameter_overrides)
+        if not (node.has_parameter(name) or name.startswith('qos_overrides.'))
+    ]
+    if ignored := names_of_others(written, names):
         node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
 
 

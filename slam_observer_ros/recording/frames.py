@@ -76,7 +76,7 @@ class BaseFrame:
     Raises
     ------
     ParameterError
-        If ``sensor_pose`` can't be one.
+        If an angle of ``sensor_pose`` is beyond 2π, as those in degrees are.
 
     """
 
@@ -88,10 +88,13 @@ class BaseFrame:
         self._tag_frame_prefix = settings.tag_frame_prefix
         self._sensor_pose: FloatArray | None = None
         if any(settings.sensor_pose):
-            try:
-                self._sensor_pose = pose_from_rpy(settings.sensor_pose)
-            except ParameterError as error:
-                raise ParameterError(f"parameter 'sensor_pose': {error}") from error
+            angles_rad = list(settings.sensor_pose[3:])
+            if np.max(np.abs(angles_rad)) > 2.0 * np.pi:
+                raise ParameterError(
+                    "parameter 'sensor_pose': roll, pitch and yaw are radians, which "
+                    f'{angles_rad} are not'
+                )
+            self._sensor_pose = pose_from_rpy(settings.sensor_pose)
 
     def observation(self, message: ObservationMessage) -> ObservationEvent:
         """Return landmarks in the base frame.
