@@ -99,7 +99,8 @@ class Hypotheses:
 
         Ids and residuals are those of :meth:`slam_observer_ros.slam.Slam.observe`.
         """
-        if len(self._states) == 1 and not (event.ids == UNKNOWN_ID).any():
+        some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
+        if len(self._states) == 1 and not some_are_unknown:
             sighting = self.best.look(event)
             if self._limit == 1 or not len(suspect_ids(self.best, sighting)):
                 return self.best.observe(event, sighting)
@@ -110,6 +111,8 @@ class Hypotheses:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
             seen = slam.observe(reading.event)
+            if some_are_unknown:
+                slam.forget_unsupported(reading.event)
             slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
             if not any(_are_one(slam, reading, other) for other in followed):
                 followed.append(_Followed(slam, reading, seen))

@@ -7,10 +7,10 @@ import numpy as np
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
-LONGEST_LOOK_NS = 1_000_000_000
-"""Most that counts as time in view from one observation to the next, nanoseconds.
+PATIENCE = 4
+"""How many times as often others must have been seen before a landmark has had its chance.
 
-Where the sensor looked in a longer pause, nobody knows.
+Some are seen more seldom than others: from afar, or from one side only.
 """
 
 
@@ -27,8 +27,10 @@ class LandmarkTable:
         (n,) how many observations in a row were rejected at one place, up to now.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
-    overlooked_ns : IntArray
-        (n,) how long each was in view since then and was not seen, nanoseconds.
+    tentative : BoolArray
+        (n,) which have no id of their own, and have yet to be seen often enough to stay.
+    looks : IntArray
+        (n,) in how many observations without ids each was in view.
 
     """
 
@@ -37,8 +39,10 @@ class LandmarkTable:
         self.counts: IntArray = np.empty(0, dtype=np.int64)
         self.rejections: IntArray = np.empty(0, dtype=np.int64)
         self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
-        self.overlooked_ns: IntArray = np.empty(0, dtype=np.int64)
-        self._in_view_ns: IntArray = np.empty(0, dtype=np.int64)
+        self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
+        self.looks: IntArray = np.empty(0, dtype=np.int64)
+        self._settled_looks = 0
+        self._settled_seen = 0
         self._rejected_at: FloatArray = np.empty((0, 3))
         self._order: IntArray = np.empty(0, dtype=np.int64)
 
@@ -61,20 +65,20 @@ class LandmarkTable:
         self.rejections = np.concatenate([self.rejections, np.zeros(len(ids), dtype=np.int64)])
         self._rejected_at = np.concatenate([self._rejected_at, np.zeros((len(ids), 3))])
         self.last_seen_ns = np.concatenate([self.last_seen_ns, np.full(len(ids), stamp_ns)])
-        none = np.zeros(len(ids), dtype=np.int64)
-        self.overlooked_ns = np.concatenate([self.overlooked_ns, none])
-        self._in_view_ns = np.concatenate([self._in_view_ns, np.full(len(ids), stamp_ns)])
+        self.tentative = np.concatenate([self.tentative, is_automatic(ids)])
+        self.looks = np.concatenate([self.looks, np.zeros(len(ids), dtype=np.int64)])
         self._order = np.argsort(self.ids)
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
         """Append landmarks (m,) that were seen ``counts`` (m,) times before this run."""
+        n = len(self)
         self.add(ids, -1)
-        self.counts[len(self.counts) - len(ids) :] = counts
+        self.counts[n:] = counts
+        self.tentative[n:] = False
 
     def restart_time(self) -> None:
         """Take all landmarks as last seen before any stamp to come."""
         self.last_seen_ns = np.full(len(self), -1)
-        self._in_view_ns = np.full(len(self), -1)
 
     def renumber(self, indices: IntArray, ids: IntArray) -> None:
         """Give the rows ``indices`` (m,) other ids (m,)."""
@@ -86,8 +90,6 @@ class LandmarkTable:
         self.counts[indices] += 1
         self.rejections[indices] = 0
         self.last_seen_ns[indices] = np.maximum(self.last_seen_ns[indices], stamp_ns)
-        self.overlooked_ns[indices] = 0
-        self._in_view_ns[indices] = stamp_ns
 
     def reject(
         self, indices: IntArray, world_points: FloatArray, tolerances_m: FloatArray
@@ -114,16 +116,23 @@ class LandmarkTable:
         needed = np.minimum(self.counts[indices] + 1, max_rejections)
         return np.asarray(rejections >= needed)
 
-    def unconfirmed(self, confirmations: int) -> IntArray:
-        """Return rows without an id that were seen too seldom."""
-        return np.flatnonzero(is_automatic(self.ids) & (self.counts < confirmations))
+    def look(self, indices: IntArray, seen: BoolArray) -> None:
+        """Count one more observation that had rows (m,) in view, and which of them it saw."""
+        settled = ~self.tentative[indices]
+        self._settled_looks += int(np.sum(settled))
+        self._settled_seen += int(np.sum(settled & seen))
+        self.looks[indices] += 1
 
-    def overlook(self, indices: IntArray, in_view: BoolArray, stamp_ns: int) -> None:
-        """Add the time up to ``stamp_ns`` for those of the rows (m,) that were and are in view."""
-        since_ns = self._in_view_ns[indices]
-        looked_ns = np.minimum(stamp_ns - since_ns, LONGEST_LOOK_NS)
-        self.overlooked_ns[indices] += np.where(in_view & (since_ns >= 0), looked_ns, 0)
-        self._in_view_ns[indices] = np.where(in_view, stamp_ns, -1)
+    def unsupported(self, min_support: int) -> IntArray:
+        """Return rows without an id that were seen too seldom to be landmarks.
+
+        That is less than ``min_support`` times by when a settled one, as often in view, would have
+        been seen :data:`PATIENCE` times as often. One that was seen so often has settled.
+        """
+        self.tentative &= self.counts < min_support
+        # As if one of four looks had met at first, when nobody knows how often one does.
+        share = (1 + self._settled_seen) / (4 + self._settled_looks)
+        return np.flatnonzero(self.tentative & (self.looks * share >= PATIENCE * min_support))
 
     def unseen_since(self, stamp_ns: int) -> IntArray:
         """Return rows not seen since a stamp: least often seen first, then longest ago."""
@@ -134,8 +143,8 @@ class LandmarkTable:
         """Take the rows ``indices`` as seen for the first time."""
         self.counts[indices] = 1
         self.rejections[indices] = 0
-        self.overlooked_ns[indices] = 0
-        self._in_view_ns[indices] = -1
+        self.tentative[indices] = is_automatic(self.ids[indices])
+        self.looks[indices] = 0
 
     def remove(self, indices: IntArray) -> None:
         """Delete rows; those behind move up."""
@@ -144,6 +153,6 @@ class LandmarkTable:
         self.rejections = np.delete(self.rejections, indices)
         self._rejected_at = np.delete(self._rejected_at, indices, axis=0)
         self.last_seen_ns = np.delete(self.last_seen_ns, indices)
-        self.overlooked_ns = np.delete(self.overlooked_ns, indices)
-        self._in_view_ns = np.delete(self._in_view_ns, indices)
+        self.tentative = np.delete(self.tentative, indices)
+        self.looks = np.delete(self.looks, indices)
         self._order = np.argsort(self.ids)

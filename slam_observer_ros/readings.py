@@ -66,7 +66,6 @@ def readings(
     gains = slam.gains
     if not isinstance(gains, RiccatiGains):
         return [Reading(event, 0.0)]
-    slam.forget_unsupported(event)
     sighting = slam.look(event)
     suspects = suspect_ids(slam, sighting)
     if (event.ids == UNKNOWN_ID).any():

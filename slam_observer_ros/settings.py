@@ -221,14 +221,11 @@ class Settings(Immutable):
         'Most landmarks kept; a new one then replaces the one seen least often; 0 for any number',
         minimum=0,
     )
-    support_timeout: float = parameter(
-        10.0,
-        'Points without id: how long a landmark with too few confirmations is kept that is in '
-        'view, as far as can be told, and not seen; between two observations a second counts at '
-        'most',
-        unit='s',
-        minimum=0.0,
-        maximum=1e6,
+    min_support: int = parameter(
+        5,
+        'Points without id: how often a landmark must be seen to stay, by when others as often in '
+        'view would have been seen four times as often; 1 for all to stay',
+        minimum=1,
     )
     max_hypotheses: int = parameter(
         8,

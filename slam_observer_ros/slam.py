@@ -9,7 +9,7 @@ import numpy as np
 from slam_observer_ros.axes import axes_of
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimates import Smoothed
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.field_of_view import FieldOfView
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Innovation
@@ -275,20 +275,19 @@ class Slam:
         self.landmarks.remove(rows)
 
     def forget_unsupported(self, event: ObservationEvent) -> None:
-        """Forget landmarks without an id that were seen too seldom, though they were in view.
+        """Forget landmarks without an id that were seen too seldom, after an observation of some.
 
         One that the robot has turned away from may be the only tie to what was mapped before.
         """
-        rows = self.landmarks.unconfirmed(self.settings.confirmations)
-        if len(rows):
-            in_view = self.field_of_view.contains(self.observer.body_points(rows))
-            self.landmarks.overlook(rows, in_view, event.stamp_ns)
-            overlooked_s = self.landmarks.overlooked_ns[rows] * 1e-9
-            forgotten = rows[overlooked_s > self.settings.support_timeout]
-            if len(forgotten):
-                self.remove(forgotten)
-                self.counts['unsupported_landmark'] += len(forgotten)
+        rows = np.flatnonzero(is_automatic(self.landmarks.ids))
+        seen = self.landmarks.last_seen_ns[rows] == event.stamp_ns
+        in_view = seen | self.field_of_view.contains(self.observer.body_points(rows))
+        self.landmarks.look(rows[in_view], seen[in_view])
         self.field_of_view.include(event.points)
+        forgotten = self.landmarks.unsupported(self.settings.min_support)
+        if len(forgotten):
+            self.remove(forgotten)
+            self.counts['unsupported_landmark'] += len(forgotten)
 
     def _turn_to_world(self, A: FloatArray) -> FloatArray:
         """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""

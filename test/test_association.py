@@ -45,7 +45,6 @@ from slam_observer_ros.settings import Settings
 CONFIG = Path(__file__).resolve().parent.parent / 'config' / 'wheeled_bearing_range.yaml'
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
 SPATIAL = Settings(reorder_window=0.0)
-SECOND_NS = 1_000_000_000
 
 
 def nameless(event):
@@ -97,8 +96,44 @@ def test_what_is_seen_once_or_twice_is_never_in_the_map_and_soon_forgotten():
     assert estimator.counts['unsupported_landmark'] == 1
 
 
+def with_false_points(world, share, seed=0):
+    """Add points where any landmark might be seen, as many as ``share`` of the true ones."""
+    rng = np.random.default_rng(seed)
+    seen = np.concatenate([event.points for event in world.observations()])
+
+    def change(_, event):
+        m = rng.binomial(len(event.ids), share)
+        turns = se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]) * rng.uniform(-0.5, 0.5, (m, 1)))
+        false = rng.uniform(0.5, 1.5, (m, 1)) * seen[rng.integers(len(seen), size=m)]
+        points = np.concatenate([event.points, se3.rotate(turns, false[:, None])[:, 0]])
+        return replace(event, ids=np.full(len(points), UNKNOWN_ID), points=points)
+
+    return world.with_observations(change)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_false_points_among_those_without_ids_leave_few_landmarks_behind(seed):
+    world = gain_worlds.drive(PLANAR, 200.0, seed, landmarks=8)
+    named = gain_worlds.estimate(world, PLANAR)
+    estimator = gain_worlds.estimate(with_false_points(world, 0.05, seed), PLANAR)
+    assert estimator.counts['unsupported_landmark'] > 20
+    assert len(estimator.landmark_ids) <= len(named.landmark_ids) + 3
+    assert_allclose(estimator.pose, named.pose, atol=0.1)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_sensor_that_seldom_sees_what_is_in_view_maps_it_all_the_same(seed):
+    rng = np.random.default_rng(seed)
+    world = gain_worlds.drive(PLANAR, 200.0, seed, landmarks=8, seen=8)
+    seldom = world.with_observations(lambda _, e: e.select(rng.random(len(e.ids)) < 0.1))
+    estimator = gain_worlds.estimate(without_ids(seldom), PLANAR)
+    named = gain_worlds.estimate(seldom, PLANAR)
+    assert len(estimator.landmark_ids) == len(named.landmark_ids) == 8
+    assert_allclose(estimator.pose, named.pose, atol=0.05)
+
+
 def test_what_was_seen_once_is_known_again_after_looking_elsewhere():
-    """The robot turns round with its back to it, for far longer than ``support_timeout``."""
+    """The robot turns round with its back to it, for 300 observations."""
     front = np.array([[3.0, 0.0, 0.0], [3.0, 1.5, 0.0], [3.0, -1.5, 0.0]])
     back = np.array([[-3.0, 0.5, 0.0], [-3.0, -1.0, 0.0]])
     once = np.array([[2.5, -0.8, 0.0]])
@@ -388,19 +423,44 @@ def test_the_index_misses_no_landmark_while_they_move_and_change_in_number(seed,
         landmarks = np.delete(landmarks, rng.integers(len(landmarks)), axis=0)
 
 
-def test_a_landmark_that_was_placed_anew_has_not_been_overlooked_before():
-    landmarks, row, in_view = LandmarkTable(), np.array([0]), np.array([True])
-    landmarks.add(np.array([FIRST_AUTOMATIC_ID]), 0)
-    landmarks.restart(row)
-    for second in (100, 101):
-        landmarks.overlook(row, in_view, second * SECOND_NS)
-    assert landmarks.overlooked_ns.tolist() == [SECOND_NS]
+def looked_at(counts, looks, settled_looks=0, settled_seen=0):
+    """A table of landmarks without ids, after one that has settled was in view and seen so often.
+
+    The landmark of row 0 is that one, the next are those of ``counts`` and ``looks``.
+    """
+    landmarks = LandmarkTable()
+    landmarks.add_known(np.array([FIRST_AUTOMATIC_ID]), np.array([100]))
+    landmarks.add(FIRST_AUTOMATIC_ID + 1 + np.arange(len(counts)), 0)
+    landmarks.counts[1:] = counts
+    for look in range(settled_looks):
+        landmarks.look(np.array([0]), np.array([look < settled_seen]))
+    for row, times in enumerate(looks, start=1):
+        for _ in range(times):
+            landmarks.look(np.array([row]), np.array([False]))
+    return landmarks
 
 
-def test_a_landmark_is_not_overlooked_while_nothing_is_observed():
-    """The robot may have turned away and back."""
-    landmarks, row, in_view = LandmarkTable(), np.array([0]), np.array([True])
-    landmarks.add(np.array([FIRST_AUTOMATIC_ID]), 0)
-    for step in (5, 10, 200, 205):
-        landmarks.overlook(row, in_view, step * SECOND_NS // 10)
-    assert landmarks.overlooked_ns.tolist() == [2.5 * SECOND_NS]
+def test_a_landmark_seen_far_more_seldom_than_others_in_view_is_unsupported():
+    landmarks = looked_at([1, 4, 4, 5], [50, 50, 20, 50], settled_looks=996, settled_seen=499)
+    assert landmarks.unsupported(5).tolist() == [1, 2]
+    assert landmarks.unsupported(1).tolist() == []
+
+
+def test_where_all_are_seen_seldom_it_takes_longer():
+    landmarks = looked_at([1, 1], [199, 201], settled_looks=996, settled_seen=99)
+    assert landmarks.unsupported(5).tolist() == [2]
+
+
+def test_what_has_settled_stays_however_long_it_is_not_seen():
+    landmarks = looked_at([5], [0], settled_looks=100, settled_seen=100)
+    assert landmarks.unsupported(5).tolist() == []
+    for _ in range(1000):
+        landmarks.look(np.array([0, 1]), np.array([True, False]))
+    assert landmarks.unsupported(5).tolist() == []
+
+
+def test_a_landmark_that_was_placed_anew_has_its_chance_again():
+    landmarks = looked_at([4], [39], settled_looks=996, settled_seen=499)
+    landmarks.restart(np.array([1]))
+    landmarks.look(np.array([1]), np.array([False]))
+    assert landmarks.unsupported(5).tolist() == []

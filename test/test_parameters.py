@@ -52,7 +52,7 @@ rows_of_all_tables = pytest.mark.parametrize(
 
 
 def test_a_time_in_nanoseconds_is_refused_where_seconds_are_meant():
-    for name in ('velocity_timeout', 'reorder_window', 'late_limit', 'support_timeout'):
+    for name in ('velocity_timeout', 'reorder_window', 'late_limit'):
         assert name in error_text({name: 1e10}, Settings)
 
 
