@@ -85,6 +85,7 @@ def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:
     """Yield all jobs on the worlds of these names, the longest first."""
     for name in names:
         yield Job(report.CLEAN, name, GTSAM_JOB, first_s)
+        yield Job(report.FALSE_POINTS, name, 'riccati', first_s)
         yield Job(report.NO_IDS, name, 'riccati', first_s)
     for name in names:
         for column in (*estimators.ONLINE, estimators.SMOOTHED):

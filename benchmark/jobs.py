@@ -66,7 +66,9 @@ def run_job(job: Job) -> dict[str, Scores]:
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
     world = _load(job.world) if job.first_s is None else _load(job.world).first(job.first_s)
     if job.variant == report.NO_IDS:
-        return {job.column: _score_without_ids(world)}
+        return {job.column: _score_without_ids(outliers.without_ids(world))}
+    if job.variant == report.FALSE_POINTS:
+        return {job.column: _score_without_ids(outliers.with_false_points(world, seed=1))}
     if job.variant == report.OUTLIERS:
         return _score_draws(job, world, outliers.with_outliers)
     if job.variant == report.LEFT_OUT:
@@ -122,7 +124,7 @@ def _with_least_cpu_time(column: str, world: World) -> dict[str, Run]:
 
 def _score_without_ids(world: World) -> Scores:
     estimator = estimators.observer('riccati')(world.settings)
-    run = estimators.run_online(estimator, outliers.without_ids(world).events)
+    run = estimators.run_online(estimator, world.events)
     if not len(estimator.landmark_ids):
         return FAILED
     return score(run, world, has_ids=False)

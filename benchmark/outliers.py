@@ -1,4 +1,4 @@
-"""Worse data: outliers added to observations, points or ids taken from them."""
+"""Worse data: outliers or false points added to observations, points or ids taken from them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from slam_observer_ros.types import FloatArray, IntArray
 GROSS_SHARE = 0.05
 GROSS_M = (0.5, 20.0)
 SWAPPED_SHARE = 0.01
+FALSE_SHARE = 0.05
 
 
 def with_outliers(world: World, seed: int) -> World:
@@ -48,6 +49,18 @@ def without_ids(world: World) -> World:
     return replace(world, events=[_anonymous(event) for event in world.events])
 
 
+def with_false_points(world: World, seed: int) -> World:
+    """Take the ids away and add 5 % of points where nothing is, as reflections make them.
+
+    They are seen where some landmark was at another time of the run, so the sensor can see there.
+    """
+    rng = np.random.default_rng(seed)
+    anonymous = without_ids(world)
+    elsewhere = [event for event in anonymous.events if isinstance(event, ObservationEvent)]
+    events = [_joined(event, elsewhere, rng) for event in anonymous.events]
+    return replace(anonymous, events=events)
+
+
 def _displaced(points: FloatArray, planar: bool, rng: np.random.Generator) -> FloatArray:
     m = len(points)
     directions = rng.standard_normal((m, 3))
@@ -73,6 +86,23 @@ def _untouched(event: Event, other: Event) -> Event:
     if not isinstance(event, ObservationEvent) or not isinstance(other, ObservationEvent):
         return event
     return event.select((event.ids == other.ids) & (event.points == other.points).all(axis=1))
+
+
+def _joined(event: Event, elsewhere: list[ObservationEvent], rng: np.random.Generator) -> Event:
+    """Return an observation with single points of others in it, now and then."""
+    if not isinstance(event, ObservationEvent):
+        return event
+    parts = [event]
+    for _ in range(rng.binomial(len(event.ids), FALSE_SHARE)):
+        other = elsewhere[rng.integers(len(elsewhere))]
+        parts.append(other.select(np.arange(len(other.ids)) == rng.integers(len(other.ids))))
+    covariances = [part.covariances for part in parts if part.covariances is not None]
+    return replace(
+        event,
+        ids=np.concatenate([part.ids for part in parts]),
+        points=np.concatenate([part.points for part in parts]),
+        covariances=np.concatenate(covariances) if covariances else None,
+    )
 
 
 def _anonymous(event: Event) -> Event:

@@ -21,7 +21,8 @@ from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.types import FloatArray
 
 CLEAN, OUTLIERS, LEFT_OUT, NO_IDS = 'accuracy', 'with_outliers', 'left_out', 'without_ids'
-VARIANTS = (CLEAN, OUTLIERS, LEFT_OUT, NO_IDS)
+FALSE_POINTS = 'false_points'
+VARIANTS = (CLEAN, OUTLIERS, LEFT_OUT, NO_IDS, FALSE_POINTS)
 OUTLIER_COLUMNS = (*DESIGNS, EKF, ISAM2_DEFAULT)
 WORST = ', worst draw'
 LEFT_OUT_COLUMN = 'riccati, these points left out'
@@ -70,7 +71,9 @@ METRICS: dict[str, tuple[str, int]] = {
 
 OUTLIERS_TITLE = 'Growth of the configuration error with 5 % gross outliers and 1 % swapped ids'
 NO_IDS_TITLE = 'Configuration error and CPU time with and without ids'
-NO_IDS_COLUMNS = ('with, m', 'without, m', 'with, s', 'without, s')
+NO_IDS_COLUMNS = tuple(
+    f'{case}, {unit}' for unit in 'ms' for case in ('with', 'without', 'and with 5 % false points')
+)
 
 BATCHES_TITLE = f'inside, {BATCH_OF_RUNS} runs at a time'
 CONSISTENCY_COLUMNS = ('inside', BATCHES_TITLE, 'pose', 'landmarks')
@@ -261,9 +264,10 @@ def _growth(tables: Tables) -> dict[str, dict[str, str]]:
 def _without_ids(tables: Tables) -> dict[str, dict[str, str]]:
     rows = {}
     for world, columns in tables[NO_IDS].items():
-        both = tables[CLEAN][world]['riccati'], columns['riccati']
-        errors = [_number(scores.configuration_rmse_m, 3) for scores in both]
-        times = [_number(scores.cpu_s, 2) for scores in both]
+        worse = tables[FALSE_POINTS][world]['riccati']
+        cases = tables[CLEAN][world]['riccati'], columns['riccati'], worse
+        errors = [_number(scores.configuration_rmse_m, 3) for scores in cases]
+        times = [_number(scores.cpu_s, 2) for scores in cases]
         rows[world] = dict(zip(NO_IDS_COLUMNS, errors + times, strict=True))
     return rows
 
@@ -307,6 +311,7 @@ def _summary(tables: Tables) -> dict[str, dict[str, str]]:
         (OUTLIERS, 'riccati' + WORST, 'with outliers, worst draw / without', ''),
         (LEFT_OUT, 'riccati', 'these points left out / all', ''),
         (NO_IDS, 'riccati', 'without ids / with', 'mean ≤ 1.3'),
+        (FALSE_POINTS, 'riccati', 'without ids, with 5 % false points / with', ''),
     ):
         values = {
             world: (
