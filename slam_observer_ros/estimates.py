@@ -36,7 +36,7 @@ class Update:
     residuals : FloatArray
         (m, 3) their residuals r_i before the correction, metres, along the world's axes.
     lyapunov : float
-        L (34) of these residuals.
+        L (34) of these residuals, of rejected ones, too; k_i is ``gain_k`` whatever the gains.
 
     """
 

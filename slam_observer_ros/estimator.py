@@ -9,7 +9,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.counted_warnings import CountedWarnings
-from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.errors import InvalidEventError, ParameterError
 from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import (
@@ -23,6 +23,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.map_frame import MapFrame
 from slam_observer_ros.observer import lyapunov
+from slam_observer_ros.parameters import table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
@@ -175,7 +176,20 @@ class Estimator:
         self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other gains from now on; only what may change while running may differ."""
+        """Use other values of the settings that may change while running, from now on.
+
+        Raises
+        ------
+        ParameterError
+            If another setting differs.
+
+        """
+        fixed = [row.name for row in table(Settings) if row.read_only]
+        changed = [
+            name for name in fixed if getattr(settings, name) != getattr(self.settings, name)
+        ]
+        if changed:
+            raise ParameterError(f'{", ".join(changed)} can only be set before the start')
         self.settings = settings
         self._frame.change_settings(settings)
 

@@ -77,7 +77,7 @@ class Hypotheses:
             slam.advance(velocities, start_ns, end_ns)
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other gains from now on, in all states."""
+        """Use other values of the settings that may change, in all states."""
         for slam in self._states:
             slam.change_settings(settings)
 

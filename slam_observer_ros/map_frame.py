@@ -91,7 +91,7 @@ class MapFrame:
         )
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other gains from now on."""
+        """Use other values of the settings that may change, from now on."""
         self.settings = settings
         self.states.change_settings(settings)
 

@@ -53,8 +53,9 @@ class NoiseModel(Immutable):
         """Return the covariances (k, 6, 6) of k body-frame motions, rad² and m².
 
         While a velocity is in force its error is white noise: of the stated density and
-        proportional to speed. The speed is that of a second's motion: in a single message it is
-        noisy itself, and its square the larger the more messages there are. Where the message has
+        proportional to speed. The speed is that of a second's motion, or of all of ``held`` where
+        that is less: in a single message it is noisy itself, and its square the larger the more
+        messages there are. Where the message has
         a covariance its error is the same as long as it is held, and another one in the next
         message: what was held for t has moved the robot by t times the error, however many
         motions that was cut into. The angular and the linear part may be of two messages, of

@@ -187,7 +187,7 @@ class Observer:
 
     def propagate(self, path: FloatArray) -> None:
         """Advance Â to the end of a ``path`` (k + 1, 4, 4)."""
-        self.A = path[-1]
+        self.A = path[-1].copy()
         self.A[:3, :3] = so3.normalise(self.A[:3, :3])
 
     def set_landmark_velocities(self, indices: IntArray, velocities: FloatArray) -> None:
@@ -205,7 +205,7 @@ class Observer:
         self.have_moved = self.have_moved or bool(velocities.any())
 
     def move_landmarks(self, duration_s: float) -> None:
-        """Add R_Â v_i dt to â_i: the lift of the landmarks' own velocities (19)."""
+        """Add R_Â v_i dt to â_i, where (27) has zero: here landmarks may have velocities (19)."""
         if self.have_moved:  # else this would cost O(n) at every step
             self.a += self.u * duration_s
 

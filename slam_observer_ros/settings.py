@@ -21,8 +21,9 @@ class Settings(Immutable):
     gains: str = parameter('riccati', 'Gain design', choices=('constant', 'scheduled', 'riccati'))
     gain_k: float = parameter(
         4.0,
-        "Constant gains: k of the paper's (30), how fast the pose follows the residuals",
-        unit='1/(m² s)',
+        "Constant gains: k of the paper's (30), with metres: how fast the pose follows the "
+        'residuals',
+        unit='1/s',
         minimum=1e-6,
         maximum=1e6,
         read_only=False,
@@ -30,7 +31,7 @@ class Settings(Immutable):
     gain_l: float = parameter(
         1.0,
         "Constant gains: l of the paper's (31); a landmark's residual decays at the rate l/k",
-        unit='1/(m² s²)',
+        unit='1/s²',
         minimum=0.0,
         maximum=1e6,
         read_only=False,

@@ -156,7 +156,7 @@ class Slam:
         self.gains.restart(self.observer, 'the clock jumped')
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other gains from now on."""
+        """Use other values of the settings that may change, from now on."""
         self.settings = settings
         self.gains.change_settings(settings)
 

@@ -7,7 +7,7 @@ from scipy import special
 
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
+from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -108,10 +108,7 @@ def average_nees_band(
 
 
 def anchored_average_nees(
-    estimate: Trajectory,
-    covariances: FloatArray,
-    truth: Trajectory,
-    max_gap_ns: int = MAX_GAP_NS,
+    estimate: Trajectory, covariances: FloatArray, truth: Trajectory
 ) -> float | None:
     """Compute the pose's ANEES of one run, with the truth moved onto its first estimated pose.
 
@@ -126,8 +123,6 @@ def anchored_average_nees(
         (k, 6, 6) of world-axes rotation vector and position.
     truth : Trajectory
         True poses, at any rate.
-    max_gap_ns : int
-        Longest gap in the truth that is interpolated, nanoseconds.
 
     Returns
     -------
@@ -135,7 +130,7 @@ def anchored_average_nees(
         As :func:`average_nees`; None where the truth covers no pose.
 
     """
-    paired, true_paired, covered = associate(estimate, truth, max_gap_ns)
+    paired, true_paired, covered = associate(estimate, truth)
     if len(paired) == 0:
         return None
     anchored = true_paired.moved(paired.poses[0] @ se3.inverse(true_paired.poses[0]))

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_observer_ros.evaluation.alignment import align
 from slam_observer_ros.evaluation.errors import EvaluationError
-from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
+from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.events import LandmarkTruth
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -73,9 +73,7 @@ class TrajectoryErrors:
         return root_mean_square(self.errors[:, 2])
 
 
-def trajectory_errors(
-    estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
-) -> TrajectoryErrors:
+def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
     """Compare a trajectory with the truth after one rigid alignment of all positions.
 
     Parameters
@@ -84,8 +82,6 @@ def trajectory_errors(
         Estimated poses, in any world frame.
     truth : Trajectory
         True poses, at any rate.
-    max_gap_ns : int
-        Longest gap in the truth that is interpolated, nanoseconds.
 
     Raises
     ------
@@ -93,7 +89,7 @@ def trajectory_errors(
         The truth covers no pose of the estimate.
 
     """
-    paired, true_paired, covered = associate(estimate, truth, max_gap_ns)
+    paired, true_paired, covered = associate(estimate, truth)
     if len(paired) == 0:
         raise EvaluationError('no pose of the estimate is at a time that the truth covers')
     alignment = align(paired.positions, true_paired.positions)

@@ -150,9 +150,7 @@ def _between(start: FloatArray, end: FloatArray, fraction: FloatArray) -> FloatA
     return se3.pose(rotations, start[:, :3, 3] + fraction[:, None] * shift)
 
 
-def associate(
-    estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
-) -> tuple[Trajectory, Trajectory, BoolArray]:
+def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory, BoolArray]:
     """Pair each estimated pose with the true one at the same time.
 
     Parameters
@@ -160,9 +158,7 @@ def associate(
     estimate : Trajectory
         k estimated poses.
     truth : Trajectory
-        True poses at any rate, interpolated.
-    max_gap_ns : int
-        See :func:`interpolate`.
+        True poses at any rate, interpolated (:func:`interpolate`).
 
     Returns
     -------
@@ -172,7 +168,7 @@ def associate(
         (k,) which of the estimated poses these are.
 
     """
-    true_poses, covered = interpolate(truth, estimate.stamps_ns, max_gap_ns)
+    true_poses, covered = interpolate(truth, estimate.stamps_ns)
     stamps_ns = estimate.stamps_ns[covered]
     return (
         Trajectory(stamps_ns, estimate.poses[covered]),

@@ -155,7 +155,10 @@ def same_configuration(Xi: TotalState, other: TotalState, tolerance_m: float) ->
 
 
 def phi_total(X: SlamElement, Xi: TotalState) -> TotalState:
-    """Right action Φ((A, a_i), (P, p_i)) = (P A, p_i + R_P a_i) on the total space (24)."""
+    """Right action Φ((A, a_i), (P, p_i)) = (P A, p_i + R_P a_i) on the total space.
+
+    It is what (24) calls Φ_X.
+    """
     return TotalState(Xi.P @ X.A, Xi.p + se3.rotate(Xi.P, X.a))
 
 

@@ -172,7 +172,7 @@ class Intake:
         clock = self.clocks[source]
         clock.add(stamp_ns, receive_ns)
         if self._settings.correct_clock_offset and clock.offset_ns is None:
-            self.dropped['clock_unknown'] += 1
+            self._drop('clock_unknown', f'the clock of {source} is not known yet')
             return False
         if clock.is_off:
             self._warn(source, clock.trouble(source))
@@ -182,8 +182,8 @@ class Intake:
         self.dropped[reason] += 1
         self._warn(reason, f'dropped a message ({reason}, {self.dropped[reason]} so far): {text}')
 
-    def _warn(self, topic: str, text: str) -> None:
+    def _warn(self, subject: str, text: str) -> None:
         now_s = time.monotonic()
-        if now_s >= self._quiet_until_s.get(topic, now_s):
-            self._quiet_until_s[topic] = now_s + REPORT_PERIOD_S
+        if now_s >= self._quiet_until_s.get(subject, now_s):
+            self._quiet_until_s[subject] = now_s + REPORT_PERIOD_S
             self._node.get_logger().warning(text)

@@ -210,28 +210,20 @@ class RecordingWriter:
         message = self._messages.point_cloud2(event.stamp_ns, frame_id, layout)
         self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
-    def write_pose(
-        self, truth: PoseTruth, topic: str = POSE_TRUTH_TOPIC, frame_id: str = MAP_FRAME
-    ) -> None:
+    def write_pose(self, truth: PoseTruth) -> None:
         """Write a true pose as PoseStamped."""
         message = self._messages.make(
             'geometry_msgs/msg/PoseStamped',
-            self._messages.header(truth.stamp_ns, frame_id),
+            self._messages.header(truth.stamp_ns, MAP_FRAME),
             self._messages.pose(truth.pose),
         )
-        self._write_message(topic, message, truth.stamp_ns)
+        self._write_message(POSE_TRUTH_TOPIC, message, truth.stamp_ns)
 
-    def write_landmarks(
-        self,
-        stamp_ns: int,
-        truth: LandmarkTruth,
-        topic: str = LANDMARK_TRUTH_TOPIC,
-        frame_id: str = MAP_FRAME,
-    ) -> None:
+    def write_landmarks(self, stamp_ns: int, truth: LandmarkTruth) -> None:
         """Write true landmark positions as a latched PointCloud2 with ids."""
         layout = point_cloud2_layout(truth.ids, truth.world_points)
-        message = self._messages.point_cloud2(stamp_ns, frame_id, layout)
-        self._write_message(topic, message, stamp_ns, latched=True)
+        message = self._messages.point_cloud2(stamp_ns, MAP_FRAME, layout)
+        self._write_message(LANDMARK_TRUTH_TOPIC, message, stamp_ns, latched=True)
 
     def _write_message(
         self,
