@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.axes import axes_of, SPATIAL
-from slam_observer_ros.gains.base import Innovation
+from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
 from slam_observer_ros.joint_compatibility import (
@@ -88,11 +88,11 @@ def find_assignments(
     axes = axes_of(settings.two_d_mode)
     gate, m, k = settings.rejection_distance, len(points), axes.point
     at, rows = _pairs_within(gate, observer, gains, index, points, noise, known_rows)
-    innovation = _as_innovation(observer, rows, points[at], noise[at])
-    PC, CPC = gains.foretold(innovation)
-    own_noise = innovation.covariances[:, :k, :k]
+    residuals = _as_residuals(observer, rows, points[at], noise[at])
+    PC, CPC = gains.foretold(residuals)
+    own_noise = residuals.covariances[:, :k, :k]
     S = with_blocks(CPC, own_noise)
-    pairs = Pairs(at, rows, innovation.r[:, :k], S, own_noise)
+    pairs = Pairs(at, rows, residuals.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
     lonely_cost = (m - len(np.unique(at))) * unpaired_cost(gate)
     margin = 0.0 if nearly.all() else MARGIN
@@ -127,20 +127,20 @@ def _pairs_within(
     at, rows = index.near(landmarks, points, gate * spread_m)
     allowed = np.where(known_rows[at] >= 0, rows == known_rows[at], ~np.isin(rows, known_rows))
     at, rows = at[allowed], rows[allowed]
-    distances = gains.distances(_as_innovation(observer, rows, points[at], noise[at]))
+    distances = gains.distances(_as_residuals(observer, rows, points[at], noise[at]))
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
     near = order[(rank < MAX_CANDIDATES) & (distances[order] <= gate)]
     return at[near], rows[near]
 
 
-def _as_innovation(
+def _as_residuals(
     observer: Observer, rows: IntArray, points: FloatArray, noise: FloatArray
-) -> Innovation:
+) -> Residuals:
     """Return what it would be to see the landmarks ``rows`` (q,) at ``points`` (q, 3)."""
     a = observer.a[rows]
     e = points - a
-    return Innovation(rows, e, e - observer.y_ref[rows], a, noise, np.zeros(len(rows)))
+    return Residuals(rows, e, e - observer.y_ref[rows], a, noise, np.zeros(len(rows)))
 
 
 def _largest(vectors: FloatArray) -> float:

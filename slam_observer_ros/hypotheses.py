@@ -88,7 +88,7 @@ class Hypotheses:
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
-        rows = [slam.landmarks.indices_of(np.array([landmark_id])) for slam in self._states]
+        rows = [slam.landmarks.rows_of(np.array([landmark_id])) for slam in self._states]
         for slam, row in zip(self._states, rows, strict=True):
             if row[0] >= 0:
                 slam.remove(row)

@@ -50,7 +50,7 @@ class LandmarkTable:
         """Return the number of landmarks."""
         return len(self.ids)
 
-    def indices_of(self, ids: IntArray) -> IntArray:
+    def rows_of(self, ids: IntArray) -> IntArray:
         """Return the row of each id (m,), −1 where it is unknown."""
         if not len(self.ids):
             return np.full(len(ids), -1)
@@ -80,48 +80,46 @@ class LandmarkTable:
         """Take all landmarks as last seen before any stamp to come."""
         self.last_seen_ns = np.full(len(self), -1)
 
-    def renumber(self, indices: IntArray, ids: IntArray) -> None:
-        """Give the rows ``indices`` (m,) other ids (m,)."""
-        self.ids[indices] = ids
+    def renumber(self, rows: IntArray, ids: IntArray) -> None:
+        """Give ``rows`` (m,) other ids (m,)."""
+        self.ids[rows] = ids
         self._order = np.argsort(self.ids)
 
-    def see(self, indices: IntArray, stamp_ns: int) -> None:
-        """Count one more accepted observation of the rows ``indices`` (m,)."""
-        self.counts[indices] += 1
-        self.rejections[indices] = 0
-        self.last_seen_ns[indices] = np.maximum(self.last_seen_ns[indices], stamp_ns)
+    def see(self, rows: IntArray, stamp_ns: int) -> None:
+        """Count one more accepted observation of ``rows`` (m,)."""
+        self.counts[rows] += 1
+        self.rejections[rows] = 0
+        self.last_seen_ns[rows] = np.maximum(self.last_seen_ns[rows], stamp_ns)
 
-    def reject(
-        self, indices: IntArray, world_points: FloatArray, tolerances_m: FloatArray
-    ) -> None:
-        """Count one more rejected observation of the rows ``indices`` (m,).
+    def reject(self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray) -> None:
+        """Count one more rejected observation of ``rows`` (m,).
 
         Only rejections in a row and at one place add up: ``world_points`` (m, 3) within
         ``tolerances_m`` (m,) of where the first of them was, metres.
         """
-        shift = np.linalg.norm(world_points - self._rejected_at[indices], axis=1)
-        same_place = (self.rejections[indices] > 0) & (shift <= tolerances_m)
-        self.rejections[indices] = np.where(same_place, self.rejections[indices] + 1, 1)
-        self._rejected_at[indices[~same_place]] = world_points[~same_place]
+        shift = np.linalg.norm(world_points - self._rejected_at[rows], axis=1)
+        same_place = (self.rejections[rows] > 0) & (shift <= tolerances_m)
+        self.rejections[rows] = np.where(same_place, self.rejections[rows] + 1, 1)
+        self._rejected_at[rows[~same_place]] = world_points[~same_place]
 
-    def in_doubt(self, indices: IntArray, max_rejections: int) -> BoolArray:
+    def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
         """Return which of the rows (m,) have been rejected too often to be trusted.
 
         That is ``max_rejections`` times, or once more than they were seen: what contradicts a
         landmark that was seen once or twice may itself be the outlier.
         """
-        rejections = self.rejections[indices]
+        rejections = self.rejections[rows]
         if not rejections.any():  # as nearly always
-            return np.zeros(len(indices), dtype=np.bool_)
-        needed = np.minimum(self.counts[indices] + 1, max_rejections)
+            return np.zeros(len(rows), dtype=np.bool_)
+        needed = np.minimum(self.counts[rows] + 1, max_rejections)
         return np.asarray(rejections >= needed)
 
-    def look(self, indices: IntArray, seen: BoolArray) -> None:
+    def look(self, rows: IntArray, seen: BoolArray) -> None:
         """Count one more observation that had rows (m,) in view, and which of them it saw."""
-        settled = ~self.tentative[indices]
+        settled = ~self.tentative[rows]
         self._settled_looks += int(np.sum(settled))
         self._settled_seen += int(np.sum(settled & seen))
-        self.looks[indices] += 1
+        self.looks[rows] += 1
 
     def unsupported(self, min_support: int) -> IntArray:
         """Return rows without an id that were seen too seldom to be landmarks.
@@ -139,20 +137,20 @@ class LandmarkTable:
         unseen = np.flatnonzero(self.last_seen_ns < stamp_ns)
         return unseen[np.lexsort((self.last_seen_ns[unseen], self.counts[unseen]))]
 
-    def restart(self, indices: IntArray) -> None:
-        """Take the rows ``indices`` as seen for the first time."""
-        self.counts[indices] = 1
-        self.rejections[indices] = 0
-        self.tentative[indices] = is_automatic(self.ids[indices])
-        self.looks[indices] = 0
+    def restart(self, rows: IntArray) -> None:
+        """Take ``rows`` as seen for the first time."""
+        self.counts[rows] = 1
+        self.rejections[rows] = 0
+        self.tentative[rows] = is_automatic(self.ids[rows])
+        self.looks[rows] = 0
 
-    def remove(self, indices: IntArray) -> None:
+    def remove(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""
-        self.ids = np.delete(self.ids, indices)
-        self.counts = np.delete(self.counts, indices)
-        self.rejections = np.delete(self.rejections, indices)
-        self._rejected_at = np.delete(self._rejected_at, indices, axis=0)
-        self.last_seen_ns = np.delete(self.last_seen_ns, indices)
-        self.tentative = np.delete(self.tentative, indices)
-        self.looks = np.delete(self.looks, indices)
+        self.ids = np.delete(self.ids, rows)
+        self.counts = np.delete(self.counts, rows)
+        self.rejections = np.delete(self.rejections, rows)
+        self._rejected_at = np.delete(self._rejected_at, rows, axis=0)
+        self.last_seen_ns = np.delete(self.last_seen_ns, rows)
+        self.tentative = np.delete(self.tentative, rows)
+        self.looks = np.delete(self.looks, rows)
         self._order = np.argsort(self.ids)

@@ -13,7 +13,7 @@ from scipy import special
 
 from slam_observer_ros.axes import Axes, axes_of
 from slam_observer_ros.events import is_automatic
-from slam_observer_ros.gains.fixed_map import FixedMapGains
+from slam_observer_ros.gains import held
 from slam_observer_ros.gains.gauge import anchor, gauge_information, JITTER_M2
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import block_diagonal
@@ -70,7 +70,7 @@ def enter_map(slam: Slam, known: LandmarkMap) -> bool:
 
     """
     slam.gains.recall(slam.observer, np.arange(len(slam.landmarks)))
-    rows = slam.landmarks.indices_of(known.ids)
+    rows = slam.landmarks.rows_of(known.ids)
     shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
     found = _find_frame(slam, rows[shared], known.select(shared))
     if found is None:
@@ -294,7 +294,7 @@ def _renumber(slam: Slam, known: LandmarkMap) -> None:
 def _complete(slam: Slam, known: LandmarkMap) -> None:
     """Append what a map has beyond the estimate, now that both are in one frame."""
     observer, settings = slam.observer, slam.settings
-    new = known.select(slam.landmarks.indices_of(known.ids) < 0)
+    new = known.select(slam.landmarks.rows_of(known.ids) < 0)
     y_ref, covariances = _in_reference_frame(slam, new)
     observer.add_reference_landmarks(y_ref)
     observer.rebase(observer.A, observer.y_ref + observer.a)
@@ -303,7 +303,7 @@ def _complete(slam: Slam, known: LandmarkMap) -> None:
     slam.is_mapping = settings.localization_mode == 'off'
     if settings.localization_mode == 'fixed':
         _hold(slam, known)
-    if not isinstance(slam.gains, FixedMapGains):
+    else:
         slam.gains.add_known_landmarks(covariances)
     slam.gains.restart(observer, 'the place in the loaded map was found')
 
@@ -314,8 +314,7 @@ def _hold(slam: Slam, known: LandmarkMap) -> None:
     rows = order[np.searchsorted(known.ids, slam.landmarks.ids, sorter=order)]
     y_ref, covariances = _in_reference_frame(slam, known.select(rows))
     slam.observer.rebase(slam.observer.A, y_ref)
-    if isinstance(slam.gains, RiccatiGains):
-        slam.gains = FixedMapGains(slam.gains, covariances)
+    slam.gains = held(slam.gains, covariances)
 
 
 def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:

@@ -162,7 +162,7 @@ class MapFrame:
 
     def _is_news(self, known: LandmarkMap) -> bool:
         """Return whether another of the map's landmarks was seen, or all for much longer."""
-        shared = int(np.sum(self.slam.landmarks.indices_of(known.ids) >= 0))
+        shared = int(np.sum(self.slam.landmarks.rows_of(known.ids) >= 0))
         self._searched += 1
         if shared == self._shared and self._searched < (1.0 + NEWS) * self._compared:
             return False

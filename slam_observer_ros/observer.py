@@ -30,7 +30,7 @@ class Correction:
     ----------
     D : FloatArray
         (4, 4) rigid motion in the reference frame.
-    indices : IntArray or slice
+    rows : IntArray or slice
         Landmarks that are moved, m of them; the others stay where they are in the world.
     d : FloatArray
         (m, 3) translations in the reference frame, metres.
@@ -40,7 +40,7 @@ class Correction:
     """
 
     D: FloatArray
-    indices: IntArray | slice
+    rows: IntArray | slice
     d: FloatArray
     u: FloatArray | None = None
 
@@ -92,9 +92,9 @@ class Observer:
         """
         return se3.transform(self.reference_pose, self.y_ref + self.a)
 
-    def body_points(self, indices: IntArray) -> FloatArray:
+    def body_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen, Â⁻¹ (y_i° + â_i) (m, 3), metres, body frame."""
-        arms = self.y_ref[indices] + self.a[indices] - self.A[:3, 3]
+        arms = self.y_ref[rows] + self.a[rows] - self.A[:3, 3]
         points: FloatArray = arms @ self.A[:3, :3]
         return points
 
@@ -121,10 +121,10 @@ class Observer:
         self.a = np.concatenate([self.a, np.zeros_like(y_ref)])
         self.u = np.concatenate([self.u, np.zeros_like(y_ref)])
 
-    def relocate_landmarks(self, indices: IntArray, points: FloatArray) -> None:
+    def relocate_landmarks(self, rows: IntArray, points: FloatArray) -> None:
         """Give landmarks a new reference y_i° = Â y_i where seen now, ``points`` (m, 3)."""
-        self.y_ref[indices] = se3.transform(self.A, points)
-        self.a[indices] = 0.0
+        self.y_ref[rows] = se3.transform(self.A, points)
+        self.a[rows] = 0.0
 
     def rebase(self, A: FloatArray, y_ref: FloatArray) -> None:
         """Take Â (4, 4) and the landmarks (n, 3) as they are for the reference, with â_i = 0."""
@@ -132,20 +132,18 @@ class Observer:
         self.y_ref = y_ref
         self.a = np.zeros_like(y_ref)
 
-    def remove_landmarks(self, indices: IntArray) -> None:
-        """Delete the landmarks at ``indices``; those behind move up."""
-        self.y_ref = np.delete(self.y_ref, indices, axis=0)
-        self.a = np.delete(self.a, indices, axis=0)
-        self.u = np.delete(self.u, indices, axis=0)
+    def remove_landmarks(self, rows: IntArray) -> None:
+        """Delete the landmarks at ``rows``; those behind move up."""
+        self.y_ref = np.delete(self.y_ref, rows, axis=0)
+        self.a = np.delete(self.a, rows, axis=0)
+        self.u = np.delete(self.u, rows, axis=0)
 
-    def errors(
-        self, indices: IntArray | slice, points: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def errors(self, rows: IntArray | slice, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the error (29) and the residual of seen landmarks.
 
         Parameters
         ----------
-        indices : IntArray or slice
+        rows : IntArray or slice
             Which landmarks are seen, m of them.
         points : FloatArray
             (m, 3) observations y_i, metres, body frame.
@@ -158,8 +156,8 @@ class Observer:
             (m, 3) r_i = e_i − y_i°. The paper prints e_i − p_i°, which is this for P° = I.
 
         """
-        e = se3.transform(self.A, points) - self.a[indices]  # (29)
-        return e, e - self.y_ref[indices]
+        e = se3.transform(self.A, points) - self.a[rows]  # (29)
+        return e, e - self.y_ref[rows]
 
     def path(self, body_velocities: FloatArray, dt_s: FloatArray) -> FloatArray:
         """Return Â along k held velocities, exactly: Â exp(V_1 dt_1) … exp(V_k dt_k) (27).
@@ -190,18 +188,18 @@ class Observer:
         self.A = path[-1].copy()
         self.A[:3, :3] = so3.normalise(self.A[:3, :3])
 
-    def set_landmark_velocities(self, indices: IntArray, velocities: FloatArray) -> None:
+    def set_landmark_velocities(self, rows: IntArray, velocities: FloatArray) -> None:
         """Let landmarks move from now on.
 
         Parameters
         ----------
-        indices : IntArray
+        rows : IntArray
             (m,) which landmarks.
         velocities : FloatArray
             (m, 3) their velocities v_i (19), m/s, body frame at this instant.
 
         """
-        self.u[indices] = se3.rotate(self.A, velocities)
+        self.u[rows] = se3.rotate(self.A, velocities)
         self.have_moved = self.have_moved or bool(velocities.any())
 
     def move_landmarks(self, duration_s: float) -> None:
@@ -211,67 +209,14 @@ class Observer:
 
     def correct(self, correction: Correction) -> None:
         """Move the state from the left by (D, d_i); see the module's text."""
-        D, indices = correction.D, correction.indices
+        D, rows = correction.D, correction.rows
         self.A = D @ self.A
-        self.a[indices] = self.a[indices] @ D[:3, :3].T + correction.d
+        self.a[rows] = self.a[rows] @ D[:3, :3].T + correction.d
         if correction.u is not None:
-            self.u[indices] = self.u[indices] @ D[:3, :3].T + correction.u
+            self.u[rows] = self.u[rows] @ D[:3, :3].T + correction.u
             self.have_moved = True
 
 
 def lyapunov(gain_k: FloatArray | float, r: FloatArray) -> float:
     """Return L = Σ k_i/2 |r_i|² (34) for gains k_i (m,) and residuals ``r`` (m, 3) in metres."""
     return float(0.5 * np.vdot(gain_k * r.T, r.T))
-
-
-def lyapunov_rate(gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray) -> float:
-    """Return dL/dt under the paper's innovation: −‖P(Σ k_i r_i ē_iᵀ)‖² − Σ l_i |r_i|² (35).
-
-    Parameters
-    ----------
-    gain_k, gain_l : FloatArray
-        (m,) gains k_i and l_i.
-    e, r : FloatArray
-        (m, 3) errors (29) and residuals, metres.
-
-    """
-    projection = se3.project(_outer_sum(gain_k, e, r))
-    return float(-np.sum(projection**2) - np.sum(gain_l * np.sum(r * r, axis=-1)))
-
-
-def paper_innovation(
-    gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray, a: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the paper's innovation (Δ, δ_i) in continuous time, with the signs put right.
-
-    As printed, (30) lacks a minus and (31) has one too many: with the printed signs L grows. The
-    signs here follow from ė_i = Δ e_i + Δ â_i − δ_i, for which (35) holds.
-
-    Parameters
-    ----------
-    gain_k, gain_l : FloatArray
-        (m,) gains k_i and l_i.
-    e, r : FloatArray
-        (m, 3) errors (29) and residuals, metres.
-    a : FloatArray
-        (m, 3) â_i, metres.
-
-    Returns
-    -------
-    Delta : FloatArray
-        (4, 4) Δ ∈ se(3).
-    delta : FloatArray
-        (m, 3) δ_i, m/s.
-
-    """
-    Delta = -se3.project(_outer_sum(gain_k, e, r))  # (30)
-    delta = a @ Delta[:3, :3].T + (gain_l / gain_k)[:, None] * r  # (31)
-    return Delta, delta
-
-
-def _outer_sum(k: FloatArray, e: FloatArray, r: FloatArray) -> FloatArray:
-    """Return Σ k_i r_i ē_iᵀ (4, 4), with r_i a direction and ē_i = (e_i, 1) a point."""
-    M = np.zeros((4, 4))
-    M[:3, :3] = np.einsum('i,ij,ik->jk', k, r, e)
-    M[:3, 3] = k @ r
-    return M

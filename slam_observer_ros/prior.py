@@ -89,18 +89,18 @@ class Prior:
         regular = own + least * np.eye(len(own))
         return max(float(np.trace(shared @ np.linalg.solve(regular, shared.T))), 0.0)
 
-    def without(self, axes: Axes, indices: IntArray) -> Prior:
-        """Return it without the landmarks at ``indices``; those behind move up."""
-        known, columns = self._known(axes, indices)
+    def without(self, axes: Axes, rows: IntArray) -> Prior:
+        """Return it without the landmarks at ``rows``; those behind move up."""
+        known, columns = self._known(axes, rows)
         return replace(
             self,
             points=np.delete(self.points, known, axis=0),
             covariance=np.delete(np.delete(self.covariance, columns, 0), columns, 1),
         )
 
-    def with_unknown(self, axes: Axes, indices: IntArray) -> Prior:
-        """Return it with landmarks at ``indices`` that may be anywhere."""
-        _, columns = self._known(axes, indices)
+    def with_unknown(self, axes: Axes, rows: IntArray) -> Prior:
+        """Return it with landmarks at ``rows`` that may be anywhere."""
+        _, columns = self._known(axes, rows)
         covariance = self.covariance.copy()
         covariance[columns] = covariance[:, columns] = 0.0
         covariance[columns, columns] = ANYWHERE_M**2
@@ -158,9 +158,9 @@ class Prior:
         """Return the first column of the landmarks."""
         return len(self.covariance) - axes.point * len(self.points)
 
-    def _known(self, axes: Axes, indices: IntArray) -> tuple[IntArray, IntArray]:
+    def _known(self, axes: Axes, rows: IntArray) -> tuple[IntArray, IntArray]:
         """Return those of landmarks (m,) that were known, and their columns."""
-        known, k = indices[indices < len(self.points)], axes.point
+        known, k = rows[rows < len(self.points)], axes.point
         return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from slam_observer_ros.association import Assignment, find_assignments
 from slam_observer_ros.axes import axes_of
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.gains.base import Innovation
+from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
@@ -70,12 +70,12 @@ def readings(
     suspects = suspect_ids(slam, sighting)
     if (event.ids == UNKNOWN_ID).any():
         return _named(slam, gains, event, new_ids, suspects, budget)
-    m, innovation = len(event.ids), sighting.innovation
-    trusting = _cost(slam, gains, m, innovation)
+    m, residuals = len(event.ids), sighting.residuals
+    trusting = _cost(slam, gains, m, residuals)
     found = [Reading(event, trusting)]
     left_out = [suspects] if len(suspects) > 1 else []
     for ids in [*suspects[:, None], *left_out]:
-        others = innovation.select(~np.isin(slam.landmarks.ids[innovation.indices], ids))
+        others = residuals.select(~np.isin(slam.landmarks.ids[residuals.rows], ids))
         cost = max(trusting, _cost(slam, gains, m, others))
         found.append(Reading(event.select(~np.isin(event.ids, ids)), cost))
     return found
@@ -85,8 +85,8 @@ def suspect_ids(slam: Slam, sighting: Sighting) -> IntArray:
     """Return the ids of points that pass the gate only since the state is so uncertain."""
     if not isinstance(slam.gains, RiccatiGains):
         return np.empty(0, dtype=np.int64)
-    innovation = sighting.innovation
-    return slam.landmarks.ids[innovation.indices[slam.gains.suspects(innovation)]]
+    residuals = sighting.residuals
+    return slam.landmarks.ids[residuals.rows[slam.gains.suspects(residuals)]]
 
 
 def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:
@@ -110,7 +110,7 @@ def _named(
     An id is believed here, too, until something contradicts it: without a suspect a reading
     costs no less than with all of them.
     """
-    is_new = (event.ids != UNKNOWN_ID) & (slam.landmarks.indices_of(event.ids) < 0)
+    is_new = (event.ids != UNKNOWN_ID) & (slam.landmarks.rows_of(event.ids) < 0)
     judged = event.select(~is_new)
     new_cost = np.sum(is_new) * unpaired_cost(slam.settings.rejection_distance)
     found = find_assignments(
@@ -119,7 +119,7 @@ def _named(
         slam.index,
         se3.transform(slam.observer.A, judged.points),
         slam.observer.turned(slam.noise.observation(judged)),
-        slam.landmarks.indices_of(judged.ids),
+        slam.landmarks.rows_of(judged.ids),
         slam.settings,
         budget - new_cost,
     )
@@ -144,10 +144,10 @@ def _ids_of(
     return np.where(event.ids == UNKNOWN_ID, assigned, event.ids)
 
 
-def _cost(slam: Slam, gains: RiccatiGains, m: int, innovation: Innovation) -> float:
+def _cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:
     """Return what it costs to take some of m points for the landmarks whose ids they have."""
     gate, k = slam.settings.rejection_distance, axes_of(slam.settings.two_d_mode).point
-    r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
-    passed, own = gated(r, gains.foretold(innovation)[1], noise, slam.settings)
+    r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
+    passed, own = gated(r, gains.foretold(residuals)[1], noise, slam.settings)
     paired_cost = joint_cost(r[passed], with_blocks(own, noise[passed]), noise[passed])
     return paired_cost + (m - int(np.sum(passed))) * unpaired_cost(gate)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.base import Residuals, Seen
 from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
@@ -27,7 +27,7 @@ class Sighting:
         (m,) row of the landmark that each of them is, −1 where it is new.
     covariances : FloatArray
         (m, 3, 3) their covariances, body frame, m².
-    innovation : Innovation
+    residuals : Residuals
         Of those that are not new.
 
     """
@@ -35,7 +35,7 @@ class Sighting:
     event: ObservationEvent
     rows: IntArray
     covariances: FloatArray
-    innovation: Innovation
+    residuals: Residuals
 
 
 class Outlook:
@@ -64,17 +64,17 @@ class Outlook:
         """Return what the points of ``event``, which are landmarks ``rows`` (m,), tell."""
         known = rows >= 0
         covariances = self._covariances(event, rows)
-        innovation = self.innovation(event.select(known), rows[known], covariances[known])
-        return Sighting(event, rows, covariances, innovation)
+        residuals = self.residuals(event.select(known), rows[known], covariances[known])
+        return Sighting(event, rows, covariances, residuals)
 
-    def innovation(
+    def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
-    ) -> Innovation:
+    ) -> Residuals:
         """Return what landmarks ``rows`` (m,) tell that were seen with ``covariances``, m²."""
         observer = self._observer
         e, r = observer.errors(rows, event.points)
         unseen_ns = event.stamp_ns - self._landmarks.last_seen_ns[rows]
-        return Innovation(
+        return Residuals(
             rows,
             e,
             r,

@@ -12,7 +12,7 @@ from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.field_of_view import FieldOfView
 from slam_observer_ros.gains import make_gains
-from slam_observer_ros.gains.base import Innovation
+from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
@@ -45,7 +45,7 @@ class Slam:
     observer : Observer
         State X̂ and reference ξ°.
     gains : GainDesign
-        What turns residuals into innovations.
+        What turns residuals into corrections.
     landmarks : LandmarkTable
         Ids and counts of the n known landmarks.
     is_mapping : bool
@@ -185,7 +185,7 @@ class Slam:
         It moves landmarks whose gains had put that off.
         """
         event = event.select(event.ids != UNKNOWN_ID)
-        rows = self.landmarks.indices_of(event.ids)
+        rows = self.landmarks.rows_of(event.ids)
         if not self.is_mapping:
             event, rows = event.select(rows >= 0), rows[rows >= 0]
         self.gains.recall(self.observer, rows[rows >= 0])
@@ -224,17 +224,17 @@ class Slam:
             self.gains.restart(self.observer, 'landmarks had to make room (max_landmarks)')
         known, used = rows >= 0, np.ones(len(rows), dtype=np.bool_)
         ids = event.ids[known]
-        used[known] = self._innovate(event.select(known), sighting.innovation)
+        used[known] = self._correct(event.select(known), sighting.residuals)
         if not known.all():
             self._make_room(forgotten)
             self._initialise(event.select(~known), covariances[~known])
-            rows = self.landmarks.indices_of(event.ids)
+            rows = self.landmarks.rows_of(event.ids)
             kept = rows >= 0
             event, rows, used = event.select(kept), rows[kept], used[kept]
         if event.velocities is not None:
             self.observer.set_landmark_velocities(rows[used], event.velocities[used])
         self._look_back(event, rows)
-        return ids, sighting.innovation.r
+        return ids, sighting.residuals.r
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight.
@@ -249,7 +249,7 @@ class Slam:
         """
         if not isinstance(self.gains, RiccatiGains) or self.settings.hindsight_interval == 0:
             raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
-        if self.settings.localization_mode == 'fixed':
+        if self.settings.localization_mode == 'fixed' and not self.is_mapping:
             raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
         if self.settings.landmark_velocity_error > 0.0:
             raise ParameterError("smoothing takes landmarks to rest: 'landmark_velocity_error' 0")
@@ -297,13 +297,13 @@ class Slam:
         turn[3:, :3] = -R @ so3.hat(A[:3, 3])
         return turn
 
-    def _innovate(self, event: ObservationEvent, innovation: Innovation) -> BoolArray:
+    def _correct(self, event: ObservationEvent, residuals: Residuals) -> BoolArray:
         """Correct the state by the landmarks of ``event``; return which (m,) were not rejected."""
-        rows = innovation.indices
+        rows = residuals.rows
         if not len(rows):
             self.believed_ids = self.rejected_ids = event.ids
             return np.empty(0, dtype=np.bool_)
-        correction, weights = self.gains.correct(innovation)
+        correction, weights = self.gains.correct(residuals)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
         rejected = weights == 0.0
@@ -311,7 +311,7 @@ class Slam:
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
         if rejected.any():
-            spread_m = np.sqrt(np.trace(innovation.covariances[rejected], axis1=1, axis2=2))
+            spread_m = np.sqrt(np.trace(residuals.covariances[rejected], axis1=1, axis2=2))
             places = se3.transform(self.observer.pose, event.points[rejected])
             self.landmarks.reject(rows[rejected], places, SAME_PLACE * spread_m)
             self.counts['rejected_landmark'] += int(np.sum(rejected))
@@ -332,8 +332,8 @@ class Slam:
 
     def _relocate(self, event: ObservationEvent, rows: IntArray) -> None:
         """Start landmarks in doubt anew that are still far from where they were expected."""
-        innovation = self._outlook.innovation(event, rows, self.noise.observation(event))
-        far = self.gains.distances(innovation) > self.settings.rejection_distance
+        residuals = self._outlook.residuals(event, rows, self.noise.observation(event))
+        far = self.gains.distances(residuals) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         if moved.any():
             self.counts['moved_landmark'] += int(np.sum(moved))
@@ -343,7 +343,7 @@ class Slam:
             if self.settings.landmark_velocity_error > 0.0:
                 self.observer.u[rows[far]] = 0.0
             y_ref = self.observer.y_ref[rows[far]]
-            self.gains.relocate_landmarks(rows[far], y_ref, innovation.covariances[far])
+            self.gains.relocate_landmarks(rows[far], y_ref, residuals.covariances[far])
             self.landmarks.restart(rows[far])
 
     def _in_the_way(self, event: ObservationEvent, rows: IntArray) -> IntArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.base import Innovation
+from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer import Observer
@@ -35,26 +35,24 @@ class Filter:
         y_ref = self.observer.y_ref[-len(points) :]
         self.gains.add_landmarks(y_ref, self._turned(covariances))
 
-    def relocate(self, indices, points, covariances):
-        self.observer.relocate_landmarks(indices, points)
-        self.gains.relocate_landmarks(
-            indices, self.observer.y_ref[indices], self._turned(covariances)
-        )
+    def relocate(self, rows, points, covariances):
+        self.observer.relocate_landmarks(rows, points)
+        self.gains.relocate_landmarks(rows, self.observer.y_ref[rows], self._turned(covariances))
 
-    def innovation(self, indices, points, covariances):
-        e, r = self.observer.errors(indices, points)
+    def residuals(self, rows, points, covariances):
+        e, r = self.observer.errors(rows, points)
         dt_s = np.full(len(r), 0.1)
-        return Innovation(indices, e, r, self.observer.a[indices], self._turned(covariances), dt_s)
+        return Residuals(rows, e, r, self.observer.a[rows], self._turned(covariances), dt_s)
 
-    def see(self, indices, points, covariances):
-        self.gains.recall(self.observer, indices)
-        correction, weights = self.gains.correct(self.innovation(indices, points, covariances))
+    def see(self, rows, points, covariances):
+        self.gains.recall(self.observer, rows)
+        correction, weights = self.gains.correct(self.residuals(rows, points, covariances))
         self.observer.correct(correction)
         return weights
 
-    def expected(self, indices):
+    def expected(self, rows):
         """Where the landmarks should be seen, (m, 3)."""
-        points = self.observer.y_ref[indices] + self.observer.a[indices]
+        points = self.observer.y_ref[rows] + self.observer.a[rows]
         return se3.transform(se3.inverse(self.observer.A), points)
 
     def step(self, rng, motion_variance, point_variance):
@@ -62,10 +60,10 @@ class Filter:
         n = len(self.observer.y_ref)
         V = rng.normal(size=(2, 6))
         self.move(V, np.array([0.05, 0.1]), motion_variance * random_covariances(rng, 2, 6))
-        indices = np.sort(rng.permutation(n)[: rng.integers(1, n)])
-        points = self.expected(indices)
+        rows = np.sort(rng.permutation(n)[: rng.integers(1, n)])
+        points = self.expected(rows)
         points = points + np.sqrt(point_variance) * rng.normal(size=points.shape)
-        self.see(indices, points, point_variance * random_covariances(rng, len(indices), 3))
+        self.see(rows, points, point_variance * random_covariances(rng, len(rows), 3))
 
     @property
     def covariance(self):

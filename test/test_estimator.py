@@ -517,3 +517,11 @@ def test_far_points_said_to_be_exact_are_taken_after_turning_blindly(gains):
         estimator.add(ObservationEvent(stamp_ns, seen, body_points, exact))
         assert len(estimator.landmark_map.ids) == len(estimator.landmark_ids)
     np.testing.assert_allclose(estimator.pose, pose, atol=1e-6)
+
+
+def test_only_settings_that_may_change_while_running_do():
+    estimator = Estimator(Settings())
+    estimator.change_settings(Settings(gain_k=1.0, rejection_distance=4.0))
+    with pytest.raises(ParameterError, match='gains, confirmations can only be set'):
+        estimator.change_settings(Settings(gains='constant', confirmations=9, gain_k=7.0))
+    assert estimator.settings == Settings(gain_k=1.0, rejection_distance=4.0)

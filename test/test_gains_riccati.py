@@ -31,13 +31,13 @@ def started(rng, settings=PLAIN, n=4):
     return slam
 
 
-def predicted_covariance(gains, innovation):
+def predicted_covariance(gains, residuals):
     """S (3, 3) of the only residual, from the Mahalanobis distances of small residuals."""
     scale = 1e-6  # what a residual is judged by depends a little on where it leads to
 
     def squared(r):
-        y_ref, r = innovation.e - innovation.r, scale * r
-        return (gains.distances(replace(innovation, e=y_ref + r, r=r))[0] / scale) ** 2
+        y_ref, r = residuals.e - residuals.r, scale * r
+        return (gains.distances(replace(residuals, e=y_ref + r, r=r))[0] / scale) ** 2
 
     axes = np.eye(3)[:, None]
     information = [[0.5 * (squared(i + j) - squared(i) - squared(j)) for j in axes] for i in axes]
@@ -105,9 +105,9 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
         slam.observer.set_landmark_velocities(np.array([0]), velocity)
         slam.move(V, dt_s, Q)
         slam.move(V, dt_s, Q)
-        indices = np.array([0])
-        innovation = slam.innovation(indices, slam.expected(indices), np.zeros((1, 3, 3)))
-        return slam.gains.foretold(innovation)[1]
+        rows = np.array([0])
+        residuals = slam.residuals(rows, slam.expected(rows), np.zeros((1, 3, 3)))
+        return slam.gains.foretold(residuals)[1]
 
     at_rest = foretold(start + 2.0 * velocity, np.zeros((1, 3)))
     np.testing.assert_allclose(foretold(start, velocity), at_rest, atol=1e-12)
@@ -151,11 +151,11 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     first, second = np.sqrt(np.diag(R)) * rng.normal(size=(2, runs, 3))
     residuals = se3.transform(estimated, (seen + second)[:, None])[:, 0] - (point + first)
     sampled = np.cov(residuals[:, :k].T)
-    innovation = slam.innovation(np.array([0]), seen, R[None])
+    residuals = slam.residuals(np.array([0]), seen, R[None])
     if two_d_mode:
-        predicted = slam.gains._project(innovation)[1] + innovation.covariances[0, :2, :2]
+        predicted = slam.gains._project(residuals)[1] + residuals.covariances[0, :2, :2]
     else:
-        predicted = predicted_covariance(slam.gains, innovation)
+        predicted = predicted_covariance(slam.gains, residuals)
     whitening = np.linalg.inv(np.linalg.cholesky(predicted))
     np.testing.assert_allclose(whitening @ sampled @ whitening.T, np.eye(k), atol=0.05)
 
@@ -335,8 +335,8 @@ def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees(
     slam.move(np.zeros((1, 6)), np.ones(1), Q[None])
     turned = se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0]))
     seen = se3.transform(se3.inverse(turned), np.array([[5.0, 0.0, 0.0]]))
-    innovation = slam.innovation(np.array([0]), seen, 1e-4 * np.eye(3)[None])
-    assert slam.gains.distances(innovation)[0] == pytest.approx(2.0, abs=0.1)
+    residuals = slam.residuals(np.array([0]), seen, 1e-4 * np.eye(3)[None])
+    assert slam.gains.distances(residuals)[0] == pytest.approx(2.0, abs=0.1)
 
 
 class Looks:

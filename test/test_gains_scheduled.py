@@ -108,19 +108,19 @@ def test_an_observation_acts_on_all_landmarks_as_in_a_kalman_filter(rng, n):
     slam.gains.recall(slam.observer, np.arange(n))
     prior, points = slam.covariance, slam.points
     R = 1e-3 * random_covariances(rng, len(seen), 3)
-    innovation = slam.innovation(seen, slam.expected(seen) + 0.03, R)
+    residuals = slam.residuals(seen, slam.expected(seen) + 0.03, R)
     C = np.zeros((3 * len(seen), len(prior)))
     C[:, :6] = SPATIAL.output_matrix(points[seen]).reshape(-1, 6)
     C[np.arange(len(C)), (6 + 3 * seen[:, None] + np.arange(3)).ravel()] = -1.0
-    S = C @ prior @ C.T + block_diagonal(innovation.covariances)
+    S = C @ prior @ C.T + block_diagonal(residuals.covariances)
     K = prior @ C.T @ np.linalg.inv(S)
-    x = -K @ innovation.r.ravel()
+    x = -K @ residuals.r.ravel()
     # In the covariance, turning everything now turns landmarks where they have been moved to.
     turn = np.eye(len(prior))
     turn[6:, :6] = SPATIAL.turn_matrix(x[6:].reshape(n, 3)).reshape(-1, 6)
     posterior = turn @ (prior - K @ C @ prior) @ turn.T
 
-    correction, weights = slam.gains.correct(innovation)
+    correction, weights = slam.gains.correct(residuals)
     slam.observer.correct(correction)
     np.testing.assert_array_equal(weights, 1.0)
     np.testing.assert_allclose(correction.D, se3.exp(x[:6]), atol=1e-8)

@@ -88,6 +88,16 @@ def test_a_mode_of_localising_without_a_map_is_told_to_have_no_effect(slam_obser
     assert '--load-map' in ended.errors
 
 
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati --smooth'])
+def test_a_mode_of_localising_has_no_effect_without_a_map(slam_observer, tmp_path, gains):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    options = (path, *SETTINGS, '--json', '--gains', *gains.split())
+    plain = slam_observer('replay', *options).json
+    fixed = slam_observer('replay', *options, '--set', 'localization_mode=fixed').json
+    assert fixed['ate_rmse_m'] == plain['ate_rmse_m']
+    assert fixed['landmark_rmse_m'] == plain['landmark_rmse_m']
+
+
 def test_a_map_keeps_the_name_of_its_frame(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'

@@ -1,4 +1,4 @@
-"""The observer: error (29), innovation (30)-(31) and Lyapunov function (34)-(35)."""
+"""The observer: error (29), residuals (30)-(31) and Lyapunov function (34)-(35)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 from strategies import generators, poses, rotations
 
-from slam_observer_ros.gains.base import Innovation
-from slam_observer_ros.gains.constant import centroid_step, ConstantGains, paper_step, safe_step
+from slam_observer_ros.gains.base import Residuals
+from slam_observer_ros.gains.constant import (
+    centroid_step,
+    ConstantGains,
+    lyapunov_rate,
+    paper_innovation,
+    paper_step,
+    safe_step,
+)
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
-from slam_observer_ros.observer import lyapunov, lyapunov_rate, Observer, paper_innovation
+from slam_observer_ros.observer import lyapunov, Observer
 from slam_observer_ros.settings import Settings
 
 PAPER_LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 0], [0, 4, 0], [0, -4, 0]])
@@ -97,6 +104,15 @@ def test_residual_vanishes_exactly_where_the_output_fits_for_any_reference_pose(
     np.testing.assert_allclose(r, 0.0, atol=1e-10)
 
 
+def test_a_path_that_was_moved_along_stays_as_it_was():
+    observer = Observer(np.eye(4))
+    path = observer.path(np.array([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]]), np.array([0.5]))
+    before = path.copy()
+    observer.propagate(path)
+    observer.A[:3, 3] += 1.0
+    np.testing.assert_array_equal(path, before)
+
+
 @given(generators(), st.integers(0, 6))
 def test_lyapunov_rate_35_is_the_derivative_of_34_under_the_paper_innovation(rng, n):
     observer = Observer(np.eye(4))
@@ -140,10 +156,10 @@ def test_any_reference_pose_gives_the_same_configuration(reference_pose):
         for step in range(40):
             y = paper_observation(0.1 * step)
             e, r = observer.errors(slice(None), y)
-            innovation = Innovation(
+            residuals = Residuals(
                 np.arange(4), e, r, observer.a, np.zeros((4, 3, 3)), np.full(4, 0.1)
             )
-            observer.correct(gains.correct(innovation)[0])
+            observer.correct(gains.correct(residuals)[0])
             observer.propagate(observer.path(PAPER_VELOCITY[None], np.array([0.1])))
         return se3.transform(se3.inverse(observer.pose), observer.world_points)
 
@@ -168,8 +184,8 @@ def test_lyapunov_never_increases_at_any_step_gain_distance_and_rotation(
     e = y_ref @ turn.T + 0.3 * distance_m * rng.normal(size=(n, 3))
     r = e - y_ref
     settings = Settings(gain_k=k, gain_l=k * rng.uniform(0.01, 10.0), step_mode=step_mode)
-    innovation = Innovation(np.arange(n), e, r, np.zeros((n, 3)), np.zeros((n, 3, 3)), dt_s)
-    correction, _ = ConstantGains(settings).correct(innovation)
+    residuals = Residuals(np.arange(n), e, r, np.zeros((n, 3)), np.zeros((n, 3, 3)), dt_s)
+    correction, _ = ConstantGains(settings).correct(residuals)
     remaining = se3.transform(correction.D, e) - correction.d - y_ref
     assert lyapunov(k, remaining) <= lyapunov(k, r) * (1.0 + 1e-9) + 1e-18 * k * distance_m**2
 
@@ -206,10 +222,10 @@ def test_far_landmarks_that_overflow_the_explicit_step_converge():
     for _ in range(500):
         e, r = observer.errors(slice(None), y_ref)
         levels.append(lyapunov(4.0, r))
-        innovation = Innovation(
+        residuals = Residuals(
             np.arange(100), e, r, observer.a, np.zeros((100, 3, 3)), np.full(100, 0.02)
         )
-        observer.correct(gains.correct(innovation)[0])
+        observer.correct(gains.correct(residuals)[0])
     assert levels[-1] < 0.02 * levels[0]
     assert np.all(np.diff(levels) <= 0.0)
 
@@ -220,6 +236,6 @@ def test_unseen_landmarks_stay_where_they_are_in_the_world():
     before = observer.world_points[2:]
     seen = np.array([0, 1])
     e, r = observer.errors(seen, paper_observation(0.0)[:2])
-    innovation = Innovation(seen, e, r, observer.a[seen], np.zeros((2, 3, 3)), np.full(2, 0.1))
-    observer.correct(ConstantGains(Settings()).correct(innovation)[0])
+    residuals = Residuals(seen, e, r, observer.a[seen], np.zeros((2, 3, 3)), np.full(2, 0.1))
+    observer.correct(ConstantGains(Settings()).correct(residuals)[0])
     np.testing.assert_array_equal(observer.world_points[2:], before)

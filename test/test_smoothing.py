@@ -193,9 +193,9 @@ def test_marginal_is_that_of_the_dense_inverse(problem):
 @pytest.mark.parametrize('forgotten', [[], [0], [0, 1]])
 def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten):
     prior = Problem(axes, 2, seed=5).prior
-    indices = np.array(forgotten, dtype=np.int64)
-    absolute = prior.without(axes, indices)
-    relative = prior.relative(axes).without(axes, indices)
+    rows = np.array(forgotten, dtype=np.int64)
+    absolute = prior.without(axes, rows)
+    relative = prior.relative(axes).without(axes, rows)
     at_it = absolute.pose, absolute.calibration, absolute.points
     expected, _ = absolute.normal_equations(axes, np.linalg.inv(absolute.covariance), *at_it)
     found, pull = relative.normal_equations(axes, np.linalg.inv(relative.covariance), *at_it)

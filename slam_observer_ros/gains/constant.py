@@ -18,9 +18,8 @@ from functools import partial
 import numpy as np
 
 from slam_observer_ros.axes import Axes, axes_of, SPATIAL
-from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.base import GainDesign, Residuals
 from slam_observer_ros.gains.calibration import Calibration
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer import Correction, lyapunov, Observer
 from slam_observer_ros.settings import Settings
@@ -30,7 +29,60 @@ PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
 
 
-class ConstantGains:
+def paper_innovation(
+    gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray, a: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the paper's innovation (Δ, δ_i) in continuous time, with the signs put right.
+
+    As printed, (30) lacks a minus and (31) has one too many: with the printed signs L grows. The
+    signs here follow from ė_i = Δ e_i + Δ â_i − δ_i, for which (35) holds.
+
+    Parameters
+    ----------
+    gain_k, gain_l : FloatArray
+        (m,) gains k_i and l_i.
+    e, r : FloatArray
+        (m, 3) errors (29) and residuals, metres.
+    a : FloatArray
+        (m, 3) â_i, metres.
+
+    Returns
+    -------
+    Delta : FloatArray
+        (4, 4) Δ ∈ se(3).
+    delta : FloatArray
+        (m, 3) δ_i, m/s.
+
+    """
+    Delta = -se3.project(_outer_sum(gain_k, e, r))  # (30)
+    delta = a @ Delta[:3, :3].T + (gain_l / gain_k)[:, None] * r  # (31)
+    return Delta, delta
+
+
+def lyapunov_rate(gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray) -> float:
+    """Return dL/dt under the paper's innovation: −‖P(Σ k_i r_i ē_iᵀ)‖² − Σ l_i |r_i|² (35).
+
+    Parameters
+    ----------
+    gain_k, gain_l : FloatArray
+        (m,) gains k_i and l_i.
+    e, r : FloatArray
+        (m, 3) errors (29) and residuals, metres.
+
+    """
+    projection = se3.project(_outer_sum(gain_k, e, r))
+    return float(-np.sum(projection**2) - np.sum(gain_l * np.sum(r * r, axis=-1)))
+
+
+def _outer_sum(k: FloatArray, e: FloatArray, r: FloatArray) -> FloatArray:
+    """Return Σ k_i r_i ē_iᵀ (4, 4), with r_i a direction and ē_i = (e_i, 1) a point."""
+    M = np.zeros((4, 4))
+    M[:3, :3] = np.einsum('i,ij,ik->jk', k, r, e)
+    M[:3, 3] = k @ r
+    return M
+
+
+class ConstantGains(GainDesign):
     """Constant gains k and l, the same for every landmark.
 
     Parameters
@@ -48,91 +100,42 @@ class ConstantGains:
 
     """
 
-    pose_covariance = None
-    landmark_covariances = None
-    looks_back = False
-
     def __init__(self, settings: Settings) -> None:
         self._axes = axes_of(settings.two_d_mode)
+        self._is_held = False
         self.calibration = Calibration(Settings(), self._axes)
         self.change_settings(settings)
 
     def change_settings(self, settings: Settings) -> None:
-        """Take over k, l (zero in a fixed map) and the step mode."""
+        """Take over k, l and the step mode."""
         self.gain_k = settings.gain_k
-        self.gain_l = 0.0 if settings.localization_mode == 'fixed' else settings.gain_l
+        self.gain_l = 0.0 if self._is_held else settings.gain_l
         self.step_mode = settings.step_mode
         self.max_time_s = settings.max_innovation_time
 
-    def predict(self, observer: Observer, motion: Motion) -> None:
-        """Do nothing: constant gains know no noise."""
-
-    def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Do nothing: constant gains know no noise."""
-
-    def relocate_landmarks(
-        self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
-    ) -> None:
-        """Do nothing: constant gains have no state."""
-
-    def add_known_landmarks(self, covariances: FloatArray) -> None:
-        """Do nothing: constant gains know no noise."""
-
-    def pose_covariance_after(self, motion: Motion) -> None:
-        """Return None: constant gains know no noise."""
-
-    def set_pose_covariance(self, covariance: FloatArray) -> None:
-        """Do nothing: constant gains know no noise."""
-
-    def joint_covariance(self, indices: IntArray) -> None:
-        """Return None: constant gains know no noise."""
-
     def anchor(
-        self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
+        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
         """Return the correction that puts the known landmarks where they are known to be."""
-        return Correction(np.eye(4), indices, -r)
+        return Correction(np.eye(4), rows, -r)
 
-    def restart(self, observer: Observer, since: str) -> None:
-        """Do nothing: constant gains have no memory."""
+    def hold_landmarks(self, count: int) -> None:
+        """Let l be zero."""
+        self._is_held = True
+        self.gain_l = 0.0
 
-    def remove_landmarks(self, indices: IntArray) -> None:
-        """Do nothing: constant gains have no state."""
-
-    @property
-    def calibration_variances(self) -> FloatArray:
-        """(0,) since nothing is estimated of the calibration."""
-        return np.empty(0)
-
-    def recall(self, observer: Observer, indices: IntArray) -> None:
-        """Do nothing: these gains put nothing off."""
-
-    def postponed_shifts(self) -> FloatArray:
-        """Return zero (1, 3): these gains put nothing off."""
-        return np.zeros((1, 3))
-
-    def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
-        """Return the innovation; all observations take part."""
-        k = np.full(len(innovation.r), self.gain_k)
+    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
+        """Return the correction; all points seen take part."""
+        k = np.full(len(residuals.r), self.gain_k)
         step_on = paper_step if self.step_mode == 'paper' else centroid_step
         step = partial(step_on, axes=self._axes)
-        dt_s = np.minimum(innovation.dt_s, self.max_time_s)
+        dt_s = np.minimum(residuals.dt_s, self.max_time_s)
         # One time for the pose: were the r_i to act for different ones, L (34) might grow.
-        D = safe_step(step, k, innovation.e, innovation.r, float(np.mean(dt_s)))
-        remaining = se3.transform(D, innovation.e) - innovation.e + innovation.r
+        D = safe_step(step, k, residuals.e, residuals.r, float(np.mean(dt_s)))  # (30)
+        remaining = se3.transform(D, residuals.e) - residuals.e + residuals.r
         shares = -np.expm1(-self.gain_l / self.gain_k * dt_s)
-        d = shares[:, None] * remaining  # (31)
-        return Correction(D, innovation.indices, d), np.ones(len(k))
-
-    def distances(self, innovation: Innovation) -> FloatArray:
-        """Return zeros: constant gains know no noise to measure residuals by."""
-        return np.zeros(len(innovation.r))
-
-    def settle(self, observer: Observer) -> None:
-        """Do nothing: the reference stays where the paper puts it."""
-
-    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
-        """Do nothing: constant gains have no memory."""
+        d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
+        return Correction(D, residuals.rows, d), np.ones(len(k))
 
 
 def centroid_step(

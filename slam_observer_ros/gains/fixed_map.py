@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.base import Innovation
+from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
@@ -45,9 +45,9 @@ class FixedMapGains(RiccatiGains):
         """Add the motion's noise to the pose's covariance."""
         predict(self._joint.P, self._axes, self.calibration, motion)
 
-    def remove_landmarks(self, indices: IntArray) -> None:
-        """Forget the landmarks at ``indices``."""
-        self._landmark_covariances = np.delete(self._landmark_covariances, indices, axis=0)
+    def remove_landmarks(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        self._landmark_covariances = np.delete(self._landmark_covariances, rows, axis=0)
 
     def settle(self, observer: Observer) -> None:
         """Do nothing: the landmarks of an exact map do not move."""
@@ -60,9 +60,9 @@ class FixedMapGains(RiccatiGains):
     def restart(self, observer: Observer, since: str) -> None:
         """Do nothing: nothing is kept of the past."""
 
-    def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+    def _project(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
-        C = self._pose_output(innovation)
+        C = self._pose_output(residuals)
         PC = self._joint.P[:, : self._p] @ C.T
         return PC, C @ PC[: self._p]
 

@@ -135,30 +135,28 @@ class History:
         self.summary = known
         self.summarised = len(self.stamps_ns)
 
-    def relocate_landmarks(self, indices: IntArray) -> None:
-        """Forget all about the landmarks at ``indices`` but their latest observation."""
+    def relocate_landmarks(self, rows: IntArray) -> None:
+        """Forget all about the landmarks at ``rows`` but their latest observation."""
         last = len(self.stamps_ns) - 1
         self._change(
-            lambda frames: frames.only(
-                (frames.frames == last) | ~np.isin(frames.landmarks, indices)
-            )
+            lambda frames: frames.only((frames.frames == last) | ~np.isin(frames.landmarks, rows))
         )
-        self.prior = self.prior.with_unknown(self._axes, indices)
-        self.summary = self.summary.with_unknown(self._axes, indices)
+        self.prior = self.prior.with_unknown(self._axes, rows)
+        self.summary = self.summary.with_unknown(self._axes, rows)
 
-    def remove_landmarks(self, indices: IntArray) -> None:
-        """Forget the landmarks at ``indices`` and all observations of them."""
-        in_order = np.sort(indices)
+    def remove_landmarks(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows`` and all observations of them."""
+        in_order = np.sort(rows)
 
         def without(frames: Frames) -> Frames:
-            kept = frames.only(~np.isin(frames.landmarks, indices))
+            kept = frames.only(~np.isin(frames.landmarks, rows))
             return replace(
                 kept, landmarks=kept.landmarks - np.searchsorted(in_order, kept.landmarks)
             )
 
         self._change(without)
-        self.prior = self.prior.without(self._axes, indices)
-        self.summary = self.summary.without(self._axes, indices)
+        self.prior = self.prior.without(self._axes, rows)
+        self.summary = self.summary.without(self._axes, rows)
 
     def frames(self) -> Frames:
         """Return all frames."""
@@ -195,8 +193,8 @@ class History:
             motion_covariances=to_body @ noises @ so3.transpose(to_body),
             sensitivities=to_body @ np.array([frame.sensitivity for frame in frames]),
             calibrations=np.array([frame.calibration for frame in frames]),
-            frames=np.repeat(numbers, [len(part.indices) for part in seen]),
-            landmarks=np.concatenate([part.indices for part in seen]),
+            frames=np.repeat(numbers, [len(part.rows) for part in seen]),
+            landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
         )
@@ -207,8 +205,8 @@ class History:
         stated = [part.covariances for part in seen if part.covariances is not None]
         if stated:
             is_stated = [part.covariances is not None for part in seen]
-            covariances[np.repeat(is_stated, [len(part.indices) for part in seen])] = (
-                np.concatenate(stated)
+            covariances[np.repeat(is_stated, [len(part.rows) for part in seen])] = np.concatenate(
+                stated
             )
         return covariances
 

@@ -67,19 +67,19 @@ class JointCovariance:
             return self.columns(np.arange(self.count))
         return slice(self.first, None)
 
-    def columns(self, indices: IntArray) -> IntArray:
+    def columns(self, rows: IntArray) -> IntArray:
         """Return the columns that belong to landmarks (m,), as (m k,)."""
-        return (self._first_columns + self._stride * indices[:, None]).ravel()
+        return (self._first_columns + self._stride * rows[:, None]).ravel()
 
-    def velocity_columns(self, indices: IntArray) -> IntArray:
+    def velocity_columns(self, rows: IntArray) -> IntArray:
         """Return those of the landmarks' velocities, none where these are not estimated."""
         if self._velocity_error == 0.0:
             return np.empty(0, dtype=np.int64)
-        return self.columns(indices) + self._axes.point
+        return self.columns(rows) + self._axes.point
 
-    def with_pose(self, indices: IntArray) -> FloatArray:
+    def with_pose(self, rows: IntArray) -> FloatArray:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks together."""
-        columns = np.append(np.arange(self._p), self.columns(indices))
+        columns = np.append(np.arange(self._p), self.columns(rows))
         return self.P[np.ix_(columns, columns)]
 
     def set_pose(self, covariance: FloatArray) -> None:
@@ -88,32 +88,32 @@ class JointCovariance:
         self.P[: self._p, : self._p] = covariance
 
     def make_room(self, m: int) -> IntArray:
-        """Append m landmarks, filled with zeros; return their indices."""
+        """Append m landmarks, filled with zeros; return their rows."""
         count, old = self.count, self.P
         self.P = np.zeros((len(old) + self._stride * m,) * 2)
         self.P[: len(old), : len(old)] = old
         return np.arange(count, count + m)
 
-    def place_seen(self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray) -> None:
+    def place_seen(self, rows: IntArray, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Fill in landmarks seen now: ã_i = J ε + noise, with J = [−[y_i°]×, I]."""
         P, p, k = self.P, self._p, self._axes.point
-        columns = self.columns(indices)
+        columns = self.columns(rows)
         J = self._axes.output_matrix(y_ref).reshape(-1, p)
         P[columns] = J @ P[:p]
         P[:, columns] = P[columns].T
         own = J @ P[:p, :p] @ J.T + block_diagonal(covariances[:, :k, :k])
         P[np.ix_(columns, columns)] = own
-        self._place_velocities(indices)
+        self._place_velocities(rows)
 
-    def place_known(self, indices: IntArray, covariances: FloatArray) -> None:
+    def place_known(self, rows: IntArray, covariances: FloatArray) -> None:
         """Fill in landmarks whose errors are independent of all else."""
-        k, columns = self._axes.point, self.columns(indices)
+        k, columns = self._axes.point, self.columns(rows)
         self.P[np.ix_(columns, columns)] = block_diagonal(covariances[:, :k, :k])
-        self._place_velocities(indices)
+        self._place_velocities(rows)
 
-    def remove(self, indices: IntArray) -> None:
+    def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
-        columns = np.append(self.columns(indices), self.velocity_columns(indices))
+        columns = np.append(self.columns(rows), self.velocity_columns(rows))
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
 
     def turn(self, columns: IntArray | slice, vectors: FloatArray) -> None:
@@ -142,8 +142,8 @@ class JointCovariance:
         changed[:, :p] = changed[:, :p] @ Ad.T
         return changed
 
-    def _place_velocities(self, indices: IntArray) -> None:
+    def _place_velocities(self, rows: IntArray) -> None:
         """Fill in landmarks whose velocity is not known at all yet."""
-        columns = self.velocity_columns(indices)
+        columns = self.velocity_columns(rows)
         self.P[columns] = self.P[:, columns] = 0.0
         self.P[columns, columns] = self._velocity_error**2

@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.axes import axes_of
-from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.base import GainDesign, Residuals, Seen
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.hindsight import Hindsight
@@ -48,7 +48,7 @@ from slam_observer_ros.smoothing import Solution
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
-class RiccatiGains:
+class RiccatiGains(GainDesign):
     """Gains from the full covariance of pose, velocity calibration and landmarks.
 
     Parameters
@@ -137,11 +137,11 @@ class RiccatiGains:
         self._joint.place_seen(self._joint.make_room(len(y_ref)), y_ref, covariances)
 
     def relocate_landmarks(
-        self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
+        self, rows: IntArray, y_ref: FloatArray, covariances: FloatArray
     ) -> None:
         """Take landmarks for new ones; what was seen of them before now is forgotten."""
-        self._hindsight.history.relocate_landmarks(indices)
-        self._joint.place_seen(indices, y_ref, covariances)
+        self._hindsight.history.relocate_landmarks(rows)
+        self._joint.place_seen(rows, y_ref, covariances)
 
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
@@ -152,12 +152,12 @@ class RiccatiGains:
         """Append landmarks whose errors are independent of all else."""
         self._joint.place_known(self._joint.make_room(len(covariances)), covariances)
 
-    def joint_covariance(self, indices: IntArray) -> FloatArray:
+    def joint_covariance(self, rows: IntArray) -> FloatArray:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks together."""
-        return self._joint.with_pose(indices)
+        return self._joint.with_pose(rows)
 
     def anchor(
-        self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
+        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
         """Return the correction that puts the whole estimate where known landmarks are.
 
@@ -169,28 +169,21 @@ class RiccatiGains:
         everything = joint.columns(np.arange(joint.count))
         G[everything] = self._axes.output_matrix(observer.y_ref).reshape(-1, self._p)
         R = block_diagonal(covariances[:, :k, :k])
-        x, joint.P = anchor(joint.P, G, joint.columns(indices), R, r[:, :k].ravel())
+        x, joint.P = anchor(joint.P, G, joint.columns(rows), R, r[:, :k].ravel())
         return self._as_correction(-x)
 
-    def remove_landmarks(self, indices: IntArray) -> None:
-        """Delete the rows and columns of the landmarks at ``indices``."""
-        self._hindsight.history.remove_landmarks(indices)
-        self._joint.remove(indices)
+    def remove_landmarks(self, rows: IntArray) -> None:
+        """Delete the rows and columns of the landmarks at ``rows``."""
+        self._hindsight.history.remove_landmarks(rows)
+        self._joint.remove(rows)
 
-    def recall(self, observer: Observer, indices: IntArray) -> None:
-        """Do nothing: these gains put nothing off."""
-
-    def postponed_shifts(self) -> FloatArray:
-        """Return zero (1, 3): these gains put nothing off."""
-        return np.zeros((1, 3))
-
-    def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
-        """Return exp(−K r) and the weight that each observation was given."""
+    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
+        """Return exp(−K r) and the weight that each point was given."""
         k, P = self._axes.point, self._joint.P
-        r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
-        weights = observation_weights(r, self.foretold(innovation)[1], noise, self._settings)
+        r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
+        weights = observation_weights(r, self.foretold(residuals)[1], noise, self._settings)
         passed = weights > 0.0
-        used = innovation.select(passed)
+        used = residuals.select(passed)
         PC, CPC = self._project(used)
         S = with_blocks(CPC, used.covariances[:, :k, :k] / weights[passed, None, None])
         K = solve(S, PC.T).T
@@ -198,24 +191,24 @@ class RiccatiGains:
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
         return self._as_correction(-K @ used.r[:, :k].ravel()), weights
 
-    def distances(self, innovation: Innovation) -> FloatArray:
+    def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
         k = self._axes.point
-        columns = self._joint.columns(innovation.indices).reshape(-1, k)
-        _, CPC = self._output_covariances(self._chord_output(innovation), columns)
-        return mahalanobis(innovation.r[:, :k], CPC + innovation.covariances[:, :k, :k])
+        columns = self._joint.columns(residuals.rows).reshape(-1, k)
+        _, CPC = self._output_covariances(self._chord_output(residuals), columns)
+        return mahalanobis(residuals.r[:, :k], CPC + residuals.covariances[:, :k, :k])
 
-    def suspects(self, innovation: Innovation) -> BoolArray:
-        """Return which observations (m,) only pass the gate since the state is so uncertain."""
+    def suspects(self, residuals: Residuals) -> BoolArray:
+        """Return which points (m,) only pass the gate since the state is so uncertain."""
         k = self._axes.point
-        r, noise = innovation.r[:, :k], innovation.covariances[:, :k, :k]
+        r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
         far = are_far(r, noise, self._settings)
         if far.any():
-            predicted = self.foretold(innovation)[1]
+            predicted = self.foretold(residuals)[1]
             far &= far_from_the_others(r, predicted, noise, self._settings)
         return far
 
-    def foretold(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+    def foretold(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return what the state foretells of m residuals, as it is to judge them by.
 
         Returns
@@ -223,31 +216,31 @@ class RiccatiGains:
         PC : FloatArray
             (p, m k) their covariances with ε.
         CPC : FloatArray
-            (m k, m k) their covariance, without the noise of the observations, m².
+            (m k, m k) their covariance, without the noise of the points, m².
 
         """
-        C = self._chord_output(innovation).reshape(-1, self._p)
-        return self._output_covariances(C, self._joint.columns(innovation.indices))
+        C = self._chord_output(residuals).reshape(-1, self._p)
+        return self._output_covariances(C, self._joint.columns(residuals.rows))
 
-    def _project(self, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+    def _project(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return P Cᵀ and C P Cᵀ."""
-        columns = self._joint.columns(innovation.indices)
-        C = self._pose_output(innovation)
+        columns = self._joint.columns(residuals.rows)
+        C = self._pose_output(residuals)
         PC = self._joint.P[:, : self._p] @ C.T - self._joint.P[:, columns]
         return PC, C @ PC[: self._p] - PC[columns]
 
-    def _pose_output(self, innovation: Innovation) -> FloatArray:
+    def _pose_output(self, residuals: Residuals) -> FloatArray:
         """Return the columns (m k, p) of C that belong to ε."""
-        y_ref = innovation.e - innovation.r
+        y_ref = residuals.e - residuals.r
         return self._axes.output_matrix(y_ref).reshape(-1, self._p)
 
-    def _chord_output(self, innovation: Innovation) -> FloatArray:
+    def _chord_output(self, residuals: Residuals) -> FloatArray:
         """Return C_i (m, k, p) at the middle of the chord from y_i° to e_i.
 
         Turning y_i° to e_i, by however much, moves it at right angles to (e_i + y_i°)/2; with C
         at y_i° a robot that has turned further than it knows would reject what it sees.
         """
-        return self._axes.output_matrix(innovation.e - 0.5 * innovation.r)
+        return self._axes.output_matrix(residuals.e - 0.5 * residuals.r)
 
     def _output_covariances(
         self, C: FloatArray, columns: IntArray
@@ -274,7 +267,7 @@ class RiccatiGains:
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise it anew."""
         # An empty frame tells nothing: the motions before and after it add up.
-        if self.looks_back and len(seen.indices):
+        if self.looks_back and len(seen.rows):
             self._hindsight.look_back(observer, seen, in_doubt)
 
     def smooth(self, observer: Observer) -> Solution:

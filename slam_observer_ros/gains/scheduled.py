@@ -33,7 +33,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.axes import axes_of
-from slam_observer_ros.gains.base import Innovation, Seen
+from slam_observer_ros.gains.base import GainDesign, Residuals
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
@@ -51,7 +51,7 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
 
-class ScheduledGains:
+class ScheduledGains(GainDesign):
     """Gains from the covariance of a small core and how each landmark hangs on it.
 
     Parameters
@@ -65,10 +65,6 @@ class ScheduledGains:
         Scale, bias and delay of the velocity, as far as they are known.
 
     """
-
-    pose_covariance = None
-    landmark_covariances = None
-    looks_back = False
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -97,34 +93,31 @@ class ScheduledGains:
         self._leaves.add(self._output_matrix(y_ref), self._noise(covariances))
 
     def relocate_landmarks(
-        self, indices: IntArray, y_ref: FloatArray, covariances: FloatArray
+        self, rows: IntArray, y_ref: FloatArray, covariances: FloatArray
     ) -> None:
         """Take landmarks for new ones."""
-        self._core.dismiss(indices)
-        self._leaves.update(indices, self._output_matrix(y_ref), self._noise(covariances))
+        self._core.dismiss(rows)
+        self._leaves.update(rows, self._output_matrix(y_ref), self._noise(covariances))
 
     def add_known_landmarks(self, covariances: FloatArray) -> None:
-        """Append landmarks (m,) as certain as the map has them, or exact in a fixed map."""
-        N = self._map_variances(covariances)
+        """Append landmarks (m,) as certain as the map has them."""
+        N = self._noise(covariances)
         self._leaves.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
-
-    def pose_covariance_after(self, motion: Motion) -> None:
-        """Return None: the covariance that sets the gains is not published."""
 
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
         self._core.set_pose_covariance(covariance[np.ix_(self._axes.pose, self._axes.pose)])
 
-    def joint_covariance(self, indices: IntArray) -> FloatArray:
+    def joint_covariance(self, rows: IntArray) -> FloatArray:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
-        F, N, _ = self._leaves.now(indices)
+        F, N, _ = self._leaves.now(rows)
         p, q = len(self._axes.pose), len(self._core.P)
         joint = self._with_landmarks(F, N)
-        rows = np.append(np.arange(p), np.arange(q, len(joint)))
-        return joint[np.ix_(rows, rows)]
+        columns = np.append(np.arange(p), np.arange(q, len(joint)))
+        return joint[np.ix_(columns, columns)]
 
     def anchor(
-        self, observer: Observer, indices: IntArray, r: FloatArray, covariances: FloatArray
+        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
     ) -> Correction:
         """Return the correction that puts pose and known landmarks where these are known to be.
 
@@ -138,10 +131,10 @@ class ScheduledGains:
         J = self._axes.output_matrix(observer.y_ref + observer.a)
         z, known, gamma = np.split(np.arange(q + m * k + p), [q, q + m * k])
         P, G = np.zeros((gamma[-1] + 1,) * 2), np.zeros((gamma[-1] + 1, p))
-        P[: gamma[0], : gamma[0]] = self._with_landmarks(F[indices], N[indices])
+        P[: gamma[0], : gamma[0]] = self._with_landmarks(F[rows], N[rows])
         G[:p] = G[gamma] = np.eye(p)
-        G[known] = J[indices].reshape(-1, p)
-        R = block_diagonal(self._map_variances(covariances))
+        G[known] = J[rows].reshape(-1, p)
+        R = block_diagonal(self._noise(covariances))
         x, P = anchor(P, G, known, R, r[:, :k].ravel())
 
         self._core.P = P[:q, :q]
@@ -149,20 +142,24 @@ class ScheduledGains:
         shifts = F @ x[z] + J @ x[gamma]
         B, left = regression(P, gamma, z)
         F, N = F + J @ B, N + J @ left @ so3.transpose(J)
-        shifts[indices] = x[known].reshape(m, k)
+        shifts[rows] = x[known].reshape(m, k)
         B, left = regression(P, known, z)
-        F[indices] = B.reshape(m, k, q)
-        N[indices] = symmetric(left.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)])
+        F[rows] = B.reshape(m, k, q)
+        N[rows] = symmetric(left.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)])
         shifts = -self._axes.full_points(shifts.ravel())
         F[:, :, :p] += self._axes.turn_matrix(shifts)
-        if self._settings.localization_mode == 'fixed':
-            F[indices] = N[indices] = 0.0
         self._leaves.update(everything, F, N)
         return self._as_correction(everything, -x[z], shifts, observer.a)
 
-    def recall(self, observer: Observer, indices: IntArray) -> None:
+    def hold_landmarks(self, count: int) -> None:
+        """Take all landmarks, ``count`` with new ones, for exact."""
+        k = self._axes.point
+        self._core.remove(np.arange(len(self._leaves)))
+        self._leaves.add(np.zeros((count, k, len(self._core.P))), np.zeros((count, k, k)))
+
+    def recall(self, observer: Observer, rows: IntArray) -> None:
         """Move landmarks that are about to be used to where they should have been moved by now."""
-        rows = np.union1d(indices, self._leaves.due())
+        rows = np.union1d(rows, self._leaves.due())
         F, N, shifts = self._leaves.now(rows)
         self._leaves.update(rows, F, N)
         observer.a[rows] += shifts
@@ -171,20 +168,17 @@ class ScheduledGains:
         """Return how far each landmark (n, 3) has yet to be moved, metres, reference frame."""
         return self._leaves.postponed_shifts()
 
-    def restart(self, observer: Observer, since: str) -> None:
-        """Do nothing: these gains keep no history."""
+    def remove_landmarks(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        self._core.remove(rows)
 
-    def remove_landmarks(self, indices: IntArray) -> None:
-        """Forget the landmarks at ``indices``."""
-        self._core.remove(indices)
-
-    def correct(self, innovation: Innovation) -> tuple[Correction, FloatArray]:
-        """Return the innovation and the weight that each observation was given."""
-        rows, r = innovation.indices, innovation.r[:, : self._axes.point, None]
+    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
+        """Return the correction and the weight that each point was given."""
+        rows, r = residuals.rows, residuals.r[:, : self._axes.point, None]
         F, N, _ = self._leaves.now(rows)
-        R, threshold = self._noise(innovation.covariances), self._settings.huber_threshold
-        passed = self._distances(innovation, F, N) <= self._settings.rejection_distance
-        H = self._output_matrix(innovation.e + innovation.a - innovation.r) - F
+        R, threshold = self._noise(residuals.covariances), self._settings.huber_threshold
+        passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
+        H = self._output_matrix(residuals.e + residuals.a - residuals.r) - F
         weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
         for _ in range(1 + REWEIGHTINGS):
             noise = R[passed] / weights[passed, None, None]
@@ -205,24 +199,18 @@ class ScheduledGains:
         self._leaves.update(rows, F, N)
         self._core.turn(x[:, 0])
         self._core.admit(rows[passed])
-        return self._as_correction(rows, x[:, 0], shifts, innovation.a), weights
+        return self._as_correction(rows, x[:, 0], shifts, residuals.a), weights
 
-    def distances(self, innovation: Innovation) -> FloatArray:
+    def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
-        F, N, _ = self._leaves.now(innovation.indices)
-        return self._distances(innovation, F, N)
+        F, N, _ = self._leaves.now(residuals.rows)
+        return self._distances(residuals, F, N)
 
-    def _distances(self, innovation: Innovation, F: FloatArray, N: FloatArray) -> FloatArray:
+    def _distances(self, residuals: Residuals, F: FloatArray, N: FloatArray) -> FloatArray:
         """Return them with C_i at the middle of the chord, for the reason Riccati gains have."""
-        H = self._output_matrix(innovation.e + innovation.a - 0.5 * innovation.r) - F
-        S = H @ self._core.P @ so3.transpose(H) + N + self._noise(innovation.covariances)
-        return mahalanobis(innovation.r[:, : self._axes.point], S)
-
-    def settle(self, observer: Observer) -> None:
-        """Do nothing: these gains measure landmarks in the world, whatever the reference."""
-
-    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
-        """Do nothing: these gains keep no history."""
+        H = self._output_matrix(residuals.e + residuals.a - 0.5 * residuals.r) - F
+        S = H @ self._core.P @ so3.transpose(H) + N + self._noise(residuals.covariances)
+        return mahalanobis(residuals.r[:, : self._axes.point], S)
 
     def _with_landmarks(self, F: FloatArray, N: FloatArray) -> FloatArray:
         """Return the covariance (q + m k, q + m k) of z and m landmarks."""
@@ -238,10 +226,6 @@ class ScheduledGains:
         full = np.zeros((*C.shape[:2], len(self._core.P)))
         full[:, :, : C.shape[2]] = C
         return full
-
-    def _map_variances(self, covariances: FloatArray) -> FloatArray:
-        """Return those (m, k, k) of a map's landmarks, zero if it is taken to be exact."""
-        return self._noise(covariances) * (self._settings.localization_mode != 'fixed')
 
     def _noise(self, covariances: FloatArray) -> FloatArray:
         """Return the part (m, k, k) of covariances (m, 3, 3) on the axes that are estimated."""
