@@ -61,8 +61,9 @@ class Estimator:
         Events used, by kind (``'velocity'``, ``'observation'``), those of them that came late
         (``'late_velocity'``, ``'late_observation'``), points in observations
         (``'observed_point'``), observations made before the place in a loaded map was found
-        (``'not_localised'``), how often it was lost again (``'lost'``), and what became of
-        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
+        (``'not_localised'``), how often it was lost again (``'lost'``), how often the robot was
+        not where odometry had it (``'slip'``), and what became of landmarks
+        (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
         ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'`` and
         ``'repeated_id'``, which are not used).
     dropped : Counter
@@ -84,6 +85,7 @@ class Estimator:
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
         self._warnings = CountedWarnings(logger)
+        self._slips = 0
         self._on_update, self._on_motion = on_update, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
@@ -402,6 +404,7 @@ class Estimator:
         ids, residuals = self._frame.states.observe(event)
         if len(moved_ids := self._slam.moved_ids):
             self._warnings.warn('moved_landmark', f'Landmarks {moved_ids.tolist()} have moved')
+        self._warn_of_slip()
         self._counts['observation'] += 1
         self._frame.find_place()
         level = lyapunov(self.settings.gain_k, residuals)
@@ -410,6 +413,13 @@ class Estimator:
         self._last = Update(event.stamp_ns, observer.pose, ids, residuals, level)
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _warn_of_slip(self) -> None:
+        slips = self._slam.counts['slip']
+        if slips > self._slips:
+            text = 'Odometry does not explain what is seen: the robot slipped or was carried'
+            self._warnings.warn('slip', text)
+        self._slips = slips
 
     def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:
         """Leave out points with one id: nobody knows which of them is right."""

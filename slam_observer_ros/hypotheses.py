@@ -23,9 +23,10 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
 )
 from slam_observer_ros.joint_compatibility import MARGIN
-from slam_observer_ros.readings import are_one, Reading, readings, suspect_ids
+from slam_observer_ros.readings import are_one, is_ambiguous, Reading, readings
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
+from slam_observer_ros.slip import slip
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.velocity_history import VelocityHistory
 
@@ -102,7 +103,7 @@ class Hypotheses:
         some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
         if len(self._states) == 1 and not some_are_unknown:
             sighting = self.best.look(event)
-            if self._limit == 1 or not len(suspect_ids(self.best, sighting)):
+            if self._limit == 1 or not is_ambiguous(self.best, sighting):
                 return self.best.observe(event, sighting)
         possible = self._possible(event)
         uses = Counter(number for number, _ in possible)
@@ -110,6 +111,8 @@ class Hypotheses:
         for number, reading in possible:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
+            if reading.has_slipped:
+                slip(slam, slam.look(reading.event))
             seen = slam.observe(reading.event)
             if some_are_unknown:
                 slam.forget_unsupported(reading.event)

@@ -97,10 +97,16 @@ class LandmarkTable:
         Only rejections in a row and at one place add up: ``world_points`` (m, 3) within
         ``tolerances_m`` (m,) of where the first of them was, metres.
         """
-        shift = np.linalg.norm(world_points - self._rejected_at[rows], axis=1)
-        same_place = (self.rejections[rows] > 0) & (shift <= tolerances_m)
+        same_place = self.are_rejected_again(rows, world_points, tolerances_m)
         self.rejections[rows] = np.where(same_place, self.rejections[rows] + 1, 1)
         self._rejected_at[rows[~same_place]] = world_points[~same_place]
+
+    def are_rejected_again(
+        self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray
+    ) -> BoolArray:
+        """Return which rows (m,) were last rejected, and within what :meth:`reject` allows."""
+        shifts_m = np.linalg.norm(world_points - self._rejected_at[rows], axis=1)
+        return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
 
     def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
         """Return which of the rows (m,) have been rejected too often to be trusted.

@@ -3,10 +3,15 @@
 After a long blind stretch the gate is wide, and a wrong id passes it. Taken for the landmark that
 it names, such a point would close a loop where there is none and throw the pose. So it is read
 both ways, as what it says and as an outlier, and later observations decide.
+
+So is an observation all of which the gate rejects. It may be garbled, or of landmarks that have
+moved; or the robot is not where odometry has it, since its wheels slipped or someone carried it,
+and would be lost if it went on without what it sees.
 """
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +26,18 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.joint_compatibility import joint_cost, RESOLUTION, unpaired_cost
 from slam_observer_ros.sighting import Sighting
 from slam_observer_ros.slam import Slam
+from slam_observer_ros.slip import slip
 from slam_observer_ros.types import IntArray
+
+SLIP_COST = 20.0
+"""What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
+
+SAME_CAUSE_COST = 3.0
+"""What it costs to reject another point for the reason for which one was rejected already.
+
+One observation may be garbled as a whole. A landmark that has moved is rejected again and again,
+and must not throw the pose, however often it is seen.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +50,14 @@ class Reading:
         The observation with all ids filled in, without points that are taken for outliers.
     cost : float
         −2 ln of its likelihood, up to what all readings of the observation share.
+    has_slipped : bool
+        Whether the robot may have moved in any way since the observation before.
 
     """
 
     event: ObservationEvent
     cost: float
+    has_slipped: bool = False
 
 
 def readings(
@@ -67,26 +86,67 @@ def readings(
     if not isinstance(gains, RiccatiGains):
         return [Reading(event, 0.0)]
     sighting = slam.look(event)
-    suspects = suspect_ids(slam, sighting)
+    suspects = _suspect_ids(slam, gains, sighting.residuals)
     if (event.ids == UNKNOWN_ID).any():
         return _named(slam, gains, event, new_ids, suspects, budget)
     m, residuals = len(event.ids), sighting.residuals
+    if gains.are_all_rejected(residuals):
+        return [_as_rejected(slam, sighting, event), *_after_slip(slam, sighting, event)]
     trusting = _cost(slam, gains, m, residuals)
     found = [Reading(event, trusting)]
     left_out = [suspects] if len(suspects) > 1 else []
     for ids in [*suspects[:, None], *left_out]:
-        others = residuals.select(~np.isin(slam.landmarks.ids[residuals.rows], ids))
-        cost = max(trusting, _cost(slam, gains, m, others))
+        kept = ~np.isin(slam.landmarks.ids[residuals.rows], ids)
+        cost = max(trusting, _cost(slam, gains, m, residuals.select(kept)))
         found.append(Reading(event.select(~np.isin(event.ids, ids)), cost))
     return found
 
 
-def suspect_ids(slam: Slam, sighting: Sighting) -> IntArray:
+def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
+    """Return whether an observation, all of whose points have ids, may mean different things."""
+    gains, residuals = slam.gains, sighting.residuals
+    if not isinstance(gains, RiccatiGains) or not len(residuals.rows):
+        return False
+    return bool(gains.suspects(residuals).any()) or gains.are_all_rejected(residuals)
+
+
+def _as_rejected(slam: Slam, sighting: Sighting, event: ObservationEvent) -> Reading:
+    """Return the reading that all known landmarks in an observation are rejected."""
+    m, rejected = len(event.ids), len(sighting.residuals.rows)
+    if _is_old_news(slam, sighting):
+        causes = 0
+    elif slam.rejected_in_a_row == 0:
+        causes = 1
+    else:
+        causes = rejected
+    each = unpaired_cost(slam.settings.rejection_distance)
+    cost = (m - rejected + causes) * each + (rejected - causes) * SAME_CAUSE_COST
+    return Reading(event, cost)
+
+
+def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
+    """Return the reading that the robot has slipped, if that explains all that is seen."""
+    if _is_old_news(slam, sighting):
+        return []
+    slipped = deepcopy(slam)
+    slip(slipped, sighting)
+    residuals, gains = slipped.look(event).residuals, slipped.gains
+    explained = gains.distances(residuals) <= slam.settings.rejection_distance
+    if not isinstance(gains, RiccatiGains) or not explained.all():
+        return []
+    cost = SLIP_COST + _cost(slipped, gains, len(event.ids), residuals)
+    return [Reading(event, cost, has_slipped=True)]
+
+
+def _is_old_news(slam: Slam, sighting: Sighting) -> bool:
+    """Return whether only one landmark is seen, and where it was rejected before."""
+    again = slam.are_rejected_again(sighting)
+    return len(again) == 1 and bool(again[0])
+
+
+def _suspect_ids(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> IntArray:
     """Return the ids of points that pass the gate only since the state is so uncertain."""
-    if not isinstance(slam.gains, RiccatiGains):
-        return np.empty(0, dtype=np.int64)
-    residuals = sighting.residuals
-    return slam.landmarks.ids[residuals.rows[slam.gains.suspects(residuals)]]
+    return slam.landmarks.ids[residuals.rows[gains.suspects(residuals)]]
 
 
 def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:

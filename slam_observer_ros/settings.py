@@ -110,13 +110,15 @@ class Settings(Immutable):
     )
     unknown_angular_motion: float = parameter(
         0.5,
-        'How much the robot may turn while no velocity is known: standard deviation after 1 s',
+        'How much the robot may turn while no velocity is known, or its wheels slip: standard '
+        'deviation after 1 s',
         unit='rad/√s',
         minimum=0.0,
     )
     unknown_linear_motion: float = parameter(
         0.5,
-        'How far the robot may go while no velocity is known: standard deviation after 1 s',
+        'How far the robot may go while no velocity is known, or its wheels slip: standard '
+        'deviation after 1 s',
         unit='m/√s',
         minimum=0.0,
     )
@@ -230,8 +232,8 @@ class Settings(Immutable):
     )
     max_hypotheses: int = parameter(
         8,
-        'Points without id, or with one that may be wrong: most states that are followed until it '
-        'is clear which one is right',
+        'Points without id, or with one that may be wrong, or a robot that may have slipped: most '
+        'states that are followed until it is clear which one is right',
         minimum=1,
     )
     hindsight_interval: int = parameter(

@@ -236,6 +236,12 @@ class Slam:
         self._look_back(event, rows)
         return ids, sighting.residuals.r
 
+    def are_rejected_again(self, sighting: Sighting) -> BoolArray:
+        """Return which known landmarks (m,) in it were rejected before where they are seen now."""
+        event = sighting.event.select(sighting.rows >= 0)
+        places = self._places(event, sighting.residuals)
+        return self.landmarks.are_rejected_again(sighting.residuals.rows, *places)
+
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight.
 
@@ -311,11 +317,17 @@ class Slam:
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
         if rejected.any():
-            spread_m = np.sqrt(np.trace(residuals.covariances[rejected], axis1=1, axis2=2))
-            places = se3.transform(self.observer.pose, event.points[rejected])
-            self.landmarks.reject(rows[rejected], places, SAME_PLACE * spread_m)
+            places = self._places(event.select(rejected), residuals.select(rejected))
+            self.landmarks.reject(rows[rejected], *places)
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return np.asarray(~rejected)
+
+    def _places(
+        self, event: ObservationEvent, residuals: Residuals
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return where points seem to be (m, 3), world, and within what they are at one place."""
+        spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
+        return se3.transform(self.observer.pose, event.points), SAME_PLACE * spread_m
 
     def _look_back(self, event: ObservationEvent, rows: IntArray) -> None:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.

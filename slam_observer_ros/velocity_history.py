@@ -46,6 +46,19 @@ class HeldVelocities:
     gap_s: FloatArray
     before_s: FloatArray
 
+    @classmethod
+    def unknown(cls, gap_s: FloatArray) -> HeldVelocities:
+        """Return k = len(gap_s) pieces of time in which no velocity is known."""
+        k = len(gap_s)
+        return cls(
+            np.zeros((k, 6)),
+            np.zeros((k, 6, 6)),
+            np.zeros((k, 2), dtype=np.bool_),
+            np.zeros(k),
+            gap_s,
+            np.zeros((k, 2)),
+        )
+
     def averaged(self, window_s: float) -> FloatArray:
         """Return the mean velocities (k, 6) over windows around the middle of each one.
 
