@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 UNUSED_POINTS = {
     'rejected_landmark': 'rejected',
@@ -35,6 +35,8 @@ class Update:
         (m,) ids of the known landmarks that were seen.
     residuals : FloatArray
         (m, 3) their residuals r_i before the correction, metres, along the world's axes.
+    rejected : BoolArray
+        (m,) whether they were too far off to be used.
     lyapunov : float
         L (34) of these residuals, of rejected ones, too; k_i is ``gain_k`` whatever the gains.
 
@@ -44,6 +46,7 @@ class Update:
     pose: FloatArray
     ids: IntArray
     residuals: FloatArray
+    rejected: BoolArray
     lyapunov: float
 
 

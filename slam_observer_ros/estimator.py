@@ -410,7 +410,8 @@ class Estimator:
         level = lyapunov(self.settings.gain_k, residuals)
         observer = self._slam.observer
         residuals = se3.rotate(observer.reference_pose, residuals)
-        self._last = Update(event.stamp_ns, observer.pose, ids, residuals, level)
+        rejected = np.isin(ids, self._slam.rejected_ids)
+        self._last = Update(event.stamp_ns, observer.pose, ids, residuals, rejected, level)
         if self._on_update is not None:
             self._on_update(self._last)
 

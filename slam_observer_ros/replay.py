@@ -22,7 +22,7 @@ from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.velocity_history import VelocityHistory
 
@@ -48,6 +48,8 @@ class Replay:
         (m,) stamp of each residual, nanoseconds.
     residuals : FloatArray
         (m, 3) residuals of the landmarks seen, metres.
+    rejected : BoolArray
+        (m,) which of them were too large to be used.
     events : int
         Events taken in, dropped ones included.
     seconds : float
@@ -68,6 +70,7 @@ class Replay:
     configuration: ConfigurationError
     residual_stamps_ns: IntArray
     residuals: FloatArray
+    rejected: BoolArray
     events: int
     seconds: float
     in_known_map: bool
@@ -161,6 +164,9 @@ class _Run:
                 np.array([len(update.residuals) for update in self._updates], dtype=np.int64),
             ),
             np.concatenate([np.empty((0, 3)), *(update.residuals for update in self._updates)]),
+            np.concatenate(
+                [np.empty(0, dtype=np.bool_), *(update.rejected for update in self._updates)]
+            ),
             self._events,
             self._seconds,
             self._in_known_map,

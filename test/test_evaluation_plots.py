@@ -13,7 +13,7 @@ from matplotlib.image import imread
 import numpy as np
 import pytest
 
-from slam_observer_ros.evaluation import replay_plots, simulation_plots
+from slam_observer_ros.evaluation import map_plot, replay_plots, simulation_plots
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.drawing import BLUE, GREEN, GREY, RED
 from slam_observer_ros.evaluation.errors import EvaluationError
@@ -101,9 +101,9 @@ def test_legend_of_a_configuration_covers_nothing(
 def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -> None:
     crowded = np.linspace(0.0, 2.0, 30)[:, None] * np.array([1.0, 0.2, 0.0])
     numbers = np.arange(30)
-    labelled = replay_plots.plot_map(tmp_path / 'a.png', estimate, numbers, crowded)
+    labelled = map_plot.plot_map(tmp_path / 'a.png', estimate, numbers, crowded)
     unnamed = numbers + FIRST_AUTOMATIC_ID
-    bare = replay_plots.plot_map(tmp_path / 'b.png', estimate, unnamed, crowded)
+    bare = map_plot.plot_map(tmp_path / 'b.png', estimate, unnamed, crowded)
     green, bare_green = (int(np.sum(pixels_of(path) == rgb(GREEN))) for path in (labelled, bare))
     assert green == bare_green
     assert np.any(pixels_of(labelled) != pixels_of(bare))
@@ -111,14 +111,12 @@ def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -
 
 def test_map_with_truth(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
     known = LandmarkTruth(IDS, LANDMARKS)
-    path = replay_plots.plot_map(
-        tmp_path / 'map.png', estimate, IDS, LANDMARKS + 0.2, truth, known
-    )
+    path = map_plot.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS + 0.2, truth, known)
     assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
 
 
 def test_map_without_truth(tmp_path: Path, estimate: Trajectory) -> None:
-    path = replay_plots.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS)
+    path = map_plot.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS)
     assert rgb(BLUE) not in colours(path)
     assert {rgb(RED), rgb(GREEN)} <= colours(path)
 
@@ -126,14 +124,14 @@ def test_map_without_truth(tmp_path: Path, estimate: Trajectory) -> None:
 def test_map_of_a_robot_that_saw_and_did_nothing(tmp_path: Path) -> None:
     standing = Trajectory(np.array([0]), np.eye(4)[None])
     empty = np.empty(0, dtype=np.int64), np.empty((0, 3))
-    assert rgb(RED) in colours(replay_plots.plot_map(tmp_path / 'map.png', standing, *empty))
+    assert rgb(RED) in colours(map_plot.plot_map(tmp_path / 'map.png', standing, *empty))
 
 
 @pytest.mark.parametrize('landmarks', [0, 4])
 def test_map_without_a_path(tmp_path: Path, landmarks: int) -> None:
     nowhere = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)))
     ids, points = IDS[:landmarks], LANDMARKS[:landmarks]
-    assert replay_plots.plot_map(tmp_path / 'map.png', nowhere, ids, points).exists()
+    assert map_plot.plot_map(tmp_path / 'map.png', nowhere, ids, points).exists()
 
 
 def test_errors(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
@@ -168,17 +166,20 @@ def test_errors_are_not_joined_across_a_time_without_any(
 def test_residuals(tmp_path: Path, dropped: dict[str, int]) -> None:
     residuals = np.random.default_rng(0).normal(size=(500, 3))
     stamps_ns = np.arange(500) * 10**8
-    path = replay_plots.plot_residuals(
-        tmp_path / 'residuals.png', stamps_ns, residuals, dropped, 1_000
-    )
-    assert rgb(RED) in colours(path)
-    assert (rgb(BLUE) in colours(path)) is bool(dropped)
+    rejected = np.zeros(500, dtype=bool)
+    drawn = tmp_path / 'residuals.png'
+    replay_plots.plot_residuals(drawn, stamps_ns, residuals, rejected, dropped, 1_000)
+    assert rgb(RED) not in colours(drawn)
+    assert (rgb(BLUE) in colours(drawn)) is bool(dropped)
+    rejected[::50] = True
+    replay_plots.plot_residuals(drawn, stamps_ns, residuals, rejected, dropped, 1_000)
+    assert rgb(RED) in colours(drawn)
 
 
 def test_residuals_of_a_run_without_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     saved: list[Figure] = []
     monkeypatch.setattr(replay_plots, 'save', lambda figure, _path: saved.append(figure))
-    empty = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    empty = np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=bool)
     replay_plots.plot_residuals(tmp_path / 'none.png', *empty, {}, 0)
     (axes,) = saved[0].axes
     assert [text.get_text() for text in axes.texts] == ['no residuals']

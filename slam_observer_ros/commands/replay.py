@@ -39,7 +39,8 @@ from slam_observer_ros.commands.replay_report import (
 )
 from slam_observer_ros.errors import SlamObserverError
 from slam_observer_ros.evaluation.gaps import fill_gaps
-from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_map, plot_residuals
+from slam_observer_ros.evaluation.map_plot import plot_map
+from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.map_file import read_map, write_map
@@ -221,6 +222,7 @@ def _draw_figures(
         directory / 'residuals.png',
         result.residual_stamps_ns,
         result.residuals,
+        result.rejected,
         outcome.report.dropped,
         outcome.report.events,
     )

@@ -1,4 +1,4 @@
-"""Figures of a replay, as PNG files: its map, its errors, its residuals."""
+"""Figures of a replay, as PNG files: its errors, its residuals."""
 
 from __future__ import annotations
 
@@ -9,158 +9,27 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.drawing import (
     BLUE,
-    END,
     GREEN,
     is_flat,
-    LANDMARKS,
     LEGEND_ABOVE,
-    LEGEND_BELOW,
-    PATH,
     RED,
     save,
     STYLE,
-    TRUE_END,
-    TRUE_LANDMARKS,
-    TRUE_PATH,
 )
-from slam_observer_ros.evaluation.metrics import trajectory_errors, TrajectoryErrors
-from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import is_automatic, LandmarkTruth
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.types import FloatArray, IntArray
-
-_MOST_LABELS = 80
-"""Maps with more landmarks than this are drawn without ids, which would cover each other."""
+from slam_observer_ros.evaluation.metrics import TrajectoryErrors
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 _GAP_S = 2.0
 """Errors further apart than this are not joined: nobody knows what was between them."""
 
 # With points, so that one error alone between two gaps is seen.
 _LINE: Any = {'linewidth': 0.9, 'marker': '.', 'markersize': 1.0}
-
-
-@mpl.rc_context(STYLE)
-def plot_map(
-    path: Path,
-    estimate: Trajectory,
-    ids: IntArray,
-    world_points: FloatArray,
-    truth: Trajectory | None = None,
-    landmark_truth: LandmarkTruth | None = None,
-) -> Path:
-    """Draw a replay's path and map over the truth, from above and, unless flat, from the side.
-
-    With a true path the estimate is moved by the alignment of :func:`trajectory_errors`.
-
-    Parameters
-    ----------
-    path : Path
-        PNG file to write.
-    estimate : Trajectory
-        Estimated poses.
-    ids : IntArray
-        (n,) landmarks in the final map.
-    world_points : FloatArray
-        (n, 3) their estimated positions, metres.
-    truth : Trajectory, optional
-        True poses.
-    landmark_truth : LandmarkTruth, optional
-        True landmarks in the world of ``truth``; drawn only together with it.
-
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written, or the truth covers no pose of the estimate.
-
-    """
-    if truth is not None:
-        alignment = trajectory_errors(estimate, truth).alignment
-        estimate, world_points = estimate.moved(alignment), se3.transform(alignment, world_points)
-        # Else paths that are long the same seem to end at different places.
-        truth = truth.during(estimate)
-    else:
-        landmark_truth = None
-    layers = _map_layers(estimate, world_points, truth, landmark_truth)
-    drawn = np.concatenate([points for points, _ in layers])
-    drawn = drawn if len(drawn) else np.zeros((1, 3))
-    low, high = drawn.min(axis=0), drawn.max(axis=0)
-    margin = 0.06 * float(np.max(high - low)) or 1.0
-    low, high = low - margin, high + margin
-
-    upward = [1] if is_flat(layers[0][0]) else [1, 2]
-    spans = (high - low)[upward]
-    height = float(np.clip(1.5 + 6.3 * spans.sum() / (high - low)[0], 4.0, 9.0))
-    figure = Figure(figsize=(7.2, height))
-    panels = figure.subplots(len(upward), 1, squeeze=False, height_ratios=spans)[:, 0]
-    for axes, up in zip(panels, upward, strict=True):
-        for points, style in layers:
-            axes.plot(points[:, 0], points[:, up], **style)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[up], high[up]), aspect='equal')
-        axes.set_ylabel(f'{"xyz"[up]} [m]')
-    named = ~is_automatic(ids)
-    if np.sum(named) <= _MOST_LABELS:
-        _label_landmarks(panels[0], ids[named], world_points[named], landmark_truth)
-    aligned = '' if truth is None else ' after rigid alignment'
-    panels[0].set_title(f'Trajectory and map{aligned}')
-    panels[-1].set_xlabel('x [m]')
-    figure.align_ylabels(panels)
-    figure.legend(*panels[-1].get_legend_handles_labels(), **LEGEND_BELOW)
-    return save(figure, path)
-
-
-def _map_layers(
-    estimate: Trajectory,
-    world_points: FloatArray,
-    truth: Trajectory | None,
-    landmark_truth: LandmarkTruth | None,
-) -> list[tuple[FloatArray, Any]]:
-    """List what a map shows, first what lies lowest: points (k, 3) and how they are drawn."""
-    layers: list[tuple[FloatArray, Any]] = [
-        (estimate.positions, {**PATH, 'linestyle': '-', 'linewidth': 0.9}),
-        (estimate.positions[-1:], END),
-        (world_points, {**LANDMARKS, 'label': 'estimated landmarks'}),
-    ]
-    if truth is not None:
-        layers[:0] = [(truth.positions, TRUE_PATH), (truth.positions[-1:], TRUE_END)]
-    if landmark_truth is not None:
-        layers.append((landmark_truth.world_points, TRUE_LANDMARKS))
-    return layers
-
-
-def _label_landmarks(
-    axes: Axes, ids: IntArray, world_points: FloatArray, landmark_truth: LandmarkTruth | None
-) -> None:
-    """Write each id beside its estimate, on the side away from the true landmark."""
-    away = np.ones((len(ids), 2))
-    if landmark_truth is not None:
-        _, rows, true_rows = np.intersect1d(ids, landmark_truth.ids, return_indices=True)
-        errors = world_points[rows] - landmark_truth.world_points[true_rows]
-        away[rows] = np.where(errors[:, :2] < 0.0, -1.0, 1.0)
-    for landmark_id, point, (right, up) in zip(ids.tolist(), world_points, away, strict=True):
-        axes.annotate(
-            str(landmark_id),
-            (point[0], point[1]),
-            xytext=(5.0 * right, 4.0 * up),
-            textcoords='offset points',
-            horizontalalignment='left' if right > 0 else 'right',
-            verticalalignment='bottom' if up > 0 else 'top',
-            fontsize=8,
-            color='#004D38',
-            zorder=3,  # above paths, below markers, which the halo would erase
-            path_effects=[withStroke(linewidth=2.5, foreground='white')],
-        )
 
 
 @mpl.rc_context(STYLE)
@@ -264,6 +133,7 @@ def plot_residuals(
     path: Path,
     stamps_ns: IntArray,
     residuals: FloatArray,
+    rejected: BoolArray,
     dropped: Mapping[str, int],
     events: int,
 ) -> Path:
@@ -277,6 +147,8 @@ def plot_residuals(
         (m,) stamp of each residual, nanoseconds.
     residuals : FloatArray
         (m, 3) residuals r_i of the landmarks seen, metres.
+    rejected : BoolArray
+        (m,) which of them were too large to be used.
     dropped : mapping of str to int
         Dropped events by reason.
     events : int
@@ -297,16 +169,18 @@ def plot_residuals(
     lengths_m = np.linalg.norm(residuals, axis=-1)
     if dropped:
         left, right = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
-        _draw_residuals(left, stamps_ns, lengths_m)
+        _draw_residuals(left, stamps_ns, lengths_m, rejected)
         _draw_dropped(right, dropped, events)
     else:
         axes = figure.add_subplot()
-        _draw_residuals(axes, stamps_ns, lengths_m)
+        _draw_residuals(axes, stamps_ns, lengths_m, rejected)
         axes.set_title(f'Residuals; none of {events} events dropped')
     return save(figure, path)
 
 
-def _draw_residuals(axes: Axes, stamps_ns: IntArray, lengths_m: FloatArray) -> None:
+def _draw_residuals(
+    axes: Axes, stamps_ns: IntArray, lengths_m: FloatArray, rejected: BoolArray
+) -> None:
     axes.set(title='Residuals', xlabel='time [s]', ylabel='residual [m]')
     positive = lengths_m > 0.0
     if not positive.any():
@@ -315,10 +189,14 @@ def _draw_residuals(axes: Axes, stamps_ns: IntArray, lengths_m: FloatArray) -> N
         return
     axes.set_yscale('log')
     times_s = _seconds_since(int(stamps_ns.min()), stamps_ns)[positive]
-    lengths_m = lengths_m[positive]
-    axes.plot(times_s, lengths_m, '.', color=BLUE, markersize=2.5, alpha=0.35)
+    lengths_m, rejected = lengths_m[positive], rejected[positive]
+    used_s, used_m = times_s[~rejected], lengths_m[~rejected]
+    axes.plot(used_s, used_m, '.', color=BLUE, markersize=2.5, alpha=0.35)
+    if rejected.any():
+        cross: Any = {'color': RED, 'markersize': 4.0, 'label': f'{np.sum(rejected)} rejected'}
+        axes.plot(times_s[rejected], lengths_m[rejected], 'x', **cross)
     median = float(np.median(lengths_m))
-    axes.axhline(median, color=RED, linestyle='--', label=f'median {median:.3g} m')
+    axes.axhline(median, color='#333333', linestyle='--', label=f'median {median:.3g} m')
     axes.margins(x=0.01)
     axes.legend(**LEGEND_ABOVE)
 

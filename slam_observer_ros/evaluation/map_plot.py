@@ -1,0 +1,150 @@
+"""Figure of a replay, as a PNG file: its path and its map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+import numpy as np
+
+from slam_observer_ros.evaluation.drawing import (
+    END,
+    is_flat,
+    LANDMARKS,
+    LEGEND_BELOW,
+    PATH,
+    save,
+    STYLE,
+    TRUE_END,
+    TRUE_LANDMARKS,
+    TRUE_PATH,
+)
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import is_automatic, LandmarkTruth
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.types import FloatArray, IntArray
+
+_MOST_LABELS = 80
+"""Maps with more landmarks than this are drawn without ids, which would cover each other."""
+
+
+@mpl.rc_context(STYLE)
+def plot_map(
+    path: Path,
+    estimate: Trajectory,
+    ids: IntArray,
+    world_points: FloatArray,
+    truth: Trajectory | None = None,
+    landmark_truth: LandmarkTruth | None = None,
+) -> Path:
+    """Draw a replay's path and map over the truth, from above and, unless flat, from the side.
+
+    With a true path the estimate is moved by the alignment of :func:`trajectory_errors`.
+
+    Parameters
+    ----------
+    path : Path
+        PNG file to write.
+    estimate : Trajectory
+        Estimated poses.
+    ids : IntArray
+        (n,) landmarks in the final map.
+    world_points : FloatArray
+        (n, 3) their estimated positions, metres.
+    truth : Trajectory, optional
+        True poses.
+    landmark_truth : LandmarkTruth, optional
+        True landmarks in the world of ``truth``; drawn only together with it.
+
+    Returns
+    -------
+    Path
+        ``path``.
+
+    Raises
+    ------
+    EvaluationError
+        The file can't be written, or the truth covers no pose of the estimate.
+
+    """
+    if truth is not None:
+        alignment = trajectory_errors(estimate, truth).alignment
+        estimate, world_points = estimate.moved(alignment), se3.transform(alignment, world_points)
+        # Else paths that are long the same seem to end at different places.
+        truth = truth.during(estimate)
+    else:
+        landmark_truth = None
+    layers = _map_layers(estimate, world_points, truth, landmark_truth)
+    drawn = np.concatenate([points for points, _ in layers])
+    drawn = drawn if len(drawn) else np.zeros((1, 3))
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    margin = 0.06 * float(np.max(high - low)) or 1.0
+    low, high = low - margin, high + margin
+
+    upward = [1] if is_flat(layers[0][0]) else [1, 2]
+    spans = (high - low)[upward]
+    height = float(np.clip(1.5 + 6.3 * spans.sum() / (high - low)[0], 4.0, 9.0))
+    figure = Figure(figsize=(7.2, height))
+    panels = figure.subplots(len(upward), 1, squeeze=False, height_ratios=spans)[:, 0]
+    for axes, up in zip(panels, upward, strict=True):
+        for points, style in layers:
+            axes.plot(points[:, 0], points[:, up], **style)
+        axes.set(xlim=(low[0], high[0]), ylim=(low[up], high[up]), aspect='equal')
+        axes.set_ylabel(f'{"xyz"[up]} [m]')
+    named = ~is_automatic(ids)
+    if np.sum(named) <= _MOST_LABELS:
+        _label_landmarks(panels[0], ids[named], world_points[named], landmark_truth)
+    aligned = '' if truth is None else ' after rigid alignment'
+    panels[0].set_title(f'Trajectory and map{aligned}')
+    panels[-1].set_xlabel('x [m]')
+    figure.align_ylabels(panels)
+    figure.legend(*panels[-1].get_legend_handles_labels(), **LEGEND_BELOW)
+    return save(figure, path)
+
+
+def _map_layers(
+    estimate: Trajectory,
+    world_points: FloatArray,
+    truth: Trajectory | None,
+    landmark_truth: LandmarkTruth | None,
+) -> list[tuple[FloatArray, Any]]:
+    """List what a map shows, first what lies lowest: points (k, 3) and how they are drawn."""
+    layers: list[tuple[FloatArray, Any]] = [
+        (estimate.positions, {**PATH, 'linestyle': '-', 'linewidth': 0.9}),
+        (estimate.positions[-1:], END),
+        (world_points, {**LANDMARKS, 'label': 'estimated landmarks'}),
+    ]
+    if truth is not None:
+        layers[:0] = [(truth.positions, TRUE_PATH), (truth.positions[-1:], TRUE_END)]
+    if landmark_truth is not None:
+        layers.append((landmark_truth.world_points, TRUE_LANDMARKS))
+    return layers
+
+
+def _label_landmarks(
+    axes: Axes, ids: IntArray, world_points: FloatArray, landmark_truth: LandmarkTruth | None
+) -> None:
+    """Write each id beside its estimate, on the side away from the true landmark."""
+    away = np.ones((len(ids), 2))
+    if landmark_truth is not None:
+        _, rows, true_rows = np.intersect1d(ids, landmark_truth.ids, return_indices=True)
+        errors = world_points[rows] - landmark_truth.world_points[true_rows]
+        away[rows] = np.where(errors[:, :2] < 0.0, -1.0, 1.0)
+    for landmark_id, point, (right, up) in zip(ids.tolist(), world_points, away, strict=True):
+        axes.annotate(
+            str(landmark_id),
+            (point[0], point[1]),
+            xytext=(5.0 * right, 4.0 * up),
+            textcoords='offset points',
+            horizontalalignment='left' if right > 0 else 'right',
+            verticalalignment='bottom' if up > 0 else 'top',
+            fontsize=8,
+            color='#004D38',
+            zorder=3,  # above paths, below markers, which the halo would erase
+            path_effects=[withStroke(linewidth=2.5, foreground='white')],
+        )
