@@ -103,7 +103,7 @@ class Estimator:
         self._start_pose = pose
         # By somebody, so that the settings don't say any more where it is.
         self._is_placed = pose is not None
-        self._frame.begin(pose)
+        self._frame.start_run(pose)
         self._forget_time()
         self._last: Update | None = None
 
@@ -156,7 +156,7 @@ class Estimator:
         if pose is not None:
             self.set_pose(pose, pose_covariance)
         elif self.settings.set_initial_pose and self.stamp_ns is None and not self._is_placed:
-            self._frame.begin(None)
+            self._frame.start_run(None)
         elif self._slam.is_mapping:
             self._frame.enter()
         else:  # in a map that does not grow there is nothing to carry into another one

@@ -99,7 +99,7 @@ def is_lost(slam: Slam) -> bool:
     return bool(not slam.is_mapping and slam.rejected_in_a_row >= often and moved >= needed)
 
 
-class Told:
+class PoseTrial:
     """A place in a map that someone has told, on trial until landmarks of the map confirm it.
 
     With a wrong one the map's landmarks would be rejected, and where mapping goes on be taken to

@@ -14,9 +14,9 @@ from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.localisation import (
     enter_map,
     is_lost,
+    PoseTrial,
     shape_covariances,
     start_in_map,
-    Told,
 )
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
@@ -60,7 +60,7 @@ class MapFrame:
         self.is_localised = True
         self.states = Hypotheses(Slam(settings, np.eye(4)), settings)
         self._counts: Counter[str] = Counter()
-        self._told: Told | None = None
+        self._trial: PoseTrial | None = None
         self._begin_search()
         is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
         if is_given and not settings.set_initial_pose:
@@ -95,7 +95,7 @@ class MapFrame:
         self.settings = settings
         self.states.change_settings(settings)
 
-    def begin(self, pose: FloatArray | None) -> None:
+    def start_run(self, pose: FloatArray | None) -> None:
         """Start a run at ``pose`` (4, 4), exactly; by default where the settings have it start."""
         settings, covariance = self.settings, None
         if pose is None and settings.set_initial_pose:
@@ -119,23 +119,23 @@ class MapFrame:
         self.states = Hypotheses(slam, self.settings)
         self._begin_search()
         self.is_localised = self.loaded is None or pose is not None
-        self._told = None
+        self._trial = None
         if self.loaded is not None and pose is not None:
             start_in_map(self.slam, self.loaded, covariance)
-            self._told = Told(self.loaded)
+            self._trial = PoseTrial(self.loaded)
 
     def load(self, landmark_map: LandmarkMap) -> None:
         """Take a map in the place of one loaded before; the place in it is not known yet."""
         self.loaded = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
         self.is_localised = False
-        self._told = None
+        self._trial = None
         self._begin_search()
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the place in a loaded map was not known, it is now."""
         if self.is_localised:
             self.states.decide().set_pose(self._allowed(pose), covariance)
-            self._told = None if self.loaded is None else Told(self.loaded)
+            self._trial = None if self.loaded is None else PoseTrial(self.loaded)
         else:
             self.start(pose, covariance)
 
@@ -143,7 +143,7 @@ class MapFrame:
         """Find the place in the loaded map if it is not known, or not any more."""
         if self.loaded is None:
             return
-        if self._told is not None and self._told.is_contradicted(self.slam):
+        if self._trial is not None and self._trial.is_contradicted(self.slam):
             self._search_anew('Most landmarks contradict the pose that was told')
         elif self.is_localised and is_lost(self.slam):
             self._search_anew('All landmarks are far from where they should be')

@@ -82,7 +82,7 @@ class History:
         self._noise, self._sensitivity = self._at_rest()
         # Frames as arrays: those that are summarised, in pieces, and those that are not.
         self._none = no_frames(len(axes.pose), len(prior.calibration), axes.point)
-        self._told: list[Frames] = []
+        self._summarised: list[Frames] = []
         self._latest = self._none
         self._new: list[_Frame] = []
 
@@ -130,7 +130,7 @@ class History:
 
     def summarise(self, known: Prior) -> None:
         """Take ``known`` for all that the frames up to now tell."""
-        self._told.append(self._with_new())
+        self._summarised.append(self._with_new())
         self._latest = self._none
         self.summary = known
         self.summarised = len(self.stamps_ns)
@@ -160,7 +160,7 @@ class History:
 
     def frames(self) -> Frames:
         """Return all frames."""
-        return joined([*self._told, self._with_new()])
+        return joined([*self._summarised, self._with_new()])
 
     def latest_frames(self) -> Frames:
         """Return those that are not summarised, numbered anew."""
@@ -177,7 +177,7 @@ class History:
 
     def _change(self, change: Callable[[Frames], Frames]) -> None:
         """Change what was seen in the frames."""
-        self._told = [change(frames) for frames in self._told]
+        self._summarised = [change(frames) for frames in self._summarised]
         self._latest = change(self._with_new())
 
     def _as_arrays(self, frames: list[_Frame], first: int) -> Frames:
