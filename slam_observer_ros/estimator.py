@@ -416,11 +416,11 @@ class Estimator:
             self._on_update(self._last)
 
     def _warn_of_slip(self) -> None:
-        slips = self._slam.counts['slip']
+        slips = self._frame.counts['slip']
         if slips > self._slips:
             text = 'Odometry does not explain what is seen: the robot slipped or was carried'
             self._warnings.warn('slip', text)
-        self._slips = slips
+        self._slips = max(self._slips, slips)
 
     def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:
         """Leave out points with one id: nobody knows which of them is right."""

@@ -133,9 +133,12 @@ class LandmarkTable:
         That is less than ``min_support`` times by when a settled one, as often in view, would have
         been seen :data:`PATIENCE` times as often. One that was seen so often has settled.
         """
-        self.tentative &= self.counts < min_support
-        # As if one of four looks had met at first, when nobody knows how often one does.
-        share = (1 + self._settled_seen) / (4 + self._settled_looks)
+        settling = self.tentative & (self.counts >= min_support)
+        self._settled_looks += int(np.sum(self.looks[settling]))
+        self._settled_seen += int(np.sum(self.counts[settling]))
+        self.tentative &= ~settling
+        # Before any has settled nobody knows how often one is seen.
+        share = self._settled_seen / self._settled_looks if self._settled_looks else 0.0
         return np.flatnonzero(self.tentative & (self.looks * share >= PATIENCE * min_support))
 
     def unseen_since(self, stamp_ns: int) -> IntArray:

@@ -33,11 +33,10 @@ SLIP_COST = 20.0
 """What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
 
 SAME_CAUSE_COST = 3.0
-"""What it costs to reject another point for the reason for which one was rejected already.
+"""What it costs to reject another point for the reason for which one was rejected already."""
 
-One observation may be garbled as a whole. A landmark that has moved is rejected again and again,
-and must not throw the pose, however often it is seen.
-"""
+MOST_OF_ONE_CAUSE = 3
+"""Points that cost this, at most: one garbled message is one, however much it tells."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +90,7 @@ def readings(
         return _named(slam, gains, event, new_ids, suspects, budget)
     m, residuals = len(event.ids), sighting.residuals
     if gains.are_all_rejected(residuals):
-        return [_as_rejected(slam, sighting, event), *_after_slip(slam, sighting, event)]
+        return _rejected_or_slipped(slam, sighting, event)
     trusting = _cost(slam, gains, m, residuals)
     found = [Reading(event, trusting)]
     left_out = [suspects] if len(suspects) > 1 else []
@@ -110,38 +109,41 @@ def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     return bool(gains.suspects(residuals).any()) or gains.are_all_rejected(residuals)
 
 
-def _as_rejected(slam: Slam, sighting: Sighting, event: ObservationEvent) -> Reading:
-    """Return the reading that all known landmarks in an observation are rejected."""
-    m, rejected = len(event.ids), len(sighting.residuals.rows)
-    if _is_old_news(slam, sighting):
-        causes = 0
-    elif slam.rejected_in_a_row == 0:
-        causes = 1
-    else:
-        causes = rejected
+def _rejected_or_slipped(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
+    """Return the readings of an observation all of whose known landmarks are rejected."""
+    m, rejected, causes = len(event.ids), len(sighting.residuals.rows), _causes(slam, sighting)
+    more = min(rejected - causes, MOST_OF_ONE_CAUSE)
     each = unpaired_cost(slam.settings.rejection_distance)
-    cost = (m - rejected + causes) * each + (rejected - causes) * SAME_CAUSE_COST
-    return Reading(event, cost)
+    as_rejected = Reading(event, (m - rejected + causes) * each + more * SAME_CAUSE_COST)
+    return [as_rejected, *(_after_slip(slam, sighting, event) if causes else ())]
+
+
+def _causes(slam: Slam, sighting: Sighting) -> int:
+    """Return how many reasons there must be to reject all landmarks, beside those known before.
+
+    At first one is enough: the observation is garbled. The next time it is not, and each landmark
+    has moved for a reason of its own. From then on there is nothing new in it: landmarks that have
+    moved must not throw the pose, however often they are seen.
+    """
+    again = slam.are_rejected_again(sighting)
+    second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
+    new = int(np.sum(~again))
+    of_new = new if slam.rejected_in_a_row else min(new, 1)
+    return of_new + max(int(np.sum(second)) - 1, 0)
 
 
 def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
     """Return the reading that the robot has slipped, if that explains all that is seen."""
-    if _is_old_news(slam, sighting):
+    settings, slipped = slam.settings, deepcopy(slam)
+    if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return []
-    slipped = deepcopy(slam)
     slip(slipped, sighting)
     residuals, gains = slipped.look(event).residuals, slipped.gains
-    explained = gains.distances(residuals) <= slam.settings.rejection_distance
+    explained = gains.distances(residuals) <= settings.rejection_distance
     if not isinstance(gains, RiccatiGains) or not explained.all():
         return []
     cost = SLIP_COST + _cost(slipped, gains, len(event.ids), residuals)
     return [Reading(event, cost, has_slipped=True)]
-
-
-def _is_old_news(slam: Slam, sighting: Sighting) -> bool:
-    """Return whether only one landmark is seen, and where it was rejected before."""
-    again = slam.are_rejected_again(sighting)
-    return len(again) == 1 and bool(again[0])
 
 
 def _suspect_ids(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> IntArray:

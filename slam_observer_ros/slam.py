@@ -166,7 +166,7 @@ class Slam:
         self.observer.propagate(moved.path)
         self.observer.move_landmarks(float((moved.dt_s + moved.gap_s).sum()))
         self.gains.predict(self.observer, moved)
-        self._end_velocity = moved.at_ends[1]
+        self._end_velocity = None if moved.at_ends is None else moved.at_ends[1]
 
     def _motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
         return motion(

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.axes import axes_of
 from slam_observer_ros.gains.motion import Motion
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.sighting import Sighting
@@ -20,6 +20,12 @@ LONGEST_S = 4.0
 LARGE_TURN_RAD = 0.3
 """Turn, radians, that a correction, which is linear in it, does not find well."""
 
+LEAST_SPREAD = 10.0
+"""Least extent of landmarks, in standard deviations, that tells how the robot has turned."""
+
+LEAST_VARIANCE_M2 = 1e-6
+"""Variance, m², at least, of where a robot without odometry sees what it does after a second."""
+
 
 def slip(slam: Slam, sighting: Sighting) -> None:
     """Let the robot have slipped in a way that explains what it sees.
@@ -28,15 +34,16 @@ def slip(slam: Slam, sighting: Sighting) -> None:
     it sees is yet to be used.
     """
     observer, start = slam.observer, slam.observer.A
-    observer.propagate(np.array([start, _pose_after(slam, sighting)]))
-    stray = HeldVelocities.unknown(np.array([0.0, _duration_s(slam.settings, sighting)]))
+    needed_s = _duration_s(slam.settings, sighting)
+    observer.propagate(np.array([start, _pose_after(slam, sighting, needed_s)]))
+    stray = HeldVelocities.unknown(np.array([0.0, min(needed_s, LONGEST_S)]))
     moved = Motion(
         path=np.array([start, observer.A, observer.A]),
         measured_velocities=stray.body_velocities,
         dt_s=stray.dt_s,
         gap_s=np.zeros(2),
         covariances=slam.noise.motion(stray),
-        at_ends=np.zeros((2, 6)),
+        at_ends=None,
     )
     slam.gains.predict(observer, moved)
     slam.counts['slip'] += 1
@@ -48,22 +55,24 @@ def _duration_s(settings: Settings, sighting: Sighting) -> float:
     points = sighting.event.points[sighting.rows >= 0]
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
-    rounding_m2 = np.finfo(np.float64).tiny
-    needed_s = np.sum(residuals.r**2, axis=1) / (after_1_s_m2 + rounding_m2)
-    return min(float(np.mean(needed_s)), LONGEST_S)
+    needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, LEAST_VARIANCE_M2)
+    return float(np.mean(needed_s))
 
 
-def _pose_after(slam: Slam, sighting: Sighting) -> FloatArray:
-    """Return Â (4, 4) from which landmarks are where they are seen, if the robot has turned.
+def _pose_after(slam: Slam, sighting: Sighting, needed_s: float) -> FloatArray:
+    """Return Â (4, 4) from which landmarks are where they are seen, if that is far from here.
 
-    If it has not, or that can't be told, the correction that follows finds it better.
+    If it is not, or can't be told, the correction that follows finds it better.
     """
-    observer, residuals = slam.observer, sighting.residuals
-    points, rows = sighting.event.points[sighting.rows >= 0], residuals.rows
-    if len(rows) < axes_of(slam.settings.two_d_mode).point:
-        return observer.A
-    landmarks = observer.y_ref[rows] + observer.a[rows]
+    A, residuals = slam.observer.A, sighting.residuals
+    k, rows = axes_of(slam.settings.two_d_mode).point, residuals.rows
+    landmarks = slam.observer.y_ref[rows] + slam.observer.a[rows]
     weights = 1.0 / np.trace(residuals.covariances, axis1=1, axis2=2)
-    found = rigid_alignment(points, landmarks, weights)
-    turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ observer.A[:3, :3].T))
-    return found if turn_rad > LARGE_TURN_RAD else observer.A
+    offsets = landmarks - np.average(landmarks, axis=0, weights=weights)
+    spreads = np.linalg.svd(np.sqrt(weights)[:, None] * offsets, compute_uv=False)
+    if len(rows) < k or spreads[k - 2] < LEAST_SPREAD:
+        return A
+    seen = se3.transform(A, sighting.event.points[sighting.rows >= 0])
+    moved = rigid_alignment(seen, landmarks, weights)
+    is_far = np.linalg.norm(so3.log(moved[:3, :3])) > LARGE_TURN_RAD or needed_s > LONGEST_S
+    return moved @ A if is_far else A

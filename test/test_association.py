@@ -447,7 +447,7 @@ def test_a_landmark_seen_far_more_seldom_than_others_in_view_is_unsupported():
 
 
 def test_where_all_are_seen_seldom_it_takes_longer():
-    landmarks = looked_at([1, 1], [199, 201], settled_looks=996, settled_seen=99)
+    landmarks = looked_at([1, 1], [199, 201], settled_looks=1000, settled_seen=100)
     assert landmarks.unsupported(5).tolist() == [2]
 
 
@@ -457,6 +457,22 @@ def test_what_has_settled_stays_however_long_it_is_not_seen():
     for _ in range(1000):
         landmarks.look(np.array([0, 1]), np.array([True, False]))
     assert landmarks.unsupported(5).tolist() == []
+
+
+def test_nothing_is_forgotten_before_it_is_known_how_often_a_landmark_is_seen():
+    landmarks = looked_at([1, 4], [1000, 1000])
+    assert landmarks.unsupported(5).tolist() == []
+
+
+def test_reflectors_that_are_told_one_a_message_are_all_kept():
+    random = np.random.default_rng(0)
+    points = random.uniform([-8.0, -8.0, 0.0], [8.0, 8.0, 0.0], (24, 3))
+    estimator = Estimator(PLANAR)
+    for step in range(1000):
+        stand(estimator, 0.02 * step)
+        point = points[[step % 24]] + random.normal(scale=0.02, size=(1, 3)) * [1.0, 1.0, 0.0]
+        observe(estimator, 0.02 * step, point)
+    assert estimator.counts['unsupported_landmark'] == 0
 
 
 def test_a_landmark_that_was_placed_anew_has_its_chance_again():

@@ -107,6 +107,21 @@ def test_one_observation_that_is_garbled_as_a_whole_does_not_move_the_robot(
     assert max(errors_m.values()) < max(plain_m.values()) + 0.1
 
 
+@seeds
+@pytest.mark.parametrize('seen', [16, 40])
+def test_nor_does_it_however_many_landmarks_it_tells_of(seed, seen):
+    world = gain_worlds.drive(PLANAR, 30.0, seed, noise=0.5, landmarks=seen, seen=seen)
+    off = se3.exp(np.array([0.0, 0.0, 0.5, 2.0, 2.0, 0.0]))
+
+    def garble(_, event):
+        points = se3.transform(off, event.points) if seconds(event) == 20.0 else event.points
+        return replace(event, points=points)
+
+    estimator, errors_m = run(world.with_observations(garble), PLANAR)
+    assert estimator.counts['slip'] == 0
+    assert max(errors_m.values()) < 0.3
+
+
 @modes
 @pytest.mark.parametrize('shift_m', [1.0, 2.0])
 def test_a_landmark_that_moved_and_is_seen_alone_does_not_throw_the_pose(settings, shift_m):
@@ -126,3 +141,55 @@ def test_a_landmark_that_moved_and_is_seen_alone_does_not_throw_the_pose(setting
     _, plain_m = run(world, settings)
     assert estimator.counts['rejected_landmark'] >= 1
     assert max(errors_m.values()) < max(plain_m.values()) + 0.3
+
+
+@modes
+@seeds
+@pytest.mark.parametrize('alone_s', [0.75, 2.0])
+@pytest.mark.parametrize('are_swapped', [False, True])
+def test_two_landmarks_that_moved_alone_in_view_throw_the_pose_for_no_longer(
+    settings, seed, alone_s, are_swapped
+):
+    """Together, as two tags on one pallet, or in one another's place."""
+    world = gain_worlds.drive(settings, 60.0, seed, noise=0.5, landmarks=6)
+    counts = np.bincount(np.concatenate([event.ids for event in world.observations()]))
+    pair = np.argsort(-counts)[:2]
+
+    def change(_, event):
+        if seconds(event) < 30.0:
+            return event
+        if seconds(event) < 30.0 + alone_s:
+            event = event.select(np.isin(event.ids, pair))
+        is_one = np.isin(event.ids, pair)
+        if are_swapped:
+            ids = np.where(is_one, pair.sum() - event.ids, event.ids)
+            return replace(event, ids=ids)
+        back = world.true_pose(event.stamp_ns)[:3, :3].T
+        return replace(event, points=event.points + is_one[:, None] * (back @ [2.0, 0.0, 0.0]))
+
+    _, errors_m = run(world.with_observations(change), settings)
+    assert list(errors_m.values())[-1] < 0.3
+
+
+@seeds
+def test_landmarks_in_a_row_do_not_tell_how_far_a_robot_has_rolled(seed):
+    """Carried, with five tags on a wall in view: their noise would turn it about their line."""
+    rng = np.random.default_rng(seed)
+    row = np.column_stack([np.full(5, 4.0), np.linspace(-2.0, 2.0, 5), np.full(5, 0.5)])
+    estimator, carried = Estimator(SPATIAL), se3.exp(np.array([0.0, 0.0, 0.8, 1.0, -0.5, 0.0]))
+    for step in range(80):
+        points = se3.transform(se3.inverse(carried), row) if step >= 40 else row
+        stamp_ns = START_NS + step * 250_000_000
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        noisy = points + rng.normal(scale=0.02, size=points.shape)
+        estimator.add(ObservationEvent(stamp_ns, np.arange(5), noisy))
+    assert estimator.counts['slip'] >= 1
+    tilt_rad = np.arccos(estimator.pose[2, 2])
+    assert tilt_rad < 0.2
+
+
+def test_a_robot_that_never_moves_by_itself_never_slips():
+    settings = replace(PLANAR, unknown_linear_motion=0.0, unknown_angular_motion=0.0)
+    world = with_slip(gain_worlds.drive(settings, 50.0, 1, noise=0.5), 0.8)
+    estimator, _ = run(world, settings)
+    assert estimator.counts['slip'] == 0

@@ -98,9 +98,9 @@ class Calibration:
         rates = motion.measured_velocities[:, self._calibrated]
         rates[:, self._scales :] = 1.0
         of_rates = Ad[:-1, :, self._calibrated] * (rates * motion.dt_s[:, None])[:, None, :]
-        F = np.empty((Ad.shape[1], self.count))
+        F = np.zeros((Ad.shape[1], self.count))
         F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
-        if len(self._calibrated) < self.count:
+        if len(self._calibrated) < self.count and motion.at_ends is not None:
             first, last = self.apply(motion.at_ends)
             F[:, -1] = Ad[0] @ first - Ad[-1] @ last
         return F

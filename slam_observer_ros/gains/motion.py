@@ -23,9 +23,9 @@ class Motion:
         (k,) seconds after each piece during which no velocity was known.
     covariances : FloatArray
         (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
-    at_ends : FloatArray
-        (2, 6) measured velocities around the start and the end, rad/s and m/s; zero where no
-        delay is estimated.
+    at_ends : FloatArray or None
+        (2, 6) measured velocities around the start and the end, rad/s and m/s; None where what
+        moved does not depend on the delay of the velocities.
 
     """
 
@@ -34,4 +34,4 @@ class Motion:
     dt_s: FloatArray
     gap_s: FloatArray
     covariances: FloatArray
-    at_ends: FloatArray
+    at_ends: FloatArray | None
