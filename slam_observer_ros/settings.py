@@ -226,8 +226,8 @@ class Settings(Immutable):
     )
     min_support: int = parameter(
         5,
-        'Points without id: how often a landmark must be seen to stay, by when others as often in '
-        'view would have been seen four times as often; 1 for all to stay',
+        'Points without id: how often a landmark must be seen to be in the map; it is forgotten '
+        'if it was not by when others as often in view would have been seen four times as often',
         minimum=1,
     )
     max_hypotheses: int = parameter(

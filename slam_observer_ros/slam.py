@@ -90,10 +90,11 @@ class Slam:
     def confirmed(self) -> IntArray:
         """Rows of the landmarks seen often enough to be in the map.
 
-        One that was seen once or twice may still be an outlier; it helps to tell the pose, but
-        nobody is told of it.
+        One that was seen once or twice may still be an outlier, and one without an id may be a
+        false point for longer; it helps to tell the pose, but nobody is told of it.
         """
-        return np.flatnonzero(self.landmarks.counts >= self.settings.confirmations)
+        often = self.landmarks.counts >= self.settings.confirmations
+        return np.flatnonzero(often & ~self.landmarks.tentative)
 
     @property
     def world_points(self) -> FloatArray:

@@ -92,7 +92,7 @@ def test_what_is_seen_once_or_twice_is_never_in_the_map_and_soon_forgotten():
         stand(estimator, 0.1 * step)
         stray = [[0.0, 4.0, 1.0]] if step in (20, 21) else []
         observe(estimator, 0.1 * step, [[3.0, 0.0, 0.0], *stray])
-        assert len(estimator.landmark_ids) == (1 if step >= 2 else 0)
+        assert len(estimator.landmark_ids) == (1 if step >= 4 else 0)
     assert estimator.counts['unsupported_landmark'] == 1
 
 
@@ -268,7 +268,7 @@ def test_a_robot_finds_its_way_in_a_map_by_reflectors_that_all_look_alike(mode):
 
 
 def test_numbers_given_to_landmarks_in_two_runs_say_nothing_of_which_is_which():
-    estimator = Estimator(replace(SPATIAL, confirmations=1))
+    estimator = Estimator(replace(SPATIAL, confirmations=1, min_support=1))
     tags = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
     nameless_point = np.array([[3.0, 3.0, 0.0]])
     for step in range(3):
