@@ -104,7 +104,7 @@ def readings(
 def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
     gains, residuals = slam.gains, sighting.residuals
-    if not isinstance(gains, RiccatiGains) or not len(residuals.rows):
+    if not isinstance(gains, RiccatiGains) or gains.are_all_near(residuals):
         return False
     return bool(gains.suspects(residuals).any()) or gains.are_all_rejected(residuals)
 

@@ -208,14 +208,19 @@ class RiccatiGains(GainDesign):
             far &= far_from_the_others(r, predicted, noise, self._settings)
         return far
 
+    def are_all_near(self, residuals: Residuals) -> bool:
+        """Return whether all points pass the gate even by the sensor's noise alone.
+
+        This is quickly told, and by all of S they are no further off.
+        """
+        k = self._axes.point
+        own = mahalanobis(residuals.r[:, :k], residuals.covariances[:, :k, :k])
+        return bool((own <= self._settings.rejection_distance).all())
+
     def are_all_rejected(self, residuals: Residuals) -> bool:
         """Return whether there are points seen, and the gate rejects them all."""
-        k, gate = self._axes.point, self._settings.rejection_distance
-        r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
-        # The sensor's noise alone is quickly told, and no point is further off by all of S.
-        if not len(r) or mahalanobis(r, noise).min() <= gate:
-            return False
-        return bool(self.distances(residuals).min() > gate)
+        gate = self._settings.rejection_distance
+        return len(residuals.r) > 0 and bool((self.distances(residuals) > gate).all())
 
     def foretold(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return what the state foretells of m residuals, as it is to judge them by.
