@@ -298,3 +298,13 @@ def test_looking_back_does_not_undo_that_a_scale_has_changed():
     scale = np.where(np.arange(1200) < 600, 1.0, 1.15)[:, None]
     world = drive(settings, 60.0, scale=scale)
     np.testing.assert_allclose(scale_and_bias(estimate(world, settings))[0][3], 1.15, atol=0.03)
+
+
+def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
+    """As a robot that is carried; though its velocity has a bias, which is no motion either."""
+    calibration = Calibration(EVERYTHING, SPATIAL)
+    calibration.shift(np.full(calibration.count, 0.1))
+    path = np.array([np.eye(4), se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))])
+    zero = np.zeros(1)
+    carried = Motion(path, np.zeros((1, 6)), zero, zero, np.zeros((1, 6, 6)), None)
+    assert not calibration.sensitivity(se3.adjoint(path), carried).any()
