@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from slam_observer_ros.axes import axes_of
@@ -35,7 +37,7 @@ def slip(slam: Slam, sighting: Sighting) -> None:
     """
     observer, start = slam.observer, slam.observer.A
     needed_s = _duration_s(slam.settings, sighting)
-    observer.propagate(np.array([start, _pose_after(slam, sighting, needed_s)]))
+    observer.propagate(np.array([start, _pose_after(slam, sighting)]))
     stray = HeldVelocities.unknown(np.array([0.0, min(needed_s, LONGEST_S)]))
     moved = Motion(
         path=np.array([start, observer.A, observer.A]),
@@ -59,7 +61,7 @@ def _duration_s(settings: Settings, sighting: Sighting) -> float:
     return float(np.mean(needed_s))
 
 
-def _pose_after(slam: Slam, sighting: Sighting, needed_s: float) -> FloatArray:
+def _pose_after(slam: Slam, sighting: Sighting) -> FloatArray:
     """Return Â (4, 4) from which landmarks are where they are seen, if that is far from here.
 
     If it is not, or can't be told, the correction that follows finds it better.
@@ -73,6 +75,8 @@ def _pose_after(slam: Slam, sighting: Sighting, needed_s: float) -> FloatArray:
     if len(rows) < k or spreads[k - 2] < LEAST_SPREAD:
         return A
     seen = se3.transform(A, sighting.event.points[sighting.rows >= 0])
-    moved = rigid_alignment(seen, landmarks, weights)
-    is_far = np.linalg.norm(so3.log(moved[:3, :3])) > LARGE_TURN_RAD or needed_s > LONGEST_S
-    return moved @ A if is_far else A
+    found = rigid_alignment(seen, landmarks, weights) @ A
+    turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
+    shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
+    reach_m = slam.settings.unknown_linear_motion * math.sqrt(LONGEST_S)
+    return found if turn_rad > LARGE_TURN_RAD or shift_m > reach_m else A

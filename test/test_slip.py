@@ -83,6 +83,22 @@ def test_a_robot_that_is_carried_is_found_again_at_once(settings, seed):
     assert np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]) < 0.3
 
 
+@modes
+@seeds
+def test_so_is_one_that_is_carried_far_without_being_turned(settings, seed):
+    """As far as it sees enough landmarks at once to tell where it is."""
+    world = gain_worlds.drive(settings, 40.0, seed, noise=0.5, seen=8)
+
+    def shift(_, event):
+        back = world.true_pose(event.stamp_ns)[:3, :3].T @ [-9.0, 4.0, 0.0]
+        return replace(event, points=event.points + (seconds(event) >= 20.0) * back)
+
+    estimator, errors_m = run(world.with_observations(shift), settings)
+    assert estimator.counts['slip'] == 1
+    assert estimator.counts['moved_landmark'] == 0
+    assert list(errors_m.values())[-1] == pytest.approx(np.hypot(9.0, 4.0), abs=0.3)
+
+
 def moved_back(pose, moved):
     """Return where a point in the body frame is seen by a robot at ``moved`` pose instead."""
     return se3.inverse(moved @ pose) @ pose
