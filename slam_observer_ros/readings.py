@@ -134,9 +134,10 @@ def _causes(slam: Slam, sighting: Sighting) -> int:
 
 def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
     """Return the reading that the robot has slipped, if that explains all that is seen."""
-    settings, slipped = slam.settings, deepcopy(slam)
+    settings = slam.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return []
+    slipped = deepcopy(slam)
     slip(slipped, sighting)
     residuals, gains = slipped.look(event).residuals, slipped.gains
     explained = gains.distances(residuals) <= settings.rejection_distance

@@ -66,19 +66,19 @@ def test_a_slip_is_found_out_by_the_second_landmark_that_contradicts_odometry(se
 @seeds
 def test_a_robot_that_is_carried_is_found_again_at_once(settings, seed):
     world = gain_worlds.drive(settings, 40.0, seed, noise=0.5)
+    start = world.true_pose(START_NS + 20_000_000_000)
     carried = se3.exp(np.array([0.0, 0.0, 0.8, 1.5, -1.0, 0.0]))
+    moved = start @ carried @ se3.inverse(start)
 
     def seen_from_there(_, event):
         if seconds(event) < 20.0:
             return event
-        start = world.true_pose(START_NS + 20_000_000_000)
-        moved = start @ carried @ se3.inverse(start)
         pose = world.true_pose(event.stamp_ns)
-        return replace(event, points=se3.transform(moved_back(pose, moved), event.points))
+        points = se3.transform(se3.inverse(moved @ pose) @ pose, event.points)
+        return replace(event, points=points)
 
     estimator, _ = run(world.with_observations(seen_from_there), settings)
-    start = world.true_pose(START_NS + 20_000_000_000)
-    pose = start @ carried @ se3.inverse(start) @ world.true_pose(world.events[-1].stamp_ns)
+    pose = moved @ world.true_pose(world.events[-1].stamp_ns)
     assert estimator.counts['slip'] >= 1
     assert np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]) < 0.3
 
@@ -97,11 +97,6 @@ def test_so_is_one_that_is_carried_far_without_being_turned(settings, seed):
     assert estimator.counts['slip'] == 1
     assert estimator.counts['moved_landmark'] == 0
     assert list(errors_m.values())[-1] == pytest.approx(np.hypot(9.0, 4.0), abs=0.3)
-
-
-def moved_back(pose, moved):
-    """Return where a point in the body frame is seen by a robot at ``moved`` pose instead."""
-    return se3.inverse(moved @ pose) @ pose
 
 
 @modes
