@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import deque
 from statistics import median_low
 
+from slam_observer_ros.units import to_s
+
 SAMPLES = 11
 """Messages whose median offset is looked at: five stragglers in a row change nothing."""
 
@@ -44,7 +46,7 @@ class ClockOffset:
             return ''
         side = 'ahead of' if self.offset_ns > 0 else 'behind'
         return (
-            f"stamps of {source} are {abs(self.offset_ns) * 1e-9:.3f} s {side} this machine's "
+            f"stamps of {source} are {to_s(abs(self.offset_ns)):.3f} s {side} this machine's "
             'clock: synchronise the clocks, or set use_sim_time (for a recording) or '
             'correct_clock_offset'
         )

@@ -28,6 +28,7 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.units import to_ns, to_s
 from slam_observer_ros.validation import check_event
 
 logger = logging.getLogger(__name__)
@@ -114,7 +115,7 @@ class Estimator:
         anywhere. ``hold`` keeps pose and map, and goes on from there.
         """
         newest_ns = self.newest_stamp_ns
-        after = '' if newest_ns is None else f' after {newest_ns * 1e-9:.3f} s'
+        after = '' if newest_ns is None else f' after {to_s(newest_ns):.3f} s'
         if self.settings.on_time_jump == 'reset':
             logger.warning(
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
@@ -401,17 +402,21 @@ class Estimator:
             event = timeline.carry_forward(event, self._slam)
             self._counts['late_observation'] += 1
         timeline.advance(self._frame.states, event.stamp_ns)
-        ids, residuals = self._frame.states.observe(event)
-        if len(moved_ids := self._slam.moved_ids):
+        outcome = self._frame.states.observe(event)
+        if len(moved_ids := outcome.moved_ids):
             self._warnings.warn('moved_landmark', f'Landmarks {moved_ids.tolist()} have moved')
         self._warn_of_slip()
         self._counts['observation'] += 1
-        self._frame.find_place()
-        level = lyapunov(self.settings.gain_k, residuals)
+        self._frame.find_place(outcome)
         observer = self._slam.observer
-        residuals = se3.rotate(observer.reference_pose, residuals)
-        rejected = np.isin(ids, self._slam.rejected_ids)
-        self._last = Update(event.stamp_ns, observer.pose, ids, residuals, rejected, level)
+        self._last = Update(
+            event.stamp_ns,
+            observer.pose,
+            outcome.ids,
+            se3.rotate(observer.reference_pose, outcome.residuals),
+            outcome.rejected,
+            lyapunov(self.settings.gain_k, outcome.residuals),
+        )
         if self._on_update is not None:
             self._on_update(self._last)
 
@@ -444,8 +449,8 @@ class Estimator:
         """Forget all that has a stamp but the map."""
         settings = self.settings
         self._queue = EventQueue(
-            window_ns=round(settings.reorder_window * 1e9),
-            max_jump_ns=round(settings.max_stamp_jump * 1e9),
-            late_limit_ns=round(settings.late_limit * 1e9),
+            window_ns=to_ns(settings.reorder_window),
+            max_jump_ns=to_ns(settings.max_stamp_jump),
+            late_limit_ns=to_ns(settings.late_limit),
         )
         self._timeline = Timeline(settings, self._on_motion)

@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import Event, ObservationEvent
+from slam_observer_ros.units import to_s
 
 Key: TypeAlias = tuple[int, bool, bytes]
 
@@ -160,5 +161,5 @@ def _key(event: Event) -> Key:
 
 def _refusal(ahead_ns: int) -> InvalidEventError:
     reason, side = ('stamp_jump', 'ahead of') if ahead_ns > 0 else ('too_late', 'behind')
-    message = f"stamp is {abs(ahead_ns) / 1e9:.3f} s {side} the newest event's"
+    message = f"stamp is {to_s(abs(ahead_ns)):.3f} s {side} the newest event's"
     return InvalidEventError(reason, message)

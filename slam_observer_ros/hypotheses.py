@@ -25,19 +25,19 @@ from slam_observer_ros.events import (
 from slam_observer_ros.joint_compatibility import MARGIN
 from slam_observer_ros.readings import are_one, is_ambiguous, Reading, readings
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.sighting import Outcome
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.slip import slip
-from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.velocity_history import VelocityHistory
 
 
 @dataclass(frozen=True, slots=True)
 class _Followed:
-    """A state after an observation, what it took that for, and what it returned."""
+    """A state after an observation, what it took that for, and what it made of it."""
 
     slam: Slam
     reading: Reading
-    seen: tuple[IntArray, FloatArray]
+    outcome: Outcome
 
 
 class Hypotheses:
@@ -95,11 +95,8 @@ class Hypotheses:
                 slam.remove(row)
         return bool(rows[0][0] >= 0)
 
-    def observe(self, event: ObservationEvent) -> tuple[IntArray, FloatArray]:
-        """Use an observation made at the states' instant; return what the best one makes of it.
-
-        Ids and residuals are those of :meth:`slam_observer_ros.slam.Slam.observe`.
-        """
+    def observe(self, event: ObservationEvent) -> Outcome:
+        """Use an observation made at the states' instant; return what the best one makes of it."""
         some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
         if len(self._states) == 1 and not some_are_unknown:
             sighting = self.best.look(event)
@@ -113,18 +110,18 @@ class Hypotheses:
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
             if reading.has_slipped:
                 slip(slam, slam.look(reading.event))
-            seen = slam.observe(reading.event)
+            outcome = slam.observe(reading.event)
             if some_are_unknown:
                 slam.forget_unsupported(reading.event)
             slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
             if not any(_are_one(slam, reading, other) for other in followed):
-                followed.append(_Followed(slam, reading, seen))
+                followed.append(_Followed(slam, reading, outcome))
             if len(followed) == self._limit:
                 break
         least = followed[0].reading.cost
         self._costs = [one.reading.cost - least for one in followed]
         self._states = [one.slam for one in followed]
-        return followed[0].seen
+        return followed[0].outcome
 
     def _possible(self, event: ObservationEvent) -> list[tuple[int, Reading]]:
         """Return what each state may take an observation for, by the number of the state.

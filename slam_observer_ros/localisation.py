@@ -20,6 +20,7 @@ from slam_observer_ros.gains.robust import block_diagonal
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.sighting import Outcome
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -117,15 +118,15 @@ class PoseTrial:
         self._ids = known.ids
         self._for = self._against = 0
 
-    def is_contradicted(self, slam: Slam) -> bool:
-        """Count the vote of the last observation; return whether the place is wrong."""
+    def is_contradicted(self, outcome: Outcome, often: int) -> bool:
+        """Count the vote of an observation; return whether ``often`` ones say it is wrong."""
         if self._for >= CONFIRMATIONS and self._for > self._against:
             return False
-        believed = np.isin(slam.believed_ids, self._ids).sum()
-        rejected = np.isin(slam.rejected_ids, self._ids).sum()
+        rejected = int(np.isin(outcome.ids[outcome.rejected], self._ids).sum())
+        believed = int(np.isin(outcome.ids, self._ids).sum()) - rejected
         self._for += int(believed > 0 and believed >= rejected)
         self._against += int(rejected > believed)
-        return self._against >= slam.settings.max_rejections and self._against > self._for
+        return self._against >= often and self._against > self._for
 
 
 def shape_covariances(slam: Slam) -> FloatArray | None:

@@ -19,6 +19,7 @@ from slam_observer_ros.localisation import (
     start_in_map,
 )
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.sighting import Outcome
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray
 
@@ -139,11 +140,15 @@ class MapFrame:
         else:
             self.start(pose, covariance)
 
-    def find_place(self) -> None:
-        """Find the place in the loaded map if it is not known, or not any more."""
+    def find_place(self, outcome: Outcome) -> None:
+        """Find the place in the loaded map if it is not known, or not any more.
+
+        ``outcome`` is what the most likely state has made of an observation right now.
+        """
         if self.loaded is None:
             return
-        if self._trial is not None and self._trial.is_contradicted(self.slam):
+        often = self.settings.max_rejections
+        if self._trial is not None and self._trial.is_contradicted(outcome, often):
             self._search_anew('Most landmarks contradict the pose that was told')
         elif self.is_localised and is_lost(self.slam):
             self._search_anew('All landmarks are far from where they should be')

@@ -48,6 +48,7 @@ class NoiseModel(Immutable):
         unknown = np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3)
         self._density_squared, self._unknown_squared = density**2, unknown**2
         self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
+        self._has_scale = bool(self._scale.any())
 
     def motion(self, held: HeldVelocities) -> FloatArray:
         """Return the covariances (k, 6, 6) of k body-frame motions, rad² and m².
@@ -63,7 +64,7 @@ class NoiseModel(Immutable):
         that ``unknown_*_motion`` allows.
         """
         rates = self._density_squared
-        if self._scale.any():
+        if self._has_scale:
             rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
         dt_s = held.dt_s[:, None]
         white = rates * dt_s * np.repeat(~held.is_stated, 3, axis=1)

@@ -23,7 +23,7 @@ from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.units import to_s
 from slam_observer_ros.velocity_history import VelocityHistory
 
 
@@ -85,7 +85,7 @@ class Replay:
 
     def seconds_until(self, stamp_ns: int) -> float:
         """Return the time from the first event to a stamp, seconds."""
-        return float(stamp_ns - self.start_ns) / NANOSECONDS_PER_SECOND
+        return to_s(stamp_ns - self.start_ns)
 
 
 def replay(

@@ -12,7 +12,8 @@ from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.units import to_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +26,8 @@ class Sighting:
         The observation without points that have no id, or are of no landmark that is mapped.
     rows : IntArray
         (m,) row of the landmark that each of them is, −1 where it is new.
+    known : BoolArray
+        (m,) which are not new.
     covariances : FloatArray
         (m, 3, 3) their covariances, body frame, m².
     residuals : Residuals
@@ -34,8 +37,32 @@ class Sighting:
 
     event: ObservationEvent
     rows: IntArray
+    known: BoolArray
     covariances: FloatArray
     residuals: Residuals
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a state made of an observation.
+
+    Attributes
+    ----------
+    ids : IntArray
+        (m,) ids of the landmarks seen that were known before.
+    residuals : FloatArray
+        (m, 3) their residuals before the correction, metres, reference frame.
+    rejected : BoolArray
+        (m,) which of them were too far off to be used.
+    moved_ids : IntArray
+        Landmarks that it showed to have moved.
+
+    """
+
+    ids: IntArray
+    residuals: FloatArray
+    rejected: BoolArray
+    moved_ids: IntArray
 
 
 class Outlook:
@@ -60,12 +87,11 @@ class Outlook:
         self._observer, self._landmarks, self._noise = observer, landmarks, noise
         self._settings = settings
 
-    def sighting(self, event: ObservationEvent, rows: IntArray) -> Sighting:
-        """Return what the points of ``event``, which are landmarks ``rows`` (m,), tell."""
-        known = rows >= 0
+    def sighting(self, event: ObservationEvent, rows: IntArray, known: BoolArray) -> Sighting:
+        """Return what the points of ``event`` tell, which are the ``known`` of ``rows`` (m,)."""
         covariances = self._covariances(event, rows)
         residuals = self.residuals(event.select(known), rows[known], covariances[known])
-        return Sighting(event, rows, covariances, residuals)
+        return Sighting(event, rows, known, covariances, residuals)
 
     def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
@@ -80,7 +106,7 @@ class Outlook:
             r,
             observer.a[rows],
             observer.turned(covariances),
-            unseen_ns.astype(np.float64) * 1e-9,
+            to_s(unseen_ns),
         )
 
     def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:

@@ -16,6 +16,7 @@ from slam_observer_ros.sampling import SAMPLE_PERIOD_NS
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_s
 
 LYAPUNOV_FLOOR = 1e-40
 """What log10 L is taken of where every residual is exactly zero, so that it stays finite."""
@@ -132,7 +133,7 @@ class _Run:
 
     def result(self) -> SimulatedRun:
         stamps_ns = np.array(list(self._poses), dtype=np.int64)
-        times_s = (np.array(list(self._lyapunov)) - self._simulation.start_ns) / 1e9
+        times_s = to_s(np.array(list(self._lyapunov)) - self._simulation.start_ns)
         levels = np.array(list(self._lyapunov.values()))
         return SimulatedRun(
             times_s,

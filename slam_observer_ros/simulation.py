@@ -23,7 +23,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.parameters import parameter
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND, to_ns, to_s
 
 BODY_VELOCITY = (0.0, 0.0, 0.2, 1.0, 0.0, 0.0)
 """Section VI's (Ω, v), rad/s and m/s, body frame."""
@@ -268,7 +268,7 @@ class Simulation:
     def _draw_delay_ns(self, rng: np.random.Generator) -> int:
         if rng.random() >= self.scenario.late_fraction:
             return 0
-        return round(rng.uniform(0.0, self.scenario.max_lateness) * NANOSECONDS_PER_SECOND)
+        return to_ns(rng.uniform(0.0, self.scenario.max_lateness))
 
     def _loop_angle(self, stamp_ns: int) -> FloatArray:
         rate = self.scenario.landmark_speed / LANDMARK_LOOP_RADIUS_M
@@ -276,9 +276,7 @@ class Simulation:
         return angle
 
     def _elapsed_s(self, stamp_ns: int | IntArray) -> FloatArray:
-        return np.asarray(
-            (np.asarray(stamp_ns) - self.start_ns) / NANOSECONDS_PER_SECOND, dtype=np.float64
-        )
+        return to_s(np.asarray(stamp_ns, dtype=np.int64) - self.start_ns)
 
 
 def _stamp_ns(delivery: Delivery) -> int:

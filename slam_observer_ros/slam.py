@@ -22,7 +22,7 @@ from slam_observer_ros.noise import NoiseModel
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.odometry import motion
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.sighting import Outlook, Sighting
+from slam_observer_ros.sighting import Outcome, Outlook, Sighting
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.velocity_history import VelocityHistory
 
@@ -58,10 +58,6 @@ class Slam:
         Where points were seen, to know where one without an id should have been.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
-    believed_ids, rejected_ids : IntArray
-        Known landmarks in the last observation, by what it was taken for.
-    moved_ids : IntArray
-        Landmarks that the last observation showed to have moved.
     rejected_in_a_row : int
         Observations since the last one of which a known landmark was not rejected.
 
@@ -74,10 +70,6 @@ class Slam:
         self.landmarks = LandmarkTable()
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
-        nothing = np.empty(0, dtype=np.int64)
-        self.believed_ids: IntArray = nothing
-        self.rejected_ids: IntArray = nothing
-        self.moved_ids: IntArray = nothing
         self.rejected_in_a_row = 0
         self.noise = NoiseModel(settings)
         self._outlook = Outlook(self.observer, self.landmarks, self.noise, settings)
@@ -187,14 +179,13 @@ class Slam:
         """
         event = event.select(event.ids != UNKNOWN_ID)
         rows = self.landmarks.rows_of(event.ids)
+        known = rows >= 0
         if not self.is_mapping:
-            event, rows = event.select(rows >= 0), rows[rows >= 0]
-        self.gains.recall(self.observer, rows[rows >= 0])
-        return self._outlook.sighting(event, rows)
+            event, rows, known = event.select(known), rows[known], known[known]
+        self.gains.recall(self.observer, rows[known])
+        return self._outlook.sighting(event, rows, known)
 
-    def observe(
-        self, event: ObservationEvent, sighting: Sighting | None = None
-    ) -> tuple[IntArray, FloatArray]:
+    def observe(self, event: ObservationEvent, sighting: Sighting | None = None) -> Outcome:
         """Use an observation made at the state's instant.
 
         Parameters
@@ -206,40 +197,36 @@ class Slam:
 
         Returns
         -------
-        ids : IntArray
-            (m,) ids of the landmarks seen that were known before.
-        residuals : FloatArray
-            (m, 3) their residuals before the correction, metres, reference frame.
+        Outcome
+            What the state made of it.
 
         """
-        self.moved_ids = np.empty(0, dtype=np.int64)
         sighting = self.look(event) if sighting is None else sighting
         if sighting.event is not event:
             unknown = int(np.sum(event.ids == UNKNOWN_ID))
             self.counts['unknown_id'] += unknown
             self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
-        event, rows, covariances = sighting.event, sighting.rows, sighting.covariances
-        forgotten = self._in_the_way(event, rows)
+        event, rows, known = sighting.event, sighting.rows, sighting.known
+        forgotten = self._in_the_way(sighting)
         if len(forgotten):
             # A history without them would lose what they have told of the pose.
             self.gains.restart(self.observer, 'landmarks had to make room (max_landmarks)')
-        known, used = rows >= 0, np.ones(len(rows), dtype=np.bool_)
-        ids = event.ids[known]
-        used[known] = self._correct(event.select(known), sighting.residuals)
+        seen_before = event.select(known)
+        rejected = self._correct(seen_before, sighting.residuals)
         if not known.all():
             self._make_room(forgotten)
-            self._initialise(event.select(~known), covariances[~known])
+            self._initialise(event.select(~known), sighting.covariances[~known])
             rows = self.landmarks.rows_of(event.ids)
-            kept = rows >= 0
-            event, rows, used = event.select(kept), rows[kept], used[kept]
+            event, rows = event.select(rows >= 0), rows[rows >= 0]
         if event.velocities is not None:
+            used = ~np.isin(event.ids, seen_before.ids[rejected])
             self.observer.set_landmark_velocities(rows[used], event.velocities[used])
-        self._look_back(event, rows)
-        return ids, sighting.residuals.r
+        moved_ids = self._look_back(event, rows)
+        return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
 
     def are_rejected_again(self, sighting: Sighting) -> BoolArray:
         """Return which known landmarks (m,) in it were rejected before where they are seen now."""
-        event = sighting.event.select(sighting.rows >= 0)
+        event = sighting.event.select(sighting.known)
         places = self._places(event, sighting.residuals)
         return self.landmarks.are_rejected_again(sighting.residuals.rows, *places)
 
@@ -305,23 +292,21 @@ class Slam:
         return turn
 
     def _correct(self, event: ObservationEvent, residuals: Residuals) -> BoolArray:
-        """Correct the state by the landmarks of ``event``; return which (m,) were not rejected."""
+        """Correct the state by the landmarks of ``event``; return which (m,) were rejected."""
         rows = residuals.rows
         if not len(rows):
-            self.believed_ids = self.rejected_ids = event.ids
             return np.empty(0, dtype=np.bool_)
         correction, weights = self.gains.correct(residuals)
         self.observer.correct(correction)
         self.gains.settle(self.observer)
-        rejected = weights == 0.0
-        self.believed_ids, self.rejected_ids = event.ids[~rejected], event.ids[rejected]
+        rejected: BoolArray = weights == 0.0
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
         if rejected.any():
             places = self._places(event.select(rejected), residuals.select(rejected))
             self.landmarks.reject(rows[rejected], *places)
             self.counts['rejected_landmark'] += int(np.sum(rejected))
-        return np.asarray(~rejected)
+        return rejected
 
     def _places(
         self, event: ObservationEvent, residuals: Residuals
@@ -330,27 +315,29 @@ class Slam:
         spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
         return se3.transform(self.observer.pose, event.points), SAME_PLACE * spread_m
 
-    def _look_back(self, event: ObservationEvent, rows: IntArray) -> None:
+    def _look_back(self, event: ObservationEvent, rows: IntArray) -> IntArray:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
 
         Now that the state is corrected, it is known better than before from where they were seen.
+        Return the ids of those that have moved.
         """
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
-        if not (some_are or self.gains.looks_back):
-            return
-        self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
+        if some_are or self.gains.looks_back:
+            self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
         if some_are:
-            self._relocate(event.select(in_doubt), rows[in_doubt])
+            return self._relocate(event.select(in_doubt), rows[in_doubt])
+        return np.empty(0, dtype=np.int64)
 
-    def _relocate(self, event: ObservationEvent, rows: IntArray) -> None:
-        """Start landmarks in doubt anew that are still far from where they were expected."""
+    def _relocate(self, event: ObservationEvent, rows: IntArray) -> IntArray:
+        """Start landmarks in doubt anew that are still far from where they were expected.
+
+        Return the ids of those that were seen often enough to say that they have moved.
+        """
         residuals = self._outlook.residuals(event, rows, self.noise.observation(event))
         far = self.gains.distances(residuals) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
-        if moved.any():
-            self.counts['moved_landmark'] += int(np.sum(moved))
-            self.moved_ids = event.ids[moved]
+        self.counts['moved_landmark'] += int(np.sum(moved))
         if far.any():
             self.observer.relocate_landmarks(rows[far], event.points[far])
             if self.settings.landmark_velocity_error > 0.0:
@@ -358,18 +345,19 @@ class Slam:
             y_ref = self.observer.y_ref[rows[far]]
             self.gains.relocate_landmarks(rows[far], y_ref, residuals.covariances[far])
             self.landmarks.restart(rows[far])
+        return event.ids[moved]
 
-    def _in_the_way(self, event: ObservationEvent, rows: IntArray) -> IntArray:
-        """Return which landmarks out of view make room for those of ``rows`` (m,) that are new.
+    def _in_the_way(self, sighting: Sighting) -> IntArray:
+        """Return which landmarks out of view make room for the new ones of ``sighting``.
 
         The least often seen go first.
         """
-        limit, new = self.settings.max_landmarks, int(np.sum(rows < 0))
+        limit, new = self.settings.max_landmarks, len(sighting.rows) - len(sighting.residuals.rows)
         excess = len(self.landmarks) + new - limit
         if limit == 0 or new == 0 or excess <= 0:
             return np.empty(0, dtype=np.int64)
-        unseen = self.landmarks.unseen_since(event.stamp_ns)
-        return np.sort(unseen[~np.isin(unseen, rows)][:excess])
+        unseen = self.landmarks.unseen_since(sighting.event.stamp_ns)
+        return np.sort(unseen[~np.isin(unseen, sighting.rows)][:excess])
 
     def _make_room(self, rows: IntArray) -> None:
         if len(rows):

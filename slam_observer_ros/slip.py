@@ -54,7 +54,7 @@ def slip(slam: Slam, sighting: Sighting) -> None:
 def _duration_s(settings: Settings, sighting: Sighting) -> float:
     """Return after how long without odometry a robot might see what it does, seconds."""
     k, residuals = axes_of(settings.two_d_mode).point, sighting.residuals
-    points = sighting.event.points[sighting.rows >= 0]
+    points = sighting.event.points[sighting.known]
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
     needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, LEAST_VARIANCE_M2)
@@ -74,7 +74,7 @@ def _pose_after(slam: Slam, sighting: Sighting) -> FloatArray:
     spreads = np.linalg.svd(np.sqrt(weights)[:, None] * offsets, compute_uv=False)
     if len(rows) < k or spreads[k - 2] < LEAST_SPREAD:
         return A
-    seen = se3.transform(A, sighting.event.points[sighting.rows >= 0])
+    seen = se3.transform(A, sighting.event.points[sighting.known])
     found = rigid_alignment(seen, landmarks, weights) @ A
     turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
     shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])

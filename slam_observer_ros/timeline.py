@@ -16,6 +16,7 @@ from slam_observer_ros.odometry import transition, transition_covariance
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_ns, to_s
 from slam_observer_ros.velocity_history import VelocityHistory
 
 OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
@@ -47,12 +48,12 @@ class Timeline:
     """
 
     def __init__(self, settings: Settings, on_motion: OnMotion | None = None) -> None:
-        timeout_ns = round(settings.velocity_timeout * 1e9)
+        timeout_ns = to_ns(settings.velocity_timeout)
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
         self.stamp_ns: int | None = None
         self.state_ns: int | None = None
         # A delay, and beyond it half of what velocities are averaged over to estimate it.
-        self._kept_ns = round((settings.late_limit + 2.0 * MAX_DELAY_S) * 1e9)
+        self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
         self._pending = 0
         self._newest_ns: dict[type, int] = {}
@@ -128,7 +129,7 @@ class Timeline:
         back = self.motion(slam.gains.calibration, state_ns, event.stamp_ns)
         turn, points = back[:3, :3], event.points
         if event.velocities is not None:
-            points = points + event.velocities * (state_ns - event.stamp_ns) * 1e-9
+            points = points + event.velocities * to_s(state_ns - event.stamp_ns)
         Q = transition_covariance(
             self.velocities, slam.gains.calibration, slam.noise, event.stamp_ns, state_ns
         )

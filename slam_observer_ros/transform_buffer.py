@@ -14,6 +14,7 @@ import numpy as np
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_s
 
 HISTORY_NS = 10_000_000_000
 """How far back transforms are kept, nanoseconds; tf2's default."""
@@ -120,8 +121,8 @@ class TransformBuffer:
             if step is None:
                 raise TransformError(
                     f"'{track.parent}' to '{frame}' is known "
-                    f'from {track.stamps_ns[0] * 1e-9:.3f} to {track.stamps_ns[-1] * 1e-9:.3f} s, '
-                    f'not at {stamp_ns * 1e-9:.3f} s'
+                    f'from {to_s(track.stamps_ns[0]):.3f} to {to_s(track.stamps_ns[-1]):.3f} s, '
+                    f'not at {to_s(stamp_ns):.3f} s'
                 )
             pose = step @ pose
         return pose

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_observer_ros.events import AngularVelocityEvent, flatten_velocities, VelocityEvent
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND, to_s
 
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
 """Stamp of a velocity that timed out before time began, nanoseconds."""
@@ -137,11 +137,11 @@ class VelocityHistory:
         stops = np.minimum(np.maximum(since[:, 1] + self._timeout_ns, begins), ends)
         return HeldVelocities(
             self._counting(joined.body_velocities[rows]),
-            joined.covariances[rows].copy(),
-            joined.is_stated[rows].copy(),
-            _seconds(stops - begins),
-            _seconds(ends - stops),
-            _seconds(begins[:, None] - since),
+            joined.covariances[rows],
+            joined.is_stated[rows],
+            to_s(stops - begins),
+            to_s(ends - stops),
+            to_s(begins[:, None] - since),
         )
 
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
@@ -226,7 +226,10 @@ class _Joined:
     def write(
         self, first: int, events: list[tuple[VelocityEvent, AngularVelocityEvent | None]]
     ) -> None:
-        """Fill in rows from ``first`` on, which are zero: velocities, and what goes with them."""
+        """Fill in rows from ``first`` on, which are zero: velocities, and what goes with them.
+
+        Rows that are filled in never change, so that others may look at them.
+        """
         rows = slice(first, first + len(events))
         self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
         self.since_ns[rows] = [[velocity.stamp_ns] for velocity, _ in events]
@@ -244,7 +247,3 @@ class _Joined:
         self.covariances[row, :3, :3] = angular.covariance if is_stated else 0.0
         self.is_stated[row, 0] = is_stated
         self.since_ns[row, 0] = angular.stamp_ns
-
-
-def _seconds(nanoseconds: IntArray) -> FloatArray:
-    return nanoseconds.astype(np.float64) * 1e-9

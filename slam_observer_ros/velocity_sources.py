@@ -5,6 +5,7 @@ from __future__ import annotations
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_s
 
 
 class PoseDifferences:
@@ -30,4 +31,4 @@ class PoseDifferences:
         if last is None or not 0 < stamp_ns - last[0] <= self._timeout_ns:
             return None
         motion = se3.log(se3.inverse(last[1]) @ pose)
-        return VelocityEvent(last[0], motion / ((stamp_ns - last[0]) * 1e-9))
+        return VelocityEvent(last[0], motion / to_s(stamp_ns - last[0]))

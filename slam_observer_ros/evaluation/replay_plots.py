@@ -24,6 +24,7 @@ from slam_observer_ros.evaluation.drawing import (
 )
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.units import to_s
 
 _GAP_S = 2.0
 """Errors further apart than this are not joined: nobody knows what was between them."""
@@ -218,4 +219,4 @@ def _draw_dropped(axes: Axes, dropped: Mapping[str, int], events: int) -> None:
 
 
 def _seconds_since(start_ns: int, stamps_ns: IntArray) -> FloatArray:
-    return (stamps_ns - start_ns) / 1e9
+    return to_s(stamps_ns - start_ns)

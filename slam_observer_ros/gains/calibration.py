@@ -13,6 +13,7 @@ from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
 from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.units import to_ns
 
 NAMES = (
     *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
@@ -61,7 +62,7 @@ class Calibration:
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._all: FloatArray = np.repeat([1.0, 0.0], [6, 7])
         self.count = len(self._estimated)
-        self.delay_error_ns = round(settings.velocity_delay_error * 1e9)
+        self.delay_error_ns = to_ns(settings.velocity_delay_error)
         self.initial_variances = errors[self._estimated] ** 2
         self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
         self.drifts = bool(self.drift_covariance.any())
@@ -82,7 +83,7 @@ class Calibration:
     @property
     def delay_ns(self) -> int:
         """Delay τ, nanoseconds; where it is negative the latest velocity is held for longer."""
-        return round(float(self._all[DELAY]) * 1e9)
+        return to_ns(float(self._all[DELAY]))
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return (k, 6) velocities (1 + s) ∘ V + b."""

@@ -61,10 +61,10 @@ class FixedMapGains(RiccatiGains):
         """Do nothing: nothing is kept of the past."""
 
     def _project(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-        """Return P Cᵀ and C P Cᵀ."""
+        """Return C P and C P Cᵀ."""
         C = self._pose_output(residuals)
-        PC = self._joint.P[:, : self._p] @ C.T
-        return PC, C @ PC[: self._p]
+        CP = C @ self._joint.P[: self._p]
+        return CP, CP[:, : self._p] @ C.T
 
     def _output_covariances(
         self, C: FloatArray, columns: IntArray

@@ -184,10 +184,10 @@ class RiccatiGains(GainDesign):
         weights = observation_weights(r, self.foretold(residuals)[1], noise, self._settings)
         passed = weights > 0.0
         used = residuals.select(passed)
-        PC, CPC = self._project(used)
+        CP, CPC = self._project(used)
         S = with_blocks(CPC, used.covariances[:, :k, :k] / weights[passed, None, None])
-        K = solve(S, PC.T).T
-        half = K @ (0.5 * S @ K.T - PC.T)
+        K = solve(S, CP).T
+        half = K @ (0.5 * S @ K.T - CP)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
         return self._as_correction(-K @ used.r[:, :k].ravel()), weights
 
@@ -237,11 +237,11 @@ class RiccatiGains(GainDesign):
         return self._output_covariances(C, self._joint.columns(residuals.rows))
 
     def _project(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-        """Return P Cᵀ and C P Cᵀ."""
-        columns = self._joint.columns(residuals.rows)
+        """Return C P and C P Cᵀ."""
+        columns, P = self._joint.columns(residuals.rows), self._joint.P
         C = self._pose_output(residuals)
-        PC = self._joint.P[:, : self._p] @ C.T - self._joint.P[:, columns]
-        return PC, C @ PC[: self._p] - PC[columns]
+        CP = C @ P[: self._p] - P[columns]  # rows of P cost less to pick than its columns
+        return CP, CP[:, : self._p] @ C.T - CP[:, columns]
 
     def _pose_output(self, residuals: Residuals) -> FloatArray:
         """Return the columns (m k, p) of C that belong to ε."""

@@ -13,6 +13,8 @@ import numpy as np
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import FloatArray
 
+_IDENTITY = np.eye(3)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlamElement:
@@ -119,7 +121,7 @@ def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
     """
     phi, v = Delta[..., :3], Delta[..., 3:, None]
     J = so3.left_jacobian(phi)
-    R = np.eye(3) + so3.hat(phi) @ J  # exp φ, as J is the integral of exp(s φ)
+    R = _IDENTITY + so3.hat(phi) @ J  # exp φ, as J is the integral of exp(s φ)
     return SlamElement(se3.pose(R, (J @ v)[..., 0]), d @ so3.transpose(J))
 
 

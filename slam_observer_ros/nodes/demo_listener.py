@@ -27,6 +27,7 @@ from slam_observer_ros.recording.messages import (
 from slam_observer_ros.recording.point_clouds import decode_point_cloud, decode_point_cloud2
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_s
 
 CAUGHT_UP_NS = 500_000_000
 """What an estimate may lag behind at the end, as the last events are held back for others."""
@@ -111,13 +112,13 @@ class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
         """Stamp of the latest estimate since the run's start, simulated seconds."""
         if not (self._stamps_ns and self._true_stamps_ns):
             return 0.0
-        return (self._stamps_ns[-1] - self._true_stamps_ns[0]) / 1e9
+        return to_s(self._stamps_ns[-1] - self._true_stamps_ns[0])
 
     @property
     def times_s(self) -> FloatArray:
         """(k,) times of the estimates since the run's start, simulated seconds."""
         start_ns = self._true_stamps_ns[0] if self._true_stamps_ns else 0
-        return (np.array(self._stamps_ns, dtype=np.int64) - start_ns) / 1e9
+        return to_s(np.array(self._stamps_ns, dtype=np.int64) - start_ns)
 
     def trajectories(self) -> tuple[Trajectory, Trajectory]:
         """Return the estimated and the true poses at the stamps of those estimates."""

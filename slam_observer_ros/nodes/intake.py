@@ -20,6 +20,7 @@ from slam_observer_ros.recording.event_builder import EventBuilder, Measured, NO
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
+from slam_observer_ros.units import to_ns
 
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports of one kind of drop."""
@@ -77,7 +78,7 @@ class Intake:
         self._processed = 0
         self.dropped: Counter[str] = Counter()
         self.clocks = {
-            name: ClockOffset(round(settings.max_clock_offset * 1e9))
+            name: ClockOffset(to_ns(settings.max_clock_offset))
             for name in ('twist', 'imu', 'landmarks')
         }
         self.is_active = False

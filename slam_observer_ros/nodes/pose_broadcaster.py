@@ -14,6 +14,7 @@ from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.nodes.transforms import TransformPublisher
 from slam_observer_ros.recording.frames import TransformSource
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_ns
 
 DISCOVERY_S = 2.0
 """How long to look for odom to base on /tf before the base is taken to have no parent there."""
@@ -48,7 +49,7 @@ class PoseBroadcaster:
         self._settings = settings
         self._transforms = transforms
         self._publisher = TransformPublisher(node, '/tf', RELIABLE_QOS)
-        self._tolerance_ns = round(settings.transform_tolerance * 1e9)
+        self._tolerance_ns = to_ns(settings.transform_tolerance)
         self._begin_s = time.monotonic()
         self._child = '' if settings.odom_frame else settings.base_frame
         self._waiting: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_WAITING)

@@ -29,6 +29,7 @@ from slam_observer_ros.nodes.settings import SimulatorNodeSettings
 from slam_observer_ros.nodes.transforms import TransformPublisher
 from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
+from slam_observer_ros.units import to_ns
 
 QUEUE_DEPTH = 1000
 """Deep enough that nothing is lost while a reliable reader falls behind for a moment."""
@@ -109,7 +110,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
 
     def _publish_due(self) -> None:
         elapsed_s = (time.monotonic() - self._start_wall_s) * self._settings.real_time_factor
-        now_ns = self._start_ns + round(elapsed_s * 1e9)
+        now_ns = self._start_ns + to_ns(elapsed_s)
         if self._publishes_clock:
             self._clock_publisher.publish(Clock(clock=time_message(now_ns)))
         while self._next is not None and self._next.arrival_ns <= now_ns:

@@ -14,7 +14,7 @@ from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.units import to_ns
 from slam_observer_ros.velocity_sources import PoseDifferences
 
 MAX_WAITING = 1000
@@ -80,9 +80,9 @@ class EventBuilder:
         on_drop: Callable[[TransformError], None],
     ) -> None:
         self._base_frame = base_frame
-        self._transform_timeout_ns = round(transform_timeout_s * NANOSECONDS_PER_SECOND)
+        self._transform_timeout_ns = to_ns(transform_timeout_s)
         self._on_drop = on_drop
-        self._poses = PoseDifferences(round(velocity_timeout_s * NANOSECONDS_PER_SECOND))
+        self._poses = PoseDifferences(to_ns(velocity_timeout_s))
         self._waiting: deque[tuple[_Waiting, TransformError]] = deque()
         self._taken_as_base: dict[str, tuple[int, VelocityMessage]] = {}
 

@@ -46,7 +46,7 @@ from slam_observer_ros.recording.topics import (
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.transform_buffer import TransformBuffer
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.units import to_s
 
 _logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')
@@ -106,7 +106,7 @@ class Recording:
     @property
     def duration_s(self) -> float:
         """Seconds from the first message to the last, by receive time."""
-        return (self._source.end_ns - self._source.start_ns) / NANOSECONDS_PER_SECOND
+        return to_s(self._source.end_ns - self._source.start_ns)
 
     def find_topics(
         self, names: TopicNames = TopicNames(), inputs: InputSettings = InputSettings()
