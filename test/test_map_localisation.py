@@ -22,7 +22,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.localisation import find_transform
+from slam_observer_ros.map_alignment import find_transform
 from slam_observer_ros.settings import Settings
 
 POINT_NOISE_M = 0.05

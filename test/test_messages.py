@@ -12,6 +12,11 @@ import ros_messages as ros
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.recording import messages, point_clouds
+from slam_observer_ros.recording.message_types import (
+    CLOUD_DECODERS,
+    POSE_DECODERS,
+    VELOCITY_DECODERS,
+)
 from slam_observer_ros.recording.point_cloud_layout import (
     encode_point_cloud,
     point_cloud2_layout,
@@ -68,7 +73,7 @@ class TestVelocities:
         )
         message_type = 'geometry_msgs/msg/TwistWithCovarianceStamped'
         raw = ros.serialise(ros.make(message_type, ros.header(frame_id), twist), little_endian)
-        message = messages.VELOCITY_DECODERS[message_type](raw, 42)
+        message = VELOCITY_DECODERS[message_type](raw, 42)
         np.testing.assert_array_equal(message.event.body_velocity, velocity)
         np.testing.assert_array_equal(message.event.covariance, ANGULAR_FIRST_COVARIANCE)
 
@@ -133,11 +138,9 @@ class TestPoses:
                 [0.0] * 6, COVARIANCE, self.POSITION, self.QUATERNION, (frame_id, 'base')
             ),
         ]
-        assert {message.__msgtype__ for message in built} == set(messages.POSE_DECODERS)
+        assert {message.__msgtype__ for message in built} == set(POSE_DECODERS)
         for message in built:
-            decoded = messages.POSE_DECODERS[message.__msgtype__](
-                ros.serialise(message, little_endian)
-            )
+            decoded = POSE_DECODERS[message.__msgtype__](ros.serialise(message, little_endian))
             assert (decoded.stamp_ns, decoded.frame_id) == (ros.STAMP_NS, frame_id)
             assert decoded.child_frame_id == getattr(message, 'child_frame_id', '')
             np.testing.assert_allclose(decoded.pose, self.EXPECTED, atol=1e-15)
@@ -179,7 +182,7 @@ class TestPointCloud:
         table = np.array(rows, dtype=float).reshape(-1, 4)
         channels = {other_channel: np.zeros(2), 'id': table[:, 0]}
         raw = ros.serialise(ros.point_cloud(table[:, 1:], channels, frame_id), little_endian)
-        message = messages.LANDMARK_DECODERS['sensor_msgs/msg/PointCloud'](raw, 42)
+        message = CLOUD_DECODERS['sensor_msgs/msg/PointCloud'](raw, 42)
         assert (message.frame_id, message.event.stamp_ns) == (frame_id, ros.STAMP_NS)
         np.testing.assert_array_equal(message.event.ids, table[:, 0])
         np.testing.assert_array_equal(message.event.points, table[:, 1:])
@@ -187,19 +190,19 @@ class TestPointCloud:
 
     def test_without_the_channel_all_ids_are_unknown(self):
         raw = ros.serialise(ros.point_cloud(np.ones((3, 3)), {'intensity': np.ones(3)}))
-        assert messages.decode_point_cloud(raw).event.ids.tolist() == [-1, -1, -1]
+        assert point_clouds.decode_point_cloud(raw).event.ids.tolist() == [-1, -1, -1]
         assert 'id' not in point_clouds.field_names(raw, 'sensor_msgs/msg/PointCloud')
 
     @pytest.mark.parametrize('bad_id', [0.5, -2.0, np.nan, np.inf, 2.0**24])
     def test_id_that_float32_cannot_tell_is_refused(self, bad_id):
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.array([1, bad_id])}))
         with pytest.raises(MessageError, match='not a whole number'):
-            messages.decode_point_cloud(raw)
+            point_clouds.decode_point_cloud(raw)
 
     def test_id_channel_of_another_length_is_refused(self):
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.ones(3)}))
         with pytest.raises(MessageError, match='3 ids for 2 points'):
-            messages.decode_point_cloud(raw)
+            point_clouds.decode_point_cloud(raw)
 
     @given(FRAMES, st.integers(0, 5))
     def test_encoder_writes_what_the_ros_serialiser_writes(self, frame_id, count):
@@ -240,7 +243,7 @@ class TestPointCloud2:
         )
         cloud = records(dtype, shape)
         raw = ros.serialise(ros.point_cloud2(cloud, frame_id, row_padding=gap), little_endian)
-        message = messages.decode_point_cloud2(raw, 42)
+        message = point_clouds.decode_point_cloud2(raw, 42)
         assert (message.frame_id, message.event.stamp_ns) == (frame_id, ros.STAMP_NS)
         np.testing.assert_array_equal(message.event.ids, 7 + np.arange(cloud.size))
         np.testing.assert_array_equal(message.event.points, points_of(cloud))
@@ -278,7 +281,7 @@ class TestPointCloud2:
                 True,
             )
         )
-        event = messages.decode_point_cloud2(raw).event
+        event = point_clouds.decode_point_cloud2(raw).event
         np.testing.assert_array_equal(event.ids, ids)
         np.testing.assert_array_equal(event.points, points)
         if with_covariances and count:
@@ -307,19 +310,19 @@ class TestPointCloud2:
 
     def test_empty_cloud_needs_no_fields(self):
         raw = ros.serialise(ros.point_cloud2(np.zeros((0, 0), np.dtype([('q', 'f4')]))))
-        event = messages.decode_point_cloud2(raw).event
+        event = point_clouds.decode_point_cloud2(raw).event
         assert event.points.shape == (0, 3)
         assert event.ids.shape == (0,)
 
     def test_without_ids_all_are_unknown(self):
         cloud = records(np.dtype([(name, '<f4') for name in 'xyz']))
-        event = messages.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
         assert event.ids.tolist() == [-1, -1, -1]
 
     def test_zero_covariances_are_unknown(self):
         names = ['x', 'y', 'z', *point_clouds.COVARIANCE_NAMES]
         cloud = np.zeros((1, 2), [(name, '<f4') for name in names])
-        event = messages.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
         assert event.covariances is None
 
     @pytest.mark.parametrize('id_type', ['<u4', '<f4'])
@@ -341,8 +344,10 @@ class TestPointCloud2:
         whole = ros.serialise(ros.point_cloud2(cloud))
         cloud['y'][0, 1] = unmeasured
         sparse = ros.serialise(ros.point_cloud2(cloud, is_dense=is_dense))
-        event = messages.decode_point_cloud2(sparse).event
-        expected = messages.decode_point_cloud2(whole).event.select(np.array([True, False, True]))
+        event = point_clouds.decode_point_cloud2(sparse).event
+        expected = point_clouds.decode_point_cloud2(whole).event.select(
+            np.array([True, False, True])
+        )
         assert event.ids.tolist() == [7, 9]
         for name in ('points', 'covariances', 'velocities'):
             np.testing.assert_array_equal(getattr(event, name), getattr(expected, name))
@@ -350,7 +355,7 @@ class TestPointCloud2:
     def test_unmeasured_points_of_a_point_cloud_are_left_out(self):
         points = np.array([[1.0, 2.0, 3.0], [np.nan] * 3, [4.0, 5.0, 6.0]])
         raw = ros.serialise(ros.point_cloud(points, {'id': np.array([7, 8, 9])}))
-        event = messages.decode_point_cloud(raw).event
+        event = point_clouds.decode_point_cloud(raw).event
         assert event.ids.tolist() == [7, 9]
         np.testing.assert_array_equal(event.points, points[[0, 2]])
 
@@ -366,13 +371,13 @@ class TestPointCloud2:
     def test_missing_or_mistyped_field_is_named(self, fields, reason):
         raw = ros.serialise(ros.point_cloud2(records(np.dtype(fields))))
         with pytest.raises(MessageError, match=reason):
-            messages.decode_point_cloud2(raw)
+            point_clouds.decode_point_cloud2(raw)
 
     def test_negative_id_is_refused(self):
         cloud = records(np.dtype([('x', 'f4'), ('y', 'f4'), ('z', 'f4'), ('id', 'i4')]))
         cloud['id'][0, 2] = -5
         with pytest.raises(MessageError, match='negative landmark id -5'):
-            messages.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
+            point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
 
     @pytest.mark.parametrize(
         ('change', 'reason'),
@@ -389,7 +394,7 @@ class TestPointCloud2:
         for name, value in change.items():
             setattr(cloud, name, value)
         with pytest.raises(MessageError, match=reason):
-            messages.decode_point_cloud2(ros.serialise(cloud))
+            point_clouds.decode_point_cloud2(ros.serialise(cloud))
 
 
 def example_messages() -> dict[str, bytes]:
@@ -406,7 +411,7 @@ def example_messages() -> dict[str, bytes]:
     }
 
 
-DECODERS = messages.VELOCITY_DECODERS | messages.LANDMARK_DECODERS
+DECODERS = VELOCITY_DECODERS | CLOUD_DECODERS
 
 
 class TestMalformed:
@@ -445,7 +450,7 @@ class TestMalformed:
         raw = bytearray(ros.serialise(ros.point_cloud(np.zeros((0, 3)), {}, '')))
         raw[-8:-4] = struct.pack('<I', 2**32 - 1)
         with pytest.raises(MessageError, match='too short'):
-            messages.decode_point_cloud(bytes(raw))
+            point_clouds.decode_point_cloud(bytes(raw))
 
 
 def test_rclpy_serialises_the_same_bytes():
@@ -470,6 +475,6 @@ def test_rclpy_serialises_the_same_bytes():
         for f in layout.fields
     ]
     cloud.data = layout.data
-    event = messages.decode_point_cloud2(serialization.serialize_message(cloud)).event
+    event = point_clouds.decode_point_cloud2(serialization.serialize_message(cloud)).event
     assert event.ids.tolist() == [4, -1]
     assert event.points.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]

@@ -9,59 +9,34 @@ from typing import Any, TypeVar
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from slam_observer_ros.nodes.inputs import Decoder, Input
+from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.recording.cdr import Buffer
 from slam_observer_ros.recording.detections import (
-    APRILTAGS_TYPE,
     decode_apriltags,
-    decode_detections,
     decode_pose_array,
     observed_tags,
 )
 from slam_observer_ros.recording.input_settings import AUTO, ON_TF
+from slam_observer_ros.recording.message_types import (
+    APRILTAGS,
+    CLOUD_DECODERS,
+    DETECTION_DECODERS,
+    IMU,
+    ODOMETRY,
+    POSE_ARRAY,
+    TRANSFORMS,
+    VELOCITY_DECODERS,
+)
 from slam_observer_ros.recording.messages import (
     decode_imu,
     decode_odometry_pose,
-    decode_odometry_twist,
     decode_transforms,
-    decode_twist,
-    decode_twist_stamped,
-    decode_twist_with_covariance_stamped,
     ImuMessage,
     PoseMessage,
-    VelocityMessage,
 )
-from slam_observer_ros.recording.point_clouds import (
-    decode_point_cloud,
-    decode_point_cloud2,
-    ObservationMessage,
-)
-
-ODOMETRY = 'nav_msgs/msg/Odometry'
-TRANSFORMS = 'tf2_msgs/msg/TFMessage'
-IMU = 'sensor_msgs/msg/Imu'
-
-VELOCITY_DECODERS: dict[str, Decoder[VelocityMessage]] = {
-    'geometry_msgs/msg/TwistStamped': decode_twist_stamped,
-    'geometry_msgs/msg/TwistWithCovarianceStamped': decode_twist_with_covariance_stamped,
-    'geometry_msgs/msg/Twist': decode_twist,
-    ODOMETRY: decode_odometry_twist,
-}
-"""Types that give a velocity, the preferred one first where a topic carries several."""
-
-CLOUD_DECODERS: dict[str, Decoder[ObservationMessage]] = {
-    'sensor_msgs/msg/PointCloud2': decode_point_cloud2,
-    'sensor_msgs/msg/PointCloud': decode_point_cloud,
-    'geometry_msgs/msg/PoseArray': decode_pose_array,
-}
-"""Types that give landmarks, likewise."""
-
-DETECTION_DECODERS: dict[str, Decoder[ObservationMessage]] = {
-    'vision_msgs/msg/Detection3DArray': decode_detections
-}
-"""Types of packages that are imported only if they are asked for."""
+from slam_observer_ros.recording.point_clouds import ObservationMessage
 
 ValueT = TypeVar('ValueT')
 
@@ -96,9 +71,10 @@ def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
         decode = partial(_decode_tags, settings.tag_frame_prefix)
         return Input(node, '/tf', {TRANSFORMS: decode}, intake.add_observations, qos)
     if settings.landmarks_type == 'AprilTagDetectionArray':
-        return Input(node, 'landmarks', {APRILTAGS_TYPE: decode_apriltags}, intake.add_tags, qos)
+        return Input(node, 'landmarks', {APRILTAGS: decode_apriltags}, intake.add_tags, qos)
     if settings.landmarks_type == AUTO:
-        return Input(node, 'landmarks', CLOUD_DECODERS, intake.add_observation, qos)
+        decoders = CLOUD_DECODERS | {POSE_ARRAY: decode_pose_array}
+        return Input(node, 'landmarks', decoders, intake.add_observation, qos)
     decoders = _chosen(CLOUD_DECODERS | DETECTION_DECODERS, settings.landmarks_type)
     return Input(node, 'landmarks', decoders, intake.add_observation, qos)
 

@@ -8,30 +8,28 @@ from functools import partial
 from typing import TypeAlias
 
 from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.recording.detections import (
-    APRILTAGS_TYPE,
-    decode_apriltags,
-    DETECTION_DECODERS,
-    observed_tags,
-    TagDetections,
-)
+from slam_observer_ros.recording.detections import decode_apriltags, observed_tags, TagDetections
 from slam_observer_ros.recording.event_builder import Measured
 from slam_observer_ros.recording.input_settings import InputSettings, POSE_DIFFERENCES
+from slam_observer_ros.recording.message_types import (
+    APRILTAGS,
+    CLOUD_DECODERS,
+    DETECTION_DECODERS,
+    POSE_DECODERS,
+    TRANSFORMS,
+    VELOCITY_DECODERS,
+)
 from slam_observer_ros.recording.messages import (
     decode_imu,
     decode_odometry_pose,
     decode_transforms,
     ImuMessage,
-    LANDMARK_DECODERS,
-    POSE_DECODERS,
     PoseMessage,
-    VELOCITY_DECODERS,
     VelocityMessage,
 )
 from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
-from slam_observer_ros.recording.transform_topics import TRANSFORMS_TYPE
 
 Decode: TypeAlias = Callable[[RawMessage], Sequence[Measured]]
 """From a message to what it measures.
@@ -40,7 +38,7 @@ Raises :class:`MessageError` if it is malformed, :class:`RecordingError` if it i
 """
 
 
-_OBSERVATION_DECODERS = LANDMARK_DECODERS | DETECTION_DECODERS
+_OBSERVATION_DECODERS = CLOUD_DECODERS | DETECTION_DECODERS
 
 
 def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topic, Decode]:
@@ -51,9 +49,9 @@ def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topi
     }
     if inputs.velocity_source == POSE_DIFFERENCES:
         decoders[selected.velocity] = _odometry_pose
-    if selected.landmarks.message_type == TRANSFORMS_TYPE:
+    if selected.landmarks.message_type == TRANSFORMS:
         decoders[selected.landmarks] = partial(_tags_on_tf, inputs.tag_frame_prefix)
-    elif selected.landmarks.message_type == APRILTAGS_TYPE:
+    elif selected.landmarks.message_type == APRILTAGS:
         decoders[selected.landmarks] = _tags
     if selected.imu is not None:
         decoders[selected.imu] = _imu

@@ -16,12 +16,9 @@ import numpy as np
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.recording.cdr import Buffer, CdrReader
-from slam_observer_ros.recording.messages import ObservationDecoder, PoseMessage
+from slam_observer_ros.recording.messages import PoseMessage
 from slam_observer_ros.recording.point_clouds import measured, ObservationMessage
 from slam_observer_ros.types import FloatArray
-
-APRILTAGS_TYPE = 'apriltag_msgs/msg/AprilTagDetectionArray'
-"""Message type that gives the ids of fiducials, whose positions are on /tf."""
 
 _POSE = 7
 _COVARIANCE = 36
@@ -90,16 +87,6 @@ def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:
     return TagDetections(
         stamp_ns, frame_id, tuple(number for number, _ in tags), tuple(name for _, name in tags)
     )
-
-
-POSE_ARRAY_TYPE = 'geometry_msgs/msg/PoseArray'
-DETECTIONS_TYPE = 'vision_msgs/msg/Detection3DArray'
-
-DETECTION_DECODERS: dict[str, ObservationDecoder] = {
-    POSE_ARRAY_TYPE: decode_pose_array,
-    DETECTIONS_TYPE: decode_detections,
-}
-"""Message types, beside clouds, that give landmark observations."""
 
 
 def observed_tags(

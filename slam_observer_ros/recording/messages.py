@@ -8,9 +8,8 @@ first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
@@ -18,11 +17,6 @@ from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.cdr import Buffer, CdrReader
-from slam_observer_ros.recording.point_clouds import (
-    decode_point_cloud,
-    decode_point_cloud2,
-    ObservationMessage,
-)
 from slam_observer_ros.types import FloatArray
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
@@ -99,15 +93,6 @@ class PoseMessage:
     def pose(self) -> FloatArray:
         """(4, 4) transform that takes points from ``child_frame_id`` to ``frame_id``."""
         return pose_matrices(self.position, self.quaternion)
-
-
-VelocityDecoder: TypeAlias = Callable[[Buffer, int], VelocityMessage]
-"""From the serialised message and its receive time, which only unstamped messages use."""
-
-ObservationDecoder: TypeAlias = Callable[[Buffer, int], ObservationMessage]
-"""As :data:`VelocityDecoder`, for landmarks."""
-
-PoseDecoder: TypeAlias = Callable[[Buffer], PoseMessage]
 
 
 def pose_stack(messages: Sequence[PoseMessage]) -> FloatArray:
@@ -225,29 +210,6 @@ def decode_imu(raw: Buffer) -> ImuMessage:
     if covariance[0, 0] == -1.0:
         raise MessageError('this Imu says that it measures no angular velocity')
     return ImuMessage(stamp_ns, frame_id, angular_velocity, _known(covariance))
-
-
-VELOCITY_DECODERS: dict[str, VelocityDecoder] = {
-    'geometry_msgs/msg/Twist': decode_twist,
-    'geometry_msgs/msg/TwistStamped': decode_twist_stamped,
-    'geometry_msgs/msg/TwistWithCovarianceStamped': decode_twist_with_covariance_stamped,
-    'nav_msgs/msg/Odometry': decode_odometry_twist,
-}
-"""Message types that give a velocity."""
-
-LANDMARK_DECODERS: dict[str, ObservationDecoder] = {
-    'sensor_msgs/msg/PointCloud': decode_point_cloud,
-    'sensor_msgs/msg/PointCloud2': decode_point_cloud2,
-}
-"""Clouds, which give landmarks, measured or true."""
-
-POSE_DECODERS: dict[str, PoseDecoder] = {
-    'geometry_msgs/msg/PoseStamped': decode_pose_stamped,
-    'geometry_msgs/msg/PoseWithCovarianceStamped': decode_pose_with_covariance_stamped,
-    'geometry_msgs/msg/TransformStamped': decode_transform_stamped,
-    'nav_msgs/msg/Odometry': decode_odometry_pose,
-}
-"""Message types that give a pose."""
 
 
 def _read_twist(reader: CdrReader) -> FloatArray:

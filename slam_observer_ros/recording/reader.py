@@ -23,7 +23,6 @@ from slam_observer_ros.recording.decoding import (
     decode_transform_message,
     input_decoders,
 )
-from slam_observer_ros.recording.detections import POSE_ARRAY_TYPE
 from slam_observer_ros.recording.event_builder import (
     EventBuilder,
     Measured,
@@ -32,17 +31,12 @@ from slam_observer_ros.recording.event_builder import (
 )
 from slam_observer_ros.recording.frames import BaseFrame, insert_transforms
 from slam_observer_ros.recording.input_settings import InputSettings
-from slam_observer_ros.recording.messages import LANDMARK_DECODERS
+from slam_observer_ros.recording.message_types import CLOUD_DECODERS, ODOMETRY, POSE_ARRAY
 from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.point_cloud_layout import ID_NAME
 from slam_observer_ros.recording.point_clouds import field_names
 from slam_observer_ros.recording.sources import RawMessage, Topic
-from slam_observer_ros.recording.topics import (
-    ODOMETRY_TYPE,
-    select_topics,
-    SelectedTopics,
-    TopicNames,
-)
+from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.transform_buffer import TransformBuffer
@@ -202,9 +196,9 @@ class Recording:
 
     def missing_ids(self, topic: Topic) -> str:
         """Tell whether a landmark topic's points have no ids, and what they have; else empty."""
-        if topic.message_type == POSE_ARRAY_TYPE:
+        if topic.message_type == POSE_ARRAY:
             return 'without ids'
-        if topic.message_type not in LANDMARK_DECODERS:
+        if topic.message_type not in CLOUD_DECODERS:
             return ''
         names = self._field_names(topic)
         kind = 'fields' if topic.message_type.endswith('PointCloud2') else 'channels'
@@ -212,7 +206,7 @@ class Recording:
 
     def poses_move(self, topic: Topic) -> bool:
         """Tell whether a topic holds an odometry's poses, and they are not all the same."""
-        if topic.message_type != ODOMETRY_TYPE:
+        if topic.message_type != ODOMETRY:
             return False
         poses = (message.pose for message in self._all_decoded(topic, decode_pose))
         return any(not np.array_equal(pose, after) for pose, after in pairwise(poses))

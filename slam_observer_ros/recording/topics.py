@@ -7,37 +7,26 @@ from dataclasses import dataclass, replace
 import logging
 
 from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.recording.detections import (
-    APRILTAGS_TYPE,
-    DETECTIONS_TYPE,
-    POSE_ARRAY_TYPE,
-)
-from slam_observer_ros.recording.input_settings import (
-    AUTO,
-    InputSettings,
-    ON_TF,
-    POSE_DIFFERENCES,
-)
-from slam_observer_ros.recording.messages import (
-    LANDMARK_DECODERS,
+from slam_observer_ros.recording.input_settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
+from slam_observer_ros.recording.message_types import (
+    APRILTAGS,
+    CLOUD_DECODERS,
+    DETECTIONS,
+    IMU,
+    ODOMETRY,
+    POSE_ARRAY,
     POSE_DECODERS,
+    TRANSFORMS,
     VELOCITY_DECODERS,
 )
 from slam_observer_ros.recording.sources import last_part, Topic
-from slam_observer_ros.recording.transform_topics import (
-    transform_topics,
-    TRANSFORMS_TYPE,
-    TransformTopics,
-)
+from slam_observer_ros.recording.transform_topics import transform_topics, TransformTopics
 
 TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
 """Topics with one of these between the slashes of their name hold truth, not measurements."""
 
 ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
 """Landmarks that an observer publishes, and does not measure."""
-
-ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
-IMU_TYPE = 'sensor_msgs/msg/Imu'
 
 _logger = logging.getLogger(__name__)
 
@@ -138,7 +127,7 @@ def select_topics(
             return topic.message_type in (*role.message_types, *role.types_by_name)
         if topic.message_type not in role.message_types:
             return False
-        return topic.message_type not in LANDMARK_DECODERS or identifies(topic)
+        return topic.message_type not in CLOUD_DECODERS or identifies(topic)
 
     def pick(role: _Role, name: str | None) -> Topic | None:
         if name is not None:
@@ -198,19 +187,19 @@ def _pose_rank(name: str) -> int:
 
 
 _VELOCITY = _Role('velocity', '--velocity-topic', VELOCITY_DECODERS, False, _velocity_rank)
-_ODOMETRY = _Role('odometry', '--velocity-topic', (ODOMETRY_TYPE,), False, _velocity_rank)
-_IMU = _Role('Imu', '--imu', (IMU_TYPE,), False, lambda _name: 0)
+_ODOMETRY = _Role('odometry', '--velocity-topic', (ODOMETRY,), False, _velocity_rank)
+_IMU = _Role('Imu', '--imu', (IMU,), False, lambda _name: 0)
 _LANDMARKS = _Role(
     'landmark',
     '--landmarks-topic',
-    (*LANDMARK_DECODERS, DETECTIONS_TYPE, APRILTAGS_TYPE),
+    (*CLOUD_DECODERS, DETECTIONS, APRILTAGS),
     False,
     _landmark_rank,
-    types_by_name=(POSE_ARRAY_TYPE, TRANSFORMS_TYPE),
+    types_by_name=(POSE_ARRAY, TRANSFORMS),
 )
 _POSE_TRUTH = _Role('true pose', '--pose-truth-topic', POSE_DECODERS, True, _pose_rank)
 _LANDMARK_TRUTH = _Role(
-    'true landmark', '--landmark-truth-topic', LANDMARK_DECODERS, True, _landmark_rank
+    'true landmark', '--landmark-truth-topic', CLOUD_DECODERS, True, _landmark_rank
 )
 
 
@@ -219,7 +208,7 @@ def _landmark_choice(name: str | None, landmarks_type: str) -> tuple[_Role, str 
     if landmarks_type == AUTO:
         return _LANDMARKS, name
     if landmarks_type == ON_TF:
-        types, name = [TRANSFORMS_TYPE], name or '/tf'
+        types, name = [TRANSFORMS], name or '/tf'
     else:
         known = (*_LANDMARKS.message_types, *_LANDMARKS.types_by_name)
         types = [known_type for known_type in known if last_part(known_type) == landmarks_type]
@@ -259,7 +248,7 @@ def _best(fitting: Sequence[Topic], role: _Role) -> Topic | None:
 def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topic:
     if topic is not None:
         return topic
-    with_ids = '' if LANDMARK_DECODERS.keys().isdisjoint(role.message_types) else ' with ids'
+    with_ids = '' if CLOUD_DECODERS.keys().isdisjoint(role.message_types) else ' with ids'
     raise RecordingError(
         f'no {role.name} topic: none of type {_join(role.message_types)}{with_ids}; '
         f'choose another with {role.option}; the recording holds {_join(topics)}'

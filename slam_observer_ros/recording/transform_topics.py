@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import logging
 from os.path import commonpath
 
+from slam_observer_ros.recording.message_types import TRANSFORMS
 from slam_observer_ros.recording.sources import last_part, Topic
-
-TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
-"""Type of /tf, which holds landmarks if they are fiducials."""
 
 _logger = logging.getLogger(__name__)
 
@@ -48,7 +46,7 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
     trees = [
         topic
         for topic in topics
-        if topic.message_type == TRANSFORMS_TYPE
+        if topic.message_type == TRANSFORMS
         and topic.count
         and last_part(topic.name) in ('tf', 'tf_static')
     ]

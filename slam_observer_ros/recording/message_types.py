@@ -1,0 +1,80 @@
+"""The message types that are read, live and recorded, and what decodes each of them.
+
+Of types that are equally right, where a live topic carries several, the first one is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+from slam_observer_ros.recording.cdr import Buffer
+from slam_observer_ros.recording.detections import decode_detections, decode_pose_array
+from slam_observer_ros.recording.messages import (
+    decode_odometry_pose,
+    decode_odometry_twist,
+    decode_pose_stamped,
+    decode_pose_with_covariance_stamped,
+    decode_transform_stamped,
+    decode_twist,
+    decode_twist_stamped,
+    decode_twist_with_covariance_stamped,
+    PoseMessage,
+    VelocityMessage,
+)
+from slam_observer_ros.recording.point_clouds import (
+    decode_point_cloud,
+    decode_point_cloud2,
+    ObservationMessage,
+)
+
+ODOMETRY = 'nav_msgs/msg/Odometry'
+"""Type that gives a velocity and a pose."""
+
+IMU = 'sensor_msgs/msg/Imu'
+"""Type that gives an angular velocity."""
+
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+"""Type of /tf, which places sensors, and holds landmarks if they are fiducials."""
+
+APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'
+"""Type that gives the ids of fiducials, whose positions are on /tf."""
+
+POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
+DETECTIONS = 'vision_msgs/msg/Detection3DArray'
+
+VelocityDecoder: TypeAlias = Callable[[Buffer, int], VelocityMessage]
+"""From the serialised message and its receive time, which only unstamped messages use."""
+
+ObservationDecoder: TypeAlias = Callable[[Buffer, int], ObservationMessage]
+"""As :data:`VelocityDecoder`, for landmarks."""
+
+PoseDecoder: TypeAlias = Callable[[Buffer], PoseMessage]
+
+VELOCITY_DECODERS: dict[str, VelocityDecoder] = {
+    'geometry_msgs/msg/TwistStamped': decode_twist_stamped,
+    'geometry_msgs/msg/TwistWithCovarianceStamped': decode_twist_with_covariance_stamped,
+    'geometry_msgs/msg/Twist': decode_twist,
+    ODOMETRY: decode_odometry_twist,
+}
+"""Types that give a velocity."""
+
+CLOUD_DECODERS: dict[str, ObservationDecoder] = {
+    'sensor_msgs/msg/PointCloud2': decode_point_cloud2,
+    'sensor_msgs/msg/PointCloud': decode_point_cloud,
+}
+"""Clouds, which give landmarks, measured or true."""
+
+DETECTION_DECODERS: dict[str, ObservationDecoder] = {
+    POSE_ARRAY: decode_pose_array,
+    DETECTIONS: decode_detections,
+}
+"""Types, beside clouds, that give landmark observations."""
+
+POSE_DECODERS: dict[str, PoseDecoder] = {
+    'geometry_msgs/msg/PoseStamped': decode_pose_stamped,
+    'geometry_msgs/msg/PoseWithCovarianceStamped': decode_pose_with_covariance_stamped,
+    'geometry_msgs/msg/TransformStamped': decode_transform_stamped,
+    ODOMETRY: decode_odometry_pose,
+}
+"""Types that give a pose."""
