@@ -21,6 +21,15 @@ def used_points(counts: Counter[str]) -> int:
     return counts['observed_point'] - sum(counts[name] for name in UNUSED_POINTS)
 
 
+MOST_REJECTED = 0.1
+"""Share of the points beyond which they are more than a sensor's outliers."""
+
+
+def rejected_share(counts: Counter[str]) -> float:
+    """Return the share of the points that was rejected, from :attr:`.Estimator.counts`."""
+    return counts['rejected_landmark'] / max(counts['observed_point'], 1)
+
+
 @dataclass(frozen=True, slots=True)
 class Update:
     """The state right after an observation was used.

@@ -17,13 +17,14 @@ from slam_observer_ros.events import (
     Event,
     flatten,
     ObservationEvent,
+    UNKNOWN_ID,
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.map_frame import MapFrame
 from slam_observer_ros.observer import lyapunov
-from slam_observer_ros.parameters import table
+from slam_observer_ros.parameters import checked, table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
@@ -35,6 +36,14 @@ logger = logging.getLogger(__name__)
 
 MOST_NAMED = 10
 """Ids that a warning lists at most."""
+
+
+SLIP_WARNINGS = {
+    'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
+    'strange_place': 'Nothing that is seen is where the map has it: if the robot slipped or was '
+    'carried, it is not found again, as the points have no ids',
+}
+"""What is wrong when these counts grow."""
 
 
 class Estimator:
@@ -63,7 +72,8 @@ class Estimator:
         (``'late_velocity'``, ``'late_observation'``), points in observations
         (``'observed_point'``), observations made before the place in a loaded map was found
         (``'not_localised'``), how often it was lost again (``'lost'``), how often the robot was
-        not where odometry had it (``'slip'``), and what became of landmarks
+        not where odometry had it (``'slip'``) or nothing in view, without ids, where the map has
+        it (``'strange_place'``), and what became of landmarks
         (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
         ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'`` and
         ``'repeated_id'``, which are not used).
@@ -71,6 +81,11 @@ class Estimator:
         Events refused, by reason.
     jumps : int
         How often the clock has jumped.
+
+    Raises
+    ------
+    ParameterError
+        If a setting does not fit its table.
 
     """
 
@@ -81,12 +96,12 @@ class Estimator:
         on_update: Callable[[Update], None] | None = None,
         on_motion: OnMotion | None = None,
     ) -> None:
-        self.settings = settings
+        self.settings = settings = checked(settings)
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
         self._warnings = CountedWarnings(logger)
-        self._slips = 0
+        self._slips: Counter[str] = Counter()
         self._on_update, self._on_motion = on_update, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
@@ -184,9 +199,10 @@ class Estimator:
         Raises
         ------
         ParameterError
-            If another setting differs.
+            If another setting differs, or one does not fit its table.
 
         """
+        settings = checked(settings)
         fixed = [row.name for row in table(Settings) if row.read_only]
         changed = [
             name for name in fixed if getattr(settings, name) != getattr(self.settings, name)
@@ -396,6 +412,7 @@ class Estimator:
             event = flatten(event)
         self._counts['observed_point'] += len(event.ids)
         event = self._without_repeated(event)
+        self._warn_of_unknown_ids(event)
         timeline = self._timeline
         timeline.begin(event.stamp_ns)
         if event.stamp_ns < (timeline.state_ns or 0):
@@ -405,7 +422,7 @@ class Estimator:
         outcome = self._frame.states.observe(event)
         if len(moved_ids := outcome.moved_ids):
             self._warnings.warn('moved_landmark', f'Landmarks {moved_ids.tolist()} have moved')
-        self._warn_of_slip()
+        self._warn_of_slips()
         self._counts['observation'] += 1
         self._frame.find_place(outcome)
         observer = self._slam.observer
@@ -420,12 +437,17 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self._last)
 
-    def _warn_of_slip(self) -> None:
-        slips = self._frame.counts['slip']
-        if slips > self._slips:
-            text = 'Odometry does not explain what is seen: the robot slipped or was carried'
-            self._warnings.warn('slip', text)
-        self._slips = max(self._slips, slips)
+    def _warn_of_slips(self) -> None:
+        counts = self._frame.counts
+        for name, text in SLIP_WARNINGS.items():
+            if counts[name] > self._slips[name]:
+                self._warnings.warn(name, text)
+                self._slips[name] = counts[name]
+
+    def _warn_of_unknown_ids(self, event: ObservationEvent) -> None:
+        if self.settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
+            text = f'Not used: points without an id, by {self.settings.gains} gains; riccati do'
+            self._warnings.warn('unknown_id', text)
 
     def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:
         """Leave out points with one id: nobody knows which of them is right."""

@@ -39,10 +39,15 @@ class FieldOfView:
         self._faces: FloatArray = np.empty((0, k + 1))
         self._margin_m = 0.0
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the hull has an inside."""
+        return len(self._faces) > 0
+
     def include(self, points: FloatArray) -> None:
         """Take in points (m, 3) that were seen, metres, body frame."""
         k = self.corners.shape[1]
-        known = self.contains(points) & (len(self._faces) > 0)
+        known = self.contains(points) & self.is_known
         if known.all():
             return
         corners = np.concatenate([self.corners, points[~known, :k]])

@@ -112,7 +112,7 @@ class Hypotheses:
                 slip(slam, slam.look(reading.event))
             outcome = slam.observe(reading.event)
             if some_are_unknown:
-                slam.forget_unsupported(reading.event)
+                slam.look_around(reading.event)
             slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
             if not any(_are_one(slam, reading, other) for other in followed):
                 followed.append(_Followed(slam, reading, outcome))

@@ -127,6 +127,11 @@ class LandmarkTable:
         self._settled_seen += int(np.sum(settled & seen))
         self.looks[rows] += 1
 
+    @property
+    def seen_share(self) -> float:
+        """How often a landmark without an id that has settled is seen while in view; else 0."""
+        return self._settled_seen / self._settled_looks if self._settled_looks else 0.0
+
     def unsupported(self, min_support: int) -> IntArray:
         """Return rows without an id that were seen too seldom to be landmarks.
 
@@ -138,8 +143,8 @@ class LandmarkTable:
         self._settled_seen += int(np.sum(self.counts[settling]))
         self.tentative &= ~settling
         # Before any has settled nobody knows how often one is seen.
-        share = self._settled_seen / self._settled_looks if self._settled_looks else 0.0
-        return np.flatnonzero(self.tentative & (self.looks * share >= PATIENCE * min_support))
+        expected = self.looks * self.seen_share
+        return np.flatnonzero(self.tentative & (expected >= PATIENCE * min_support))
 
     def unseen_since(self, stamp_ns: int) -> IntArray:
         """Return rows not seen since a stamp: least often seen first, then longest ago."""

@@ -6,7 +6,7 @@ parameter descriptors, the check of YAML files, the command-line options and the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 import dataclasses
 from dataclasses import dataclass
 import difflib
@@ -177,6 +177,18 @@ def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object
     return settings_class(**{name: rows[name].check(value) for name, value in values.items()})
 
 
+def checked(settings: SettingsT) -> SettingsT:
+    """Return settings that were built in Python, with their values checked as those of a file are.
+
+    Raises
+    ------
+    ParameterError
+        If a value does not fit the table.
+
+    """
+    return from_parameters(type(settings), dataclasses.asdict(settings))
+
+
 def suggestion(name: str, names: Collection[str]) -> str:
     """Return the end of a message that asks for the nearest of ``names``; empty if none is near.
 
@@ -212,8 +224,8 @@ def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
 def read_parameter_file(path: Path) -> dict[str, object]:
     """Return the name → value mapping of a ROS 2 parameter file.
 
-    The file has the usual form ``<node or /**>: ros__parameters: {name: value}``; nested mappings
-    become dotted names. Sections of other nodes are left out.
+    The file has the usual form ``<node or /**>: ros__parameters: {name: value}``, the node maybe
+    below its namespace; nested mappings become dotted names. Sections of other nodes are left out.
 
     Raises
     ------
@@ -231,11 +243,10 @@ def read_parameter_file(path: Path) -> dict[str, object]:
         raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
     values: dict[str, object] = {}
     found: list[str] = []
-    for section, body in content.items() if isinstance(content, dict) else ():
-        is_ours = section == '/**' or str(section).rsplit('/', 1)[-1] == OBSERVER_NODE
-        if is_ours and isinstance(body, dict) and isinstance(body.get('ros__parameters'), dict):
-            found.append(str(section))
-            values.update(_flatten(body['ros__parameters']))
+    for section, body in _sections(content if isinstance(content, dict) else {}):
+        if section == '/**' or section.rsplit('/', 1)[-1] == OBSERVER_NODE:
+            found.append(section)
+            values.update(_flatten(body))
     robots = [section for section in found if '*' not in section]
     if len({section.strip('/') for section in robots}) > 1:
         raise ParameterError(
@@ -266,6 +277,20 @@ class _RosLoader(yaml.SafeLoader):
 _RosLoader.add_implicit_resolver(
     'tag:yaml.org,2002:float', re.compile(r'^[-+]?\d+[eE][-+]?\d+$'), list('-+0123456789')
 )
+
+
+def _sections(
+    tree: Mapping[object, object], namespace: str = ''
+) -> Iterator[tuple[str, dict[str, object]]]:
+    """Yield the nodes of a parameter file by their full names, and their parameters."""
+    for name, body in tree.items():
+        if not isinstance(body, dict):
+            continue
+        parameters = body.get('ros__parameters')
+        if isinstance(parameters, dict):
+            yield f'{namespace}{name}', parameters
+        else:
+            yield from _sections(body, f'{namespace}{name}/')
 
 
 def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:

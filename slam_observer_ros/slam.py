@@ -7,10 +7,9 @@ from collections import Counter
 import numpy as np
 
 from slam_observer_ros.axes import axes_of
-from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.errors import ParameterError, SmoothingError
 from slam_observer_ros.estimates import Smoothed
-from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.field_of_view import FieldOfView
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.motion import Motion
@@ -23,6 +22,7 @@ from slam_observer_ros.observer import Observer
 from slam_observer_ros.odometry import motion
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.sighting import Outcome, Outlook, Sighting
+from slam_observer_ros.surroundings import Surroundings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.velocity_history import VelocityHistory
 
@@ -54,8 +54,6 @@ class Slam:
         Noise of velocities and observations.
     index : LandmarkIndex
         For landmarks near a point.
-    field_of_view : FieldOfView
-        Where points were seen, to know where one without an id should have been.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
     rejected_in_a_row : int
@@ -76,7 +74,8 @@ class Slam:
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
-        self.field_of_view = FieldOfView(axes_of(settings.two_d_mode).point)
+        k = axes_of(settings.two_d_mode).point
+        self._surroundings = Surroundings(self.observer, self.landmarks, k)
 
     @property
     def confirmed(self) -> IntArray:
@@ -238,7 +237,7 @@ class Slam:
         ParameterError
             If the gain design keeps no history.
         SmoothingError
-            If the observations don't determine the whole trajectory.
+            If there is none in the history, or they don't determine the whole trajectory.
 
         """
         if not isinstance(self.gains, RiccatiGains) or self.settings.hindsight_interval == 0:
@@ -246,14 +245,20 @@ class Slam:
         if self.settings.localization_mode == 'fixed' and not self.is_mapping:
             raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
         if self.settings.landmark_velocity_error > 0.0:
-            raise ParameterError("smoothing takes landmarks to rest: 'landmark_velocity_error' 0")
+            raise ParameterError(
+                "smoothing takes landmarks to rest: 'landmark_velocity_error' must be 0"
+            )
         if self.gains.calibration.drifts:
-            raise ParameterError("smoothing takes the calibration to stay: 'calibration_drift' 0")
+            raise ParameterError(
+                "smoothing takes calibration to stay: 'calibration_drift' must be 0"
+            )
         if self.observer.have_moved:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
+        history, rows = self.gains.history, self.confirmed
+        if not history.stamps_ns:
+            raise SmoothingError(f'nothing to smooth: no observation since {history.since}')
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
-        history, rows = self.gains.history, self.confirmed
         return Smoothed(
             stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
             poses=P @ solution.poses[1:],
@@ -268,16 +273,12 @@ class Slam:
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
 
-    def forget_unsupported(self, event: ObservationEvent) -> None:
+    def look_around(self, event: ObservationEvent) -> None:
         """Forget landmarks without an id that were seen too seldom, after an observation of some.
 
         One that the robot has turned away from may be the only tie to what was mapped before.
         """
-        rows = np.flatnonzero(is_automatic(self.landmarks.ids))
-        seen = self.landmarks.last_seen_ns[rows] == event.stamp_ns
-        in_view = seen | self.field_of_view.contains(self.observer.body_points(rows))
-        self.landmarks.look(rows[in_view], seen[in_view])
-        self.field_of_view.include(event.points)
+        self.counts['strange_place'] += self._surroundings.look(event)
         forgotten = self.landmarks.unsupported(self.settings.min_support)
         if len(forgotten):
             self.remove(forgotten)

@@ -27,10 +27,13 @@ def check_event(event: Event) -> None:
     Raises
     ------
     InvalidEventError
-        With the reason ``'negative_stamp'``, ``'wrong_shape'``, ``'not_finite'``,
-        ``'too_large'``, ``'negative_id'`` or ``'bad_covariance'``.
+        With the reason ``'wrong_type'``, ``'negative_stamp'``, ``'wrong_shape'``,
+        ``'not_finite'``, ``'too_large'``, ``'negative_id'`` or ``'bad_covariance'``.
 
     """
+    if not isinstance(event.stamp_ns, int | np.integer):
+        reason = f'stamp {event.stamp_ns!r} is no integer: stamps are in nanoseconds'
+        raise InvalidEventError('wrong_type', reason)
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
     if isinstance(event, VelocityEvent):
@@ -50,6 +53,8 @@ def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: i
 
 def _check_observation(event: ObservationEvent) -> None:
     m = len(event.points)
+    if not isinstance(event.ids, np.ndarray) or event.ids.dtype.kind not in 'iu':
+        raise InvalidEventError('wrong_type', 'landmark ids are not an array of integers')
     _check_coordinates('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'{len(event.ids)} ids for {m} landmark points')
@@ -66,16 +71,19 @@ def _check_observation(event: ObservationEvent) -> None:
 
 
 def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
-    entries = array.ravel()
-    if array.shape == shape and entries.dot(entries) <= LARGEST**2:
-        return
+    if isinstance(array, np.ndarray) and array.shape == shape:
+        # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
+        entries = array.ravel()
+        if entries.dot(entries) <= LARGEST**2:
+            return
     _check_array(name, array, shape)
     if np.abs(array).max(initial=0.0) > LARGEST:
         raise InvalidEventError('too_large', f'an entry of the {name} is beyond {LARGEST:g}')
 
 
 def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+    if not isinstance(array, np.ndarray):
+        raise InvalidEventError('wrong_type', f'{name}: {type(array).__name__}, no numpy array')
     if array.shape != shape:
         raise InvalidEventError('wrong_shape', f'{name}: shape {array.shape}, not {shape}')
     if not np.isfinite(array).all():

@@ -220,8 +220,8 @@ class TestPoints:
         ended = slam_observer(*arguments, 'constant')
         assert '0 used, 150 without id (100.0 %)' in ended.output
         assert (
-            'slam-observer: warning: 150 points without id are not used by constant gains; '
-            'use --gains riccati.\n'
+            'slam-observer: warning: Not used: points without an id, by constant gains; riccati do '
+            '(1 so far).\n'
         ) in ended.errors
         assert '150 used' in slam_observer.succeed(*arguments, 'riccati').output
 
@@ -622,7 +622,7 @@ class TestTroubledRecordings:
         landmarks.write_text('a good map')
         unconfirmed = ('--set', 'confirmations=1000', '--map', landmarks, '--force')
         ended = slam_observer('replay', simulated, *unconfirmed)
-        assert f'{landmarks} is left as it is: the map is empty' in ended.errors
+        assert f'the map is empty: nothing is written to {landmarks}' in ended.errors
         assert ended.code == 2
         assert landmarks.read_text() == 'a good map'
 

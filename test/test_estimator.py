@@ -266,6 +266,11 @@ def bad_events():
     points = good.points
     return [
         ('negative_stamp', VelocityEvent(-1, BODY_VELOCITY)),
+        ('wrong_type', VelocityEvent(stamp_ns * 1e-9, BODY_VELOCITY)),
+        ('wrong_type', VelocityEvent(stamp_ns, BODY_VELOCITY.tolist())),
+        ('wrong_type', ObservationEvent(stamp_ns, np.array([1.5, 2.0]), points)),
+        ('wrong_type', ObservationEvent(stamp_ns, [1, 2], points)),
+        ('wrong_type', ObservationEvent(stamp_ns, good.ids, points.tolist())),
         ('wrong_shape', VelocityEvent(stamp_ns, BODY_VELOCITY[:5])),
         ('not_finite', VelocityEvent(stamp_ns, BODY_VELOCITY * np.nan)),
         ('not_finite', VelocityEvent(stamp_ns, np.array([np.inf, 0, 0, -np.inf, 0, 0]))),
@@ -517,6 +522,21 @@ def test_far_points_said_to_be_exact_are_taken_after_turning_blindly(gains):
         estimator.add(ObservationEvent(stamp_ns, seen, body_points, exact))
         assert len(estimator.landmark_map.ids) == len(estimator.landmark_ids)
     np.testing.assert_allclose(estimator.pose, pose, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'expected'),
+    [
+        ({'gains': 'x'}, "'gains' takes one of constant, scheduled, riccati, not 'x'"),
+        ({'range_noise': -1.0}, "'range_noise' takes a value"),
+        ({'linear_velocity_noise': (1.0, 2.0)}, 'a list of 3 numbers'),
+    ],
+)
+def test_settings_made_in_python_are_checked_like_those_of_a_file(wrong, expected):
+    with pytest.raises(ParameterError, match=expected):
+        Estimator(Settings(**wrong))
+    with pytest.raises(ParameterError, match=expected):
+        Estimator(Settings()).change_settings(Settings(**wrong))
 
 
 def test_only_settings_that_may_change_while_running_do():

@@ -58,10 +58,12 @@ def test_a_map_is_read_back_bit_for_bit(tmp_path_factory, n, seed):
     assert_same_map(read_map(path), a_map(n, seed))
 
 
-def test_an_empty_map_is_read_back_empty(tmp_path):
+def test_an_empty_map_replaces_none(tmp_path):
     path = tmp_path / 'map.yaml'
-    write_map(path, a_map(0), Settings())
-    assert read_map(path).world_points.shape == (0, 3)
+    write_map(path, a_map(3), Settings())
+    with pytest.raises(MapError, match='the map is empty: nothing is written to'):
+        write_map(path, a_map(0), Settings())
+    assert_same_map(read_map(path), a_map(3))
 
 
 def test_a_map_without_covariances_is_read_back_without(tmp_path):

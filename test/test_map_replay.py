@@ -197,7 +197,7 @@ class TestPlaceNotKnown:
         assert 'points without id take --gains riccati' in slam_observer.fail(*arguments)
         told = slam_observer.fail(*arguments, '--set', 'set_initial_pose=true')
         assert 'no observation was used' in told
-        assert 'points without id' in told
+        assert 'points without an id' in told
         assert not again.exists()
 
     def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
@@ -261,6 +261,15 @@ def test_smoothing_tells_that_landmarks_had_to_make_room(slam_observer, tmp_path
     window = ('--set', 'hindsight_window=10', '--set', 'hindsight_interval=1')
     told = slam_observer('replay', path, *limited, *window).errors
     assert 'those since the history was cut (hindsight_window=0 keeps all of it)' in told
+
+
+def test_nothing_to_smooth_is_an_error_and_writes_nothing(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    window = ('--set', 'hindsight_window=1', '--set', 'hindsight_interval=1')
+    outputs = ('--smooth', '--tum', tmp_path / 'smoothed.tum')
+    told = slam_observer.fail('replay', path, *outputs, *window, *SETTINGS)
+    assert 'nothing to smooth: no observation since the history was cut' in told
+    assert not (tmp_path / 'smoothed.tum').exists()
 
 
 @pytest.mark.parametrize('resets', [True, False])

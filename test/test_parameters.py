@@ -209,6 +209,15 @@ def test_sections_of_this_node_are_read_and_those_of_others_left_out(tmp_path, s
     assert read_parameter_file(path) == {'gains': 'constant', 'nested.deep': 1}
 
 
+def test_a_node_may_be_below_its_namespace(tmp_path):
+    path = write(
+        tmp_path,
+        'robot1:\n  observer_node:\n    ros__parameters:\n      gains: constant\n'
+        '  camera:\n    ros__parameters: {exposure: 3}\n',
+    )
+    assert read_parameter_file(path) == {'gains': 'constant'}
+
+
 def test_later_sections_win(tmp_path):
     path = write(
         tmp_path,

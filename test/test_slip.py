@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.settings import Settings
 
@@ -62,13 +62,11 @@ def test_a_slip_is_found_out_by_the_second_landmark_that_contradicts_odometry(se
     assert max(lost_m.values()) > 3.0
 
 
-@modes
-@seeds
-def test_a_robot_that_is_carried_is_found_again_at_once(settings, seed):
-    world = gain_worlds.drive(settings, 40.0, seed, noise=0.5)
+def carried(settings, seed, landmarks=12):
+    """A world in which someone carries the robot after 20 s; and where to, as a motion before."""
+    world = gain_worlds.drive(settings, 40.0, seed, noise=0.5, landmarks=landmarks)
     start = world.true_pose(START_NS + 20_000_000_000)
-    carried = se3.exp(np.array([0.0, 0.0, 0.8, 1.5, -1.0, 0.0]))
-    moved = start @ carried @ se3.inverse(start)
+    moved = start @ se3.exp(np.array([0.0, 0.0, 0.8, 1.5, -1.0, 0.0])) @ se3.inverse(start)
 
     def seen_from_there(_, event):
         if seconds(event) < 20.0:
@@ -77,10 +75,37 @@ def test_a_robot_that_is_carried_is_found_again_at_once(settings, seed):
         points = se3.transform(se3.inverse(moved @ pose) @ pose, event.points)
         return replace(event, points=points)
 
-    estimator, _ = run(world.with_observations(seen_from_there), settings)
+    return world.with_observations(seen_from_there), moved
+
+
+@modes
+@seeds
+def test_a_robot_that_is_carried_is_found_again_at_once(settings, seed):
+    world, moved = carried(settings, seed)
+    estimator, _ = run(world, settings)
     pose = moved @ world.true_pose(world.events[-1].stamp_ns)
     assert estimator.counts['slip'] >= 1
     assert np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]) < 0.3
+
+
+def without_ids(_, event):
+    return replace(event, ids=np.full(len(event.ids), UNKNOWN_ID))
+
+
+@seeds
+def test_without_ids_there_is_a_warning_where_landmarks_are_far_apart(seed, caplog):
+    world, _ = carried(PLANAR, seed, landmarks=6)
+    estimator, _ = run(world.with_observations(without_ids), PLANAR)
+    assert estimator.counts['strange_place'] >= 1
+    assert 'Nothing that is seen is where the map has it' in caplog.text
+
+
+@modes
+@seeds
+def test_a_robot_that_is_where_it_should_be_is_not_warned_of(settings, seed):
+    world = gain_worlds.drive(settings, 60.0, seed, noise=0.5, landmarks=30)
+    estimator, _ = run(world.with_observations(without_ids), settings)
+    assert estimator.counts['strange_place'] == 0
 
 
 @modes

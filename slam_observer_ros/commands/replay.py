@@ -48,7 +48,6 @@ from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import replay
-from slam_observer_ros.settings import Settings
 
 logger = logging.getLogger(__name__)
 
@@ -165,7 +164,7 @@ def _write_files(
         trajectory = trajectory_of(smoothed)
     outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
         ('trajectory', args.tum, lambda path: write_tum(trajectory, path)),
-        ('map', args.map, lambda path: _save(path, landmark_map, estimator.settings)),
+        ('map', args.map, lambda path: write_map(path, landmark_map, estimator.settings)),
         ('figures', args.plot, lambda path: _draw(outcome, trajectory, landmark_map, path)),
     )
     written: dict[str, Path] = {}
@@ -179,13 +178,6 @@ def _write_files(
         except (SlamObserverError, OSError) as error:
             errors.append(str(error))
     return written, errors
-
-
-def _save(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
-    """Write the map, unless it is empty and would replace one, as at the end of the node."""
-    if not len(landmark_map.ids) and path.exists():
-        raise OutputError(f'{path} is left as it is: the map is empty')
-    write_map(path, landmark_map, settings)
 
 
 def _draw(

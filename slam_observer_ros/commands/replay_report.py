@@ -11,7 +11,13 @@ from pathlib import Path
 from slam_observer_ros.accuracy import Accuracy, measure, measure_smoothed
 from slam_observer_ros.commands.console import print_table
 from slam_observer_ros.commands.replay_checks import list_dropped
-from slam_observer_ros.estimates import Smoothed, UNUSED_POINTS, used_points
+from slam_observer_ros.estimates import (
+    MOST_REJECTED,
+    rejected_share,
+    Smoothed,
+    UNUSED_POINTS,
+    used_points,
+)
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -21,8 +27,8 @@ from slam_observer_ros.replay import Replay
 MALFORMED = 'malformed'
 """Reason under which messages that can't be decoded are counted."""
 
-MOST_REJECTED = 0.1
-"""Share of the points beyond which they are more than a sensor's outliers."""
+MOST_UNMAPPED = 0.5
+"""Share of the points beyond which they are more than what a map lacks."""
 
 LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
 """What befalls landmarks that are in the map."""
@@ -132,8 +138,8 @@ def outcome_of(
         if result.in_known_map:
             report = replace(report, unaligned_rmse_m=accuracy.pose_errors.unaligned_rmse_m)
     _warn_of_missing_stamps(recording)
-    _warn_of_unknown_ids(result)
     _warn_of_rejections(result)
+    _warn_of_unmapped(result)
     _warn_of_unused_poses(recording, selected, result)
     return Outcome(result, truth, accuracy, report, recording.missing_ids(selected.landmarks))
 
@@ -148,25 +154,27 @@ def _warn_of_missing_stamps(recording: Recording) -> None:
         )
 
 
-def _warn_of_unknown_ids(result: Replay) -> None:
-    """Say what would use points without id, if they were left out."""
-    unknown, gains = result.estimator.counts['unknown_id'], result.estimator.settings.gains
-    if unknown and gains != 'riccati':
-        logger.warning(
-            '%d points without id are not used by %s gains; use --gains riccati.', unknown, gains
-        )
-
-
 def _warn_of_rejections(result: Replay) -> None:
     """Say what may be wrong if more points were rejected than a sensor has outliers."""
-    counts = result.estimator.counts
-    share = counts['rejected_landmark'] / max(counts['observed_point'], 1)
+    share = rejected_share(result.estimator.counts)
     if share > MOST_REJECTED:
         logger.warning(
             '%.0f %% of the points were rejected: look at the signs, units and frames of the '
             'velocity and of the points, then at their noise%s.',
             100.0 * share,
             ', and whether the map is still true' if result.in_known_map else '',
+        )
+
+
+def _warn_of_unmapped(result: Replay) -> None:
+    """Say what may be wrong if most points are of no landmark of a map that does not grow."""
+    counts = result.estimator.counts
+    share = counts['unmapped_landmark'] / max(counts['observed_point'], 1)
+    if result.in_known_map and share > MOST_UNMAPPED:
+        logger.warning(
+            '%.0f %% of the points are of no landmark of the map: look whether the robot started '
+            'where it was said to, and whether it is the map of this place.',
+            100.0 * share,
         )
 
 
@@ -233,6 +241,8 @@ def print_summary(
         'observed points': _told_points(outcome.result.estimator.counts),
         'dropped': list_dropped(report.dropped),
     }
+    if slips := outcome.result.estimator.counts['slip']:
+        rows['slips'] = f'{slips} × the robot was not where odometry had it'
     if report.localised_after_s is not None:
         rows['place in the map'] = _told_place(outcome.result, report.localised_after_s)
     rows |= {part.name: str(part) for part in outcome.result.estimator.calibration}

@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from slam_observer_ros.estimates import UNUSED_POINTS
+from slam_observer_ros.estimates import MOST_REJECTED, rejected_share, UNUSED_POINTS
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
@@ -118,6 +118,8 @@ class Diagnostics:
         elif dropped:
             warnings.append(f'{dropped} messages dropped')
         warnings.append(self._points_warning(new))
+        if (share := rejected_share(self._estimator.counts)) > MOST_REJECTED:
+            warnings.append(f'{100.0 * share:.0f} % of all points seen so far were rejected')
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
         if not self._estimator.is_localised:

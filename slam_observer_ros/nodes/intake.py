@@ -157,6 +157,9 @@ class Intake:
         stamp_ns = measured.stamp_ns or receive_ns  # 0: the publisher left it out
         if not self._is_usable(source, stamp_ns, receive_ns):
             return None
+        if not measured.stamp_ns:
+            text = f'stamps are zero on {source}: the time of reception is taken instead'
+            self._warn(f'stamps of {source}', text)
         if self._settings.correct_clock_offset:
             stamp_ns += self.clocks[source].correction_ns
         return replace(measured, stamp_ns=stamp_ns)

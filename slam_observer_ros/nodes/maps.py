@@ -62,7 +62,7 @@ class Maps:
         node.create_service(Trigger, '~/load_map', self._answer_load)
 
     def save_at_end(self) -> None:
-        """Save the map if that was asked for; an empty one does not replace a file."""
+        """Save the map if that was asked for and there is one."""
         if not self._autosave:
             return
         try:

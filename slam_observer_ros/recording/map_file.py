@@ -64,9 +64,11 @@ def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None
     Raises
     ------
     MapError
-        If the file can't be written.
+        If the map is empty, or the file can't be written.
 
     """
+    if not len(landmark_map.ids):
+        raise MapError(f'the map is empty: nothing is written to {path}')
     head = {
         'format': FORMAT,
         'version': FORMAT_VERSION,
@@ -81,7 +83,7 @@ def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None
     try:
         with unfinished_file(path) as unfinished, unfinished.open('w', encoding='utf-8') as file:
             yaml.safe_dump(head, file, sort_keys=False)
-            file.write('landmarks:\n' if lines else 'landmarks: []\n')
+            file.write('landmarks:\n')
             file.writelines(f'- {line}' for line in lines)
             file.flush()
             os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file

@@ -1,0 +1,76 @@
+"""Which landmarks without an id should have been seen, and which were."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from slam_observer_ros.events import is_automatic, ObservationEvent
+from slam_observer_ros.field_of_view import FieldOfView
+from slam_observer_ros.landmark_table import LandmarkTable
+from slam_observer_ros.observer import Observer
+from slam_observer_ros.types import BoolArray
+
+IMPROBABLE = 20.0
+"""−ln of the probability from which on it is no chance that none of several landmarks is seen."""
+
+LEAST_SHARE, MOST_SHARE = 0.1, 0.9
+"""How often a landmark in view is seen at least, as in a map that was loaded, and at most: one
+that was seen each time may yet be hidden.
+"""
+
+MOST_SURPRISING = 2.0
+"""Surprise of one observation at most: what hides a landmark hides others, and for some time."""
+
+
+class Surroundings:
+    """What a sensor that gives no ids sees of the landmarks around it.
+
+    Parameters
+    ----------
+    observer, landmarks : Observer, LandmarkTable
+        The state.
+    k : int
+        Leading coordinates that matter: 2 in the plane, 3 in space.
+
+    """
+
+    def __init__(self, observer: Observer, landmarks: LandmarkTable, k: int) -> None:
+        self._observer, self._landmarks = observer, landmarks
+        self._field_of_view = FieldOfView(k)
+        # −ln of the probability that of the landmarks up to this id none is seen for so long.
+        self._surprise = 0.0
+        self._newest_id = 0
+
+    def look(self, event: ObservationEvent) -> bool:
+        """Count which landmarks were in view of an observation, already used, and which were seen.
+
+        Return whether the place has become strange: points were seen for so long, and of the
+        landmarks that should have been among them not one, that it is no chance any more.
+        """
+        landmarks, is_numbered = self._landmarks, is_automatic(self._landmarks.ids)
+        everything = np.arange(len(landmarks))
+        seen = landmarks.last_seen_ns == event.stamp_ns
+        in_view = seen | self._field_of_view.contains(self._observer.body_points(everything))
+        is_strange = self._is_strange(event, in_view, seen)
+        rows = np.flatnonzero(is_numbered & in_view)
+        landmarks.look(rows, seen[rows])
+        self._field_of_view.include(event.points)
+        return is_strange
+
+    def _is_strange(self, event: ObservationEvent, in_view: BoolArray, seen: BoolArray) -> bool:
+        """Return whether those in view and not seen (n,) are too many, for too long."""
+        landmarks = self._landmarks
+        numbered = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
+        old = in_view & ~landmarks.tentative & (numbered <= self._newest_id)
+        if (old & seen).any():
+            self._surprise = 0.0
+        elif len(event.points) and self._field_of_view.is_known:
+            share = min(max(landmarks.seen_share, LEAST_SHARE), MOST_SHARE)
+            self._surprise += min(-math.log1p(-share) * int(np.sum(old)), MOST_SURPRISING)
+        is_strange = self._surprise > IMPROBABLE
+        if is_strange or self._surprise == 0.0:
+            self._surprise = 0.0
+            self._newest_id = int(np.max(numbered, initial=0))
+        return is_strange
