@@ -61,6 +61,8 @@ class Estimator:
         the settings, or identity.
     on_update : callable, optional
         Called with an :class:`Update` after each observation that was used.
+    on_stamp : callable, optional
+        Called when all events of a stamp have been used, before the first one of another.
     on_motion : callable, optional
         Called with the velocities and two stamps, nanoseconds, before the state is moved on along
         them from one to the other.
@@ -94,6 +96,7 @@ class Estimator:
         settings: Settings,
         initial_pose: FloatArray | None = None,
         on_update: Callable[[Update], None] | None = None,
+        on_stamp: Callable[[], None] | None = None,
         on_motion: OnMotion | None = None,
     ) -> None:
         self.settings = settings = checked(settings)
@@ -102,7 +105,7 @@ class Estimator:
         self.jumps = 0
         self._warnings = CountedWarnings(logger)
         self._slips: Counter[str] = Counter()
-        self._on_update, self._on_motion = on_update, on_motion
+        self._on_update, self._on_stamp, self._on_motion = on_update, on_stamp, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
 
@@ -387,6 +390,8 @@ class Estimator:
         self._warnings.warn(error.reason, f'Dropped an event, {error.reason}: {error}')
 
     def _process(self, event: Event) -> None:
+        if self._on_stamp is not None and self.stamp_ns not in (None, event.stamp_ns):
+            self._on_stamp()
         if isinstance(event, ObservationEvent):
             self._process_observation(event)
         else:

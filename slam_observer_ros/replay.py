@@ -121,7 +121,12 @@ class _Run:
         self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
     ) -> None:
         self._settings = settings
-        self._estimator = Estimator(settings, on_update=self._on_update, on_motion=self._on_motion)
+        self._estimator = Estimator(
+            settings,
+            on_update=self._on_update,
+            on_stamp=self._on_stamp,
+            on_motion=self._on_motion,
+        )
         self._in_known_map = landmark_map is not None
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
@@ -146,7 +151,6 @@ class _Run:
         self._estimator.add(event)
         self._seconds += time.thread_time() - start_s
         self._note_jump()
-        self._sample()
 
     def finish(self) -> Replay:
         start_s = time.thread_time()
@@ -178,6 +182,12 @@ class _Run:
         if self._start_ns is None:
             self._start_ns = self._estimator.stamp_ns
         self._sampler.sample()
+
+    def _on_stamp(self) -> None:
+        start_s = time.thread_time()
+        self._note_jump()
+        self._sample()
+        self._seconds -= time.thread_time() - start_s
 
     def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         start_s = time.thread_time()

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from slam_observer_ros.axes import axes_of
-from slam_observer_ros.errors import ParameterError, SmoothingError
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
@@ -237,7 +237,7 @@ class Slam:
         ParameterError
             If the gain design keeps no history.
         SmoothingError
-            If there is none in the history, or they don't determine the whole trajectory.
+            If the observations don't determine the whole trajectory.
 
         """
         if not isinstance(self.gains, RiccatiGains) or self.settings.hindsight_interval == 0:
@@ -254,11 +254,9 @@ class Slam:
             )
         if self.observer.have_moved:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
-        history, rows = self.gains.history, self.confirmed
-        if not history.stamps_ns:
-            raise SmoothingError(f'nothing to smooth: no observation since {history.since}')
         solution = self.gains.smooth(self.observer)
         P = self.observer.reference_pose
+        history, rows = self.gains.history, self.confirmed
         return Smoothed(
             stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
             poses=P @ solution.poses[1:],

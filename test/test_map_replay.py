@@ -194,10 +194,13 @@ class TestPlaceNotKnown:
         arguments = (
             'replay', path, '--load-map', saved, '--map', again, *SETTINGS, '--gains', 'constant'
         )  # fmt: skip
-        assert 'points without id take --gains riccati' in slam_observer.fail(*arguments)
-        told = slam_observer.fail(*arguments, '--set', 'set_initial_pose=true')
-        assert 'no observation was used' in told
-        assert 'points without an id' in told
+        ended = slam_observer(*arguments)
+        assert ended.code == 2
+        assert 'points without id take --gains riccati' in ended.errors
+        ended = slam_observer(*arguments, '--set', 'set_initial_pose=true')
+        assert ended.code == 2
+        assert 'no observation was used' in ended.errors
+        assert 'points without id' in ended.errors
         assert not again.exists()
 
     def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):

@@ -241,7 +241,7 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
             assert not answer.success
             assert re.search(reason, answer.message)
         name_file(ros, tmp_path / 'no' / 'map.yaml')
-        assert "can't write map" in call(ros, 'save_map').message
+        assert 'the map is empty: nothing is written' in call(ros, 'save_map').message
         name_file(ros, robot.surveyed_file(tmp_path / 'good.yaml'))
         assert call(ros, 'load_map').success
         answer = call(ros, 'save_map')

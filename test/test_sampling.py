@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
+from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.truth import Truth
@@ -53,6 +54,32 @@ def test_there_is_no_dead_reckoning_without_velocities():
     result = replay(events_of(100, 5, has_velocities=False), Settings())
     assert len(result.dead_reckoning.poses) == 0
     assert len(result.trajectory.poses) > 0
+
+
+@pytest.mark.parametrize('window_s', [0.0, 0.25])
+def test_the_trajectory_does_not_depend_on_the_order_of_arrival(window_s):
+    """Nor on how long events are held back to be put in order."""
+    in_order = list(events_of(400, 3))
+    rng = np.random.default_rng(0)
+    received_ns = [event.stamp_ns + window_s * SECOND * rng.uniform() for event in in_order]
+    arrivals = [in_order[i] for i in np.argsort(received_ns, kind='stable')]
+    expected = replay(in_order, Settings(reorder_window=0.0)).trajectory
+    trajectory = replay(arrivals, Settings(reorder_window=window_s)).trajectory
+    assert_array_equal(trajectory.stamps_ns, expected.stamps_ns)
+    assert_array_equal(trajectory.poses, expected.poses)
+
+
+def test_of_events_with_one_stamp_the_last_one_counts():
+    events = list(events_of(400, 3))
+    updates = {}
+    estimator = Estimator(Settings(), on_update=lambda new: updates.update({new.stamp_ns: new}))
+    for event in events:
+        estimator.add(event)
+    trajectory = replay(events, Settings()).trajectory
+    seen = [stamp_ns in updates for stamp_ns in trajectory.stamps_ns.tolist()]
+    assert sum(seen) > 30
+    expected = [updates[stamp_ns].pose for stamp_ns in trajectory.stamps_ns[seen].tolist()]
+    assert_array_equal(trajectory.poses[seen], expected)
 
 
 def test_covariances_are_collected_only_to_compare_errors_with():

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from slam_observer_ros.accuracy import Accuracy, measure, measure_smoothed
 from slam_observer_ros.commands.console import print_table
+from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.commands.replay_checks import list_dropped
 from slam_observer_ros.estimates import (
     MOST_REJECTED,
@@ -191,8 +192,17 @@ def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result
 
 
 def with_smoothed(outcome: Outcome) -> Outcome:
-    """Add what the whole recording tells in hindsight."""
+    """Add what the whole recording tells in hindsight.
+
+    Raises
+    ------
+    UsageError
+        If the history holds no observation.
+
+    """
     smoothed = outcome.result.estimator.smooth()
+    if not len(smoothed.stamps_ns):
+        raise UsageError(f'nothing to smooth: no observation since {smoothed.since}')
     if len(smoothed.stamps_ns) < outcome.result.observations:
         logger.warning(
             'Only the last %d observations are smoothed: those since %s.',
