@@ -210,7 +210,7 @@ def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observ
     ('name', 'options', 'reason'),
     [
         ('two', (), '2 topics could be the landmark topic: .*choose one with --landmarks-topic'),
-        ('poses', (), 'no landmark topic: .* with ids; .*the recording holds .*/poses'),
+        ('poses', (), 'no landmark topic: .* with ids; --landmarks-topic may name /poses; '),
         ('boxes', ('--set', 'landmarks_type=tf'), 'no topic /tf; the recording holds'),
         ('boxes', ('--set', 'landmarks_type=PoseArray'),
          'no landmark topic: none of type geometry_msgs/msg/PoseArray; choose another with'),

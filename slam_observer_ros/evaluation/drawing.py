@@ -45,7 +45,7 @@ STYLE: Any = {
 TRUE_PATH: Any = {'color': PALE_BLUE, 'linestyle': '-', 'linewidth': 3.0, 'label': 'true path'}
 PATH: Any = {'color': RED, 'linestyle': '-.', 'label': 'estimated path'}
 TRUE_END: Any = {'color': PALE_BLUE, 'marker': 's', 'linestyle': 'none', 'zorder': 4}
-END: Any = {**TRUE_END, 'color': RED, 'markerfacecolor': 'none', 'zorder': 5, 'label': 'its end'}
+END: Any = {**TRUE_END, 'color': RED, 'markerfacecolor': 'none', 'zorder': 5, 'label': 'end'}
 TRUE_LANDMARKS: Any = {
     'color': BLUE, 'marker': '*', 'markersize': 10, 'linestyle': 'none', 'zorder': 4,
     'label': 'true landmarks',

@@ -32,6 +32,12 @@ from slam_observer_ros.types import FloatArray, IntArray
 _MOST_LABELS = 80
 """Maps with more landmarks than this are drawn without ids, which would cover each other."""
 
+_LABEL_DISTANCE_PT = 12.0
+"""From the middle of a marker to that of its label."""
+
+_NEAR = 0.03
+"""Markers nearer than this share of the map touch: of several it matters where their middle is."""
+
 
 @mpl.rc_context(STYLE)
 def plot_map(
@@ -129,22 +135,29 @@ def _map_layers(
 def _label_landmarks(
     axes: Axes, ids: IntArray, world_points: FloatArray, landmark_truth: LandmarkTruth | None
 ) -> None:
-    """Write each id beside its estimate, on the side away from the true landmark."""
-    away = np.ones((len(ids), 2))
-    if landmark_truth is not None:
-        _, rows, true_rows = np.intersect1d(ids, landmark_truth.ids, return_indices=True)
-        errors = world_points[rows] - landmark_truth.world_points[true_rows]
-        away[rows] = np.where(errors[:, :2] < 0.0, -1.0, 1.0)
-    for landmark_id, point, (right, up) in zip(ids.tolist(), world_points, away, strict=True):
+    """Write each id beside its estimate, on the side away from what else is drawn near it."""
+    drawn = world_points if landmark_truth is None else landmark_truth.world_points
+    markers = np.concatenate([world_points, drawn])[:, :2]
+    for landmark_id, point in zip(ids.tolist(), world_points, strict=True):
+        right, up = _LABEL_DISTANCE_PT * _away(point[:2], markers)
         axes.annotate(
             str(landmark_id),
             (point[0], point[1]),
-            xytext=(5.0 * right, 4.0 * up),
+            xytext=(right, up),
             textcoords='offset points',
-            horizontalalignment='left' if right > 0 else 'right',
-            verticalalignment='bottom' if up > 0 else 'top',
+            horizontalalignment='center',
+            verticalalignment='center',
             fontsize=8,
             color='#004D38',
             zorder=3,  # above paths, below markers, which the halo would erase
             path_effects=[withStroke(linewidth=2.5, foreground='white')],
         )
+
+
+def _away(point: FloatArray, markers: FloatArray) -> FloatArray:
+    """Return the direction (2,) that leads away from markers (m, 2), the nearest above all."""
+    apart = point - markers
+    near_m = _NEAR * float(np.ptp(markers, axis=0).max()) or 1.0  # else a single one
+    push = (apart / (np.sum(apart**2, axis=1, keepdims=True) + near_m**2)).sum(axis=0)
+    length = float(np.linalg.norm(push))
+    return push / length if length > 0.0 else np.array([1.0, 0.0])

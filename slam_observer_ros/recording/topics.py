@@ -249,9 +249,14 @@ def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topi
     if topic is not None:
         return topic
     with_ids = '' if CLOUD_DECODERS.keys().isdisjoint(role.message_types) else ' with ids'
+    possible = [topic.name for topic in topics if topic.message_type in role.types_by_name]
+    named = [name for name in possible if last_part(name) != 'tf_static']
+    advice = f'{role.option} may name {_join(named)}'
+    if not named:
+        advice = f'choose another with {role.option}'
     raise RecordingError(
         f'no {role.name} topic: none of type {_join(role.message_types)}{with_ids}; '
-        f'choose another with {role.option}; the recording holds {_join(topics)}'
+        f'{advice}; the recording holds {_join(topics)}'
     )
 
 
