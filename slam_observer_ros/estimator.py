@@ -38,12 +38,12 @@ MOST_NAMED = 10
 """Ids that a warning lists at most."""
 
 
-SLIP_WARNINGS = {
+PLACE_WARNINGS = {
     'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
     'strange_place': 'Nothing that is seen is where the map has it: if the robot slipped or was '
     'carried, it is not found again, as the points have no ids',
 }
-"""What is wrong when these counts grow."""
+"""What is wrong with the robot's place when these counts grow."""
 
 
 class Estimator:
@@ -62,7 +62,8 @@ class Estimator:
     on_update : callable, optional
         Called with an :class:`Update` after each observation that was used.
     on_stamp : callable, optional
-        Called when all events of a stamp have been used, before the first one of another.
+        Called when all events of a stamp have been used: before the first one of a later stamp
+        or after a jump of the clock, and by :meth:`flush`.
     on_motion : callable, optional
         Called with the velocities and two stamps, nanoseconds, before the state is moved on along
         them from one to the other.
@@ -104,7 +105,7 @@ class Estimator:
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
         self._warnings = CountedWarnings(logger)
-        self._slips: Counter[str] = Counter()
+        self._told: Counter[str] = Counter()
         self._on_update, self._on_stamp, self._on_motion = on_update, on_stamp, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
@@ -144,6 +145,7 @@ class Estimator:
             logger.warning('The clock has jumped%s; pose and map are held.', after)
             self.release()
             self._catch_up()
+            self._tell_stamp()
             self._frame.states.restart_time()
             self._forget_time()
             self._is_placed = True
@@ -247,6 +249,7 @@ class Estimator:
         for ready in self._queue.pop_all():
             self._process(ready)
         self._catch_up()
+        self._tell_stamp()
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; the state is not changed.
@@ -390,12 +393,17 @@ class Estimator:
         self._warnings.warn(error.reason, f'Dropped an event, {error.reason}: {error}')
 
     def _process(self, event: Event) -> None:
-        if self._on_stamp is not None and self.stamp_ns not in (None, event.stamp_ns):
-            self._on_stamp()
+        if event.stamp_ns > (self.stamp_ns or 0):
+            self._tell_stamp()
         if isinstance(event, ObservationEvent):
             self._process_observation(event)
         else:
             self._process_velocity(event)
+
+    def _tell_stamp(self) -> None:
+        """Tell that all events of the present stamp have been used."""
+        if self._on_stamp is not None and self.stamp_ns is not None:
+            self._on_stamp()
 
     def _process_velocity(self, event: VelocityEvent | AngularVelocityEvent) -> None:
         is_late = self._timeline.is_late(event)
@@ -427,7 +435,7 @@ class Estimator:
         outcome = self._frame.states.observe(event)
         if len(moved_ids := outcome.moved_ids):
             self._warnings.warn('moved_landmark', f'Landmarks {moved_ids.tolist()} have moved')
-        self._warn_of_slips()
+        self._warn_of_place()
         self._counts['observation'] += 1
         self._frame.find_place(outcome)
         observer = self._slam.observer
@@ -442,16 +450,17 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self._last)
 
-    def _warn_of_slips(self) -> None:
+    def _warn_of_place(self) -> None:
         counts = self._frame.counts
-        for name, text in SLIP_WARNINGS.items():
-            if counts[name] > self._slips[name]:
+        for name, text in PLACE_WARNINGS.items():
+            if counts[name] > self._told[name]:
                 self._warnings.warn(name, text)
-                self._slips[name] = counts[name]
+                self._told[name] = counts[name]
 
     def _warn_of_unknown_ids(self, event: ObservationEvent) -> None:
         if self.settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
-            text = f'Not used: points without an id, by {self.settings.gains} gains; riccati do'
+            gains = self.settings.gains
+            text = f'Points without an id are not used by {gains} gains, only by riccati'
             self._warnings.warn('unknown_id', text)
 
     def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:

@@ -57,6 +57,7 @@ class Hypotheses:
         self._costs = [0.0]
         self._limit = settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
+        self._some_have_ids = False
 
     def __len__(self) -> int:
         """Return how many states are followed."""
@@ -97,7 +98,9 @@ class Hypotheses:
 
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at the states' instant; return what the best one makes of it."""
-        some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
+        is_unknown = event.ids == UNKNOWN_ID
+        some_are_unknown = bool(is_unknown.any())
+        self._some_have_ids = self._some_have_ids or not is_unknown.all()
         if len(self._states) == 1 and not some_are_unknown:
             sighting = self.best.look(event)
             if self._limit == 1 or not is_ambiguous(self.best, sighting):
@@ -112,7 +115,7 @@ class Hypotheses:
                 slip(slam, slam.look(reading.event))
             outcome = slam.observe(reading.event)
             if some_are_unknown:
-                slam.look_around(reading.event)
+                slam.note_surroundings(reading.event, self._some_have_ids)
             slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
             if not any(_are_one(slam, reading, other) for other in followed):
                 followed.append(_Followed(slam, reading, outcome))

@@ -11,6 +11,7 @@ import dataclasses
 from dataclasses import dataclass
 import difflib
 import math
+from numbers import Integral, Real
 from pathlib import Path
 import re
 from typing import Any, cast, ClassVar, Protocol, TypeAlias, TypeVar
@@ -81,7 +82,7 @@ class Parameter:
             self._expect(value, isinstance(value, bool), 'true or false')
             return bool(value)
         if isinstance(default, int):
-            is_int = isinstance(value, int) and not isinstance(value, bool)
+            is_int = isinstance(value, Integral) and not isinstance(value, bool)
             self._expect(value, is_int, 'an integer')
             return int(self._in_range(cast('int', value)))
         if isinstance(default, float):
@@ -106,7 +107,7 @@ class Parameter:
             raise ParameterError(f"parameter '{self.name}' takes {expected}, not {value!r}")
 
     def _number(self, value: object) -> float:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
         self._expect(value, is_number, 'a number')
         number = float(cast('float', value))
         self._expect(value, math.isfinite(number), 'a finite number')
@@ -279,18 +280,16 @@ _RosLoader.add_implicit_resolver(
 )
 
 
-def _sections(
-    tree: Mapping[object, object], namespace: str = ''
-) -> Iterator[tuple[str, dict[str, object]]]:
+def _sections(tree: Mapping[object, object]) -> Iterator[tuple[str, dict[str, object]]]:
     """Yield the nodes of a parameter file by their full names, and their parameters."""
-    for name, body in tree.items():
-        if not isinstance(body, dict):
-            continue
-        parameters = body.get('ros__parameters')
+    nodes = {name: body for name, body in tree.items() if isinstance(body, dict)}
+    for name, body in list(nodes.items()):
+        if 'ros__parameters' not in body:  # the name is a namespace
+            nodes |= {f'{name}/{below}': node for below, node in body.items()}
+    for name, body in nodes.items():
+        parameters = body.get('ros__parameters') if isinstance(body, dict) else None
         if isinstance(parameters, dict):
-            yield f'{namespace}{name}', parameters
-        else:
-            yield from _sections(body, f'{namespace}{name}/')
+            yield str(name), parameters
 
 
 def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:

@@ -156,7 +156,6 @@ class _Run:
         start_s = time.thread_time()
         self._estimator.flush()
         self._seconds += time.thread_time() - start_s
-        self._sample()
         return Replay(
             self._estimator,
             self._sampler.trajectory,
@@ -178,15 +177,12 @@ class _Run:
             self._observations,
         )
 
-    def _sample(self) -> None:
-        if self._start_ns is None:
-            self._start_ns = self._estimator.stamp_ns
-        self._sampler.sample()
-
     def _on_stamp(self) -> None:
         start_s = time.thread_time()
         self._note_jump()
-        self._sample()
+        if self._start_ns is None:
+            self._start_ns = self._estimator.stamp_ns
+        self._sampler.sample()
         self._seconds -= time.thread_time() - start_s
 
     def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:

@@ -250,7 +250,7 @@ class Slam:
             )
         if self.gains.calibration.drifts:
             raise ParameterError(
-                "smoothing takes calibration to stay: 'calibration_drift' must be 0"
+                "smoothing takes the calibration to stay: 'calibration_drift' must be 0"
             )
         if self.observer.have_moved:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
@@ -271,12 +271,13 @@ class Slam:
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
 
-    def look_around(self, event: ObservationEvent) -> None:
+    def note_surroundings(self, event: ObservationEvent, some_have_ids: bool) -> None:
         """Forget landmarks without an id that were seen too seldom, after an observation of some.
 
         One that the robot has turned away from may be the only tie to what was mapped before.
+        Parameters are those of :meth:`.Surroundings.note`.
         """
-        self.counts['strange_place'] += self._surroundings.look(event)
+        self.counts['strange_place'] += self._surroundings.note(event, some_have_ids)
         forgotten = self.landmarks.unsupported(self.settings.min_support)
         if len(forgotten):
             self.remove(forgotten)

@@ -13,7 +13,7 @@ from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import BoolArray
 
 IMPROBABLE = 20.0
-"""−ln of the probability from which on it is no chance that none of several landmarks is seen."""
+"""−ln of the probability below which it is no chance that none of several landmarks is seen."""
 
 LEAST_SHARE, MOST_SHARE = 0.1, 0.9
 """How often a landmark in view is seen at least, as in a map that was loaded, and at most: one
@@ -39,21 +39,34 @@ class Surroundings:
     def __init__(self, observer: Observer, landmarks: LandmarkTable, k: int) -> None:
         self._observer, self._landmarks = observer, landmarks
         self._field_of_view = FieldOfView(k)
-        # −ln of the probability that of the landmarks up to this id none is seen for so long.
+        # −ln of the probability that none is seen for so long of the landmarks known before: those
+        # without an id that were numbered up to here.
         self._surprise = 0.0
-        self._newest_id = 0
+        self._newest_number = 0
 
-    def look(self, event: ObservationEvent) -> bool:
+    def note(self, event: ObservationEvent, some_have_ids: bool) -> bool:
         """Count which landmarks were in view of an observation, already used, and which were seen.
 
-        Return whether the place has become strange: points were seen for so long, and of the
-        landmarks that should have been among them not one, that it is no chance any more.
+        Parameters
+        ----------
+        event : ObservationEvent
+            The observation; some of its points came without an id.
+        some_have_ids : bool
+            Whether other points come with an id: these tell better where the robot is.
+
+        Returns
+        -------
+        bool
+            Whether the place has become strange, if there are no ids at all: points were seen for
+            so long, and of the landmarks that should have been among them not one, that it is no
+            chance any more.
+
         """
         landmarks, is_numbered = self._landmarks, is_automatic(self._landmarks.ids)
         everything = np.arange(len(landmarks))
         seen = landmarks.last_seen_ns == event.stamp_ns
         in_view = seen | self._field_of_view.contains(self._observer.body_points(everything))
-        is_strange = self._is_strange(event, in_view, seen)
+        is_strange = not some_have_ids and self._is_strange(event, in_view, seen)
         rows = np.flatnonzero(is_numbered & in_view)
         landmarks.look(rows, seen[rows])
         self._field_of_view.include(event.points)
@@ -62,15 +75,16 @@ class Surroundings:
     def _is_strange(self, event: ObservationEvent, in_view: BoolArray, seen: BoolArray) -> bool:
         """Return whether those in view and not seen (n,) are too many, for too long."""
         landmarks = self._landmarks
-        numbered = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
-        old = in_view & ~landmarks.tentative & (numbered <= self._newest_id)
+        numbers = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
+        old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)
         if (old & seen).any():
             self._surprise = 0.0
         elif len(event.points) and self._field_of_view.is_known:
             share = min(max(landmarks.seen_share, LEAST_SHARE), MOST_SHARE)
-            self._surprise += min(-math.log1p(-share) * int(np.sum(old)), MOST_SURPRISING)
+            surprise = -math.log1p(-share) * int(np.sum(old))
+            self._surprise += min(surprise, MOST_SURPRISING)
         is_strange = self._surprise > IMPROBABLE
         if is_strange or self._surprise == 0.0:
             self._surprise = 0.0
-            self._newest_id = int(np.max(numbered, initial=0))
+            self._newest_number = int(np.max(numbers, initial=0))
         return is_strange

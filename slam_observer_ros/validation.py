@@ -52,7 +52,8 @@ def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: i
 
 
 def _check_observation(event: ObservationEvent) -> None:
-    m = len(event.points)
+    is_stack = isinstance(event.points, np.ndarray) and event.points.ndim > 0
+    m = len(event.points) if is_stack else 0
     if not isinstance(event.ids, np.ndarray) or event.ids.dtype.kind not in 'iu':
         raise InvalidEventError('wrong_type', 'landmark ids are not an array of integers')
     _check_coordinates('landmark points', event.points, (m, 3))
@@ -71,7 +72,7 @@ def _check_observation(event: ObservationEvent) -> None:
 
 
 def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    if isinstance(array, np.ndarray) and array.shape == shape:
+    if isinstance(array, np.ndarray) and array.shape == shape and array.dtype.kind == 'f':
         # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
         entries = array.ravel()
         if entries.dot(entries) <= LARGEST**2:
@@ -82,8 +83,8 @@ def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> 
 
 
 def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    if not isinstance(array, np.ndarray):
-        raise InvalidEventError('wrong_type', f'{name}: {type(array).__name__}, no numpy array')
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in 'fiu':
+        raise InvalidEventError('wrong_type', f'{name}: no numpy array of numbers')
     if array.shape != shape:
         raise InvalidEventError('wrong_shape', f'{name}: shape {array.shape}, not {shape}')
     if not np.isfinite(array).all():

@@ -220,8 +220,8 @@ class TestPoints:
         ended = slam_observer(*arguments, 'constant')
         assert '0 used, 150 without id (100.0 %)' in ended.output
         assert (
-            'slam-observer: warning: Not used: points without an id, by constant gains; '
-            'riccati do (1 so far).\n'
+            'slam-observer: warning: Points without an id are not used by constant gains, '
+            'only by riccati (1 so far).\n'
         ) in ended.errors
         assert '150 used' in slam_observer.succeed(*arguments, 'riccati').output
 

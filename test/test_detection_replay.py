@@ -213,7 +213,7 @@ def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observ
         ('poses', (), 'no landmark topic: .* with ids; --landmarks-topic may name /poses; '),
         ('boxes', ('--set', 'landmarks_type=tf'), 'no topic /tf; the recording holds'),
         ('boxes', ('--set', 'landmarks_type=PoseArray'),
-         'no landmark topic: none of type geometry_msgs/msg/PoseArray; choose another with'),
+         'PoseArray; --landmarks-topic names another; the recording holds'),
         ('boxes', ('--set', 'landmarks_type=PoseArray', '--landmarks-topic', '/boxes'),
          'can not be the landmark topic, which is one of geometry_msgs/msg/PoseArray$'),
         ('boxes', ('--set', 'landmarks_type=Boxes'), "'landmarks_type' takes one of auto, "),

@@ -100,7 +100,7 @@ def test_legend_of_a_configuration_covers_nothing(
 
 def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -> None:
     crowded = np.linspace(0.0, 2.0, 30)[:, None] * np.array([1.0, 0.2, 0.0])
-    numbers = np.arange(30)
+    numbers = np.arange(30) + 12345
     labelled = map_plot.plot_map(tmp_path / 'a.png', estimate, numbers, crowded)
     unnamed = numbers + FIRST_AUTOMATIC_ID
     bare = map_plot.plot_map(tmp_path / 'b.png', estimate, unnamed, crowded)

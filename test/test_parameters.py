@@ -218,6 +218,11 @@ def test_a_node_may_be_below_its_namespace(tmp_path):
     assert read_parameter_file(path) == {'gains': 'constant'}
 
 
+def test_a_file_that_holds_itself_is_refused_in_one_line(tmp_path):
+    with pytest.raises(ParameterError, match='has no '):
+        read_parameter_file(write(tmp_path, 'a: &x {b: *x}\n'))
+
+
 def test_later_sections_win(tmp_path):
     path = write(
         tmp_path,

@@ -69,6 +69,17 @@ def test_the_trajectory_does_not_depend_on_the_order_of_arrival(window_s):
     assert_array_equal(trajectory.poses, expected.poses)
 
 
+@pytest.mark.parametrize('window_s', [0.0, 0.05])
+def test_the_last_pose_before_a_jump_of_the_clock_is_kept(window_s):
+    before = list(events_of(200, 5))
+    after = [replace(event, stamp_ns=event.stamp_ns + 1000 * SECOND) for event in before]
+    settings = Settings(reorder_window=window_s, on_time_jump='hold')
+    stamps_ns = replay(before + after, settings).trajectory.stamps_ns
+    kept = stamps_ns[stamps_ns < 500 * SECOND]
+    assert kept[-1] > before[-1].stamp_ns - SAMPLE_PERIOD_NS
+    assert np.sum(stamps_ns > 500 * SECOND) >= len(kept) - 5
+
+
 def test_of_events_with_one_stamp_the_last_one_counts():
     events = list(events_of(400, 3))
     updates = {}

@@ -100,6 +100,22 @@ def test_without_ids_there_is_a_warning_where_landmarks_are_far_apart(seed, capl
     assert 'Nothing that is seen is where the map has it' in caplog.text
 
 
+@seeds
+def test_landmarks_with_ids_are_another_sensors_to_see(seed):
+    """A robot stands among tags, and a sensor without ids sees a passer-by."""
+    rng, estimator = np.random.default_rng(seed), Estimator(PLANAR)
+    tags = rng.uniform([-5.0, -5.0, 0.0], [5.0, 5.0, 0.0], (20, 3))
+    for step in range(80):
+        stamp_ns = START_NS + step * 100_000_000
+        assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        seen = tags + rng.normal(0.0, 0.02, (20, 3)) * [1.0, 1.0, 0.0]
+        assert estimator.add(ObservationEvent(stamp_ns, np.arange(20), seen))
+        passer_by = np.array([[0.1 * step - 4.0, 2.0, 0.0]])
+        nobody = np.array([UNKNOWN_ID])
+        assert estimator.add(ObservationEvent(stamp_ns + 50_000_000, nobody, passer_by))
+    assert estimator.counts['strange_place'] == 0
+
+
 @modes
 @seeds
 def test_a_robot_that_is_where_it_should_be_is_not_warned_of(settings, seed):

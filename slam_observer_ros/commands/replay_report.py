@@ -169,13 +169,14 @@ def _warn_of_rejections(result: Replay) -> None:
 
 def _warn_of_unmapped(result: Replay) -> None:
     """Say what may be wrong if most points are of no landmark of a map that does not grow."""
-    counts = result.estimator.counts
+    counts, settings = result.estimator.counts, result.estimator.settings
     share = counts['unmapped_landmark'] / max(counts['observed_point'], 1)
-    if result.in_known_map and share > MOST_UNMAPPED:
+    is_growing = not result.in_known_map or settings.localization_mode == 'off'
+    if share > MOST_UNMAPPED and not is_growing:
         logger.warning(
-            '%.0f %% of the points are of no landmark of the map: look whether the robot started '
-            'where it was said to, and whether it is the map of this place.',
+            '%.0f %% of the points are of no landmark of the map: is it the map of this place%s?',
             100.0 * share,
+            ', and did the robot start where it was said to' if settings.set_initial_pose else '',
         )
 
 
@@ -253,6 +254,8 @@ def print_summary(
     }
     if slips := outcome.result.estimator.counts['slip']:
         rows['slips'] = f'{slips} × the robot was not where odometry had it'
+    if strange := outcome.result.estimator.counts['strange_place']:
+        rows['strange places'] = f'{strange} × nothing seen was where the map has it'
     if report.localised_after_s is not None:
         rows['place in the map'] = _told_place(outcome.result, report.localised_after_s)
     rows |= {part.name: str(part) for part in outcome.result.estimator.calibration}

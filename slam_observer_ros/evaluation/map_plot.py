@@ -32,8 +32,8 @@ from slam_observer_ros.types import FloatArray, IntArray
 _MOST_LABELS = 80
 """Maps with more landmarks than this are drawn without ids, which would cover each other."""
 
-_LABEL_DISTANCE_PT = 12.0
-"""From the middle of a marker to that of its label."""
+_LABEL_RIGHT_PT, _LABEL_UP_PT = 8.0, 12.0
+"""From the middle of a marker to its label's side, however long that is, and to its middle."""
 
 _NEAR = 0.03
 """Markers nearer than this share of the map touch: of several it matters where their middle is."""
@@ -136,16 +136,17 @@ def _label_landmarks(
     axes: Axes, ids: IntArray, world_points: FloatArray, landmark_truth: LandmarkTruth | None
 ) -> None:
     """Write each id beside its estimate, on the side away from what else is drawn near it."""
-    drawn = world_points if landmark_truth is None else landmark_truth.world_points
-    markers = np.concatenate([world_points, drawn])[:, :2]
+    true_points = [] if landmark_truth is None else [landmark_truth.world_points]
+    markers = np.concatenate([world_points, *true_points])[:, :2]
     for landmark_id, point in zip(ids.tolist(), world_points, strict=True):
-        right, up = _LABEL_DISTANCE_PT * _away(point[:2], markers)
+        right, up = _away(point[:2], markers)
+        side = 'left' if right > 0.0 else 'right'
         axes.annotate(
             str(landmark_id),
             (point[0], point[1]),
-            xytext=(right, up),
+            xytext=(_LABEL_RIGHT_PT * right, _LABEL_UP_PT * up),
             textcoords='offset points',
-            horizontalalignment='center',
+            horizontalalignment=side if abs(right) > abs(up) else 'center',
             verticalalignment='center',
             fontsize=8,
             color='#004D38',

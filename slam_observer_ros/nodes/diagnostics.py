@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 import time
 from typing import Any
@@ -17,6 +17,12 @@ from slam_observer_ros.nodes.intake import Intake
 
 SILENT_S = 2.0
 """An input without messages for this long is a warning."""
+
+RECENT = 30
+"""Statuses, of about a second each, over which rejected points are looked at."""
+
+FEWEST_POINTS = 50
+"""Points that it takes to tell how large a share of them is rejected."""
 
 LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id')
 """Points not used for something that is wrong; those that a known map lacks may well be there."""
@@ -54,6 +60,7 @@ class Diagnostics:
         self._last_received = {source.topic: 0 for source in inputs}
         self._last_dropped = 0
         self._last_counts: Counter[str] = Counter()
+        self._recent_counts: deque[Counter[str]] = deque(maxlen=RECENT)
 
     def publish(self) -> None:
         """Publish one status; call it about once a second."""
@@ -118,13 +125,21 @@ class Diagnostics:
         elif dropped:
             warnings.append(f'{dropped} messages dropped')
         warnings.append(self._points_warning(new))
-        if (share := rejected_share(self._estimator.counts)) > MOST_REJECTED:
-            warnings.append(f'{100.0 * share:.0f} % of all points seen so far were rejected')
+        warnings.append(self._rejections_warning(new))
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
         if not self._estimator.is_localised:
             warnings.append('the place in the loaded map is not known yet: no pose is published')
         return [warning for warning in warnings if warning]
+
+    def _rejections_warning(self, new: Counter[str]) -> str:
+        """Tell that more points were rejected of late than a sensor has outliers."""
+        self._recent_counts.append(new)
+        recent = sum(self._recent_counts, Counter())
+        share = rejected_share(recent)
+        if recent['observed_point'] < FEWEST_POINTS or share <= MOST_REJECTED:
+            return ''
+        return f'{100.0 * share:.0f} % of the points seen lately were rejected'
 
     @staticmethod
     def _points_warning(new: Counter[str]) -> str:

@@ -73,6 +73,7 @@ def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
     if settings.landmarks_type == 'AprilTagDetectionArray':
         return Input(node, 'landmarks', {APRILTAGS: decode_apriltags}, intake.add_tags, qos)
     if settings.landmarks_type == AUTO:
+        # Not detections: their package, which need not be installed, would be imported unasked.
         decoders = CLOUD_DECODERS | {POSE_ARRAY: decode_pose_array}
         return Input(node, 'landmarks', decoders, intake.add_observation, qos)
     decoders = _chosen(CLOUD_DECODERS | DETECTION_DECODERS, settings.landmarks_type)

@@ -41,7 +41,10 @@ APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'
 """Type that gives the ids of fiducials, whose positions are on /tf."""
 
 POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
+"""Type of landmarks without ids; it may hold other things."""
+
 DETECTIONS = 'vision_msgs/msg/Detection3DArray'
+"""Type of landmarks with ids or without."""
 
 VelocityDecoder: TypeAlias = Callable[[Buffer, int], VelocityMessage]
 """From the serialised message and its receive time, which only unstamped messages use."""

@@ -249,14 +249,20 @@ def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topi
     if topic is not None:
         return topic
     with_ids = '' if CLOUD_DECODERS.keys().isdisjoint(role.message_types) else ' with ids'
-    possible = [topic.name for topic in topics if topic.message_type in role.types_by_name]
-    named = [name for name in possible if last_part(name) != 'tf_static']
-    advice = f'{role.option} may name {_join(named)}'
-    if not named:
-        advice = f'choose another with {role.option}'
+    types = (*role.message_types, *role.types_by_name)
+    possible = [
+        topic.name
+        for topic in topics
+        if topic.message_type in types
+        and _is_truth(topic.name) == role.is_truth
+        and last_part(topic.name) != 'tf_static'
+    ]
+    # Nearly every recording has /tf, most of them without landmarks.
+    possible.sort(key=lambda name: last_part(name) == 'tf')
+    advice = f'may name {_join(possible)}' if possible else 'names another'
     raise RecordingError(
         f'no {role.name} topic: none of type {_join(role.message_types)}{with_ids}; '
-        f'{advice}; the recording holds {_join(topics)}'
+        f'{role.option} {advice}; the recording holds {_join(topics)}'
     )
 
 
