@@ -6,6 +6,7 @@ from dataclasses import replace
 import io
 import os
 from pathlib import Path
+import re
 import sys
 
 from command_line import CommandLine
@@ -213,6 +214,24 @@ class TestPoints:
         output = slam_observer('replay', path, '--gains', 'riccati').output
         assert f'{150 - rejected} used, {rejected} rejected ({rejected / 1.5:.1f} %)' in output
         assert '3, 1 moved' in output
+
+    @pytest.mark.parametrize('has_ids', [True, False])
+    def test_a_robot_that_was_carried_is_in_the_summary(self, slam_observer, tmp_path, has_ids):
+        """It stands among four landmarks, and then somewhere else."""
+        square = np.array([[2.0, 2.0, 0.0], [-2.0, 2.0, 0.0], [-2.5, -2.0, 0.0], [2.0, -3.0, 0.0]])
+        ids = np.arange(4) if has_ids else np.full(4, UNKNOWN_ID)
+        events = []
+        for step in range(80):
+            shift = np.array([0.9, 0.8, 0.0]) if step >= 40 else np.zeros(3)
+            events.append(VelocityEvent(step * 10**8, np.zeros(6)))
+            events.append(ObservationEvent(step * 10**8, ids, square + shift))
+        path = write_events(tmp_path / 'carried.mcap', events)
+        options = ('--landmarks-topic', '/landmarks', '--set', 'two_d_mode=true')
+        output = slam_observer('replay', path, *options).output
+        row = r'slips +│ \d+ × the robot was not where odometry had it'
+        if not has_ids:
+            row = r'strange places +│ \d+ × nothing seen was where the map has it'
+        assert re.search(row, output)
 
     def test_gains_that_use_no_point_without_id_say_so(self, slam_observer, tmp_path):
         path = write_events(tmp_path / 'nameless.mcap', nameless(recordings.events()))

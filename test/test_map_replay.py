@@ -256,6 +256,22 @@ def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
     assert 'hindsight_window' not in jumped.errors + loaded.errors
 
 
+@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+def test_points_of_no_landmark_of_a_map_that_does_not_grow_are_told(slam_observer, tmp_path, mode):
+    """The map is of some twenty landmarks, whose ids are shared; of others they go up from 100."""
+    first = record(tmp_path / 'first.mcap', np.eye(4), seed=1)
+    second = record(tmp_path / 'second.mcap', np.eye(4), 2, lambda s: 0 if s < 10 else 100)
+    saved = tmp_path / 'map.yaml'
+    slam_observer.succeed('replay', first, '--map', saved, *SETTINGS)
+    told = slam_observer(
+        'replay', second, '--load-map', saved, *SETTINGS,
+        '--set', f'localization_mode={mode}', '--set', 'set_initial_pose=true',
+    ).errors  # fmt: skip
+    is_told = 'of the points are of no landmark of the map: is it the map of this place' in told
+    assert is_told == (mode != 'off')
+    assert ('did the robot start where it was said to' in told) == is_told
+
+
 def test_smoothing_tells_that_landmarks_had_to_make_room(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     limited = ('--smooth', '--set', 'max_landmarks=30', *SETTINGS)
