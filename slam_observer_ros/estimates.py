@@ -25,9 +25,9 @@ MOST_REJECTED = 0.1
 """Share of the points beyond which they are more than a sensor's outliers."""
 
 
-def rejected_share(counts: Counter[str]) -> float:
-    """Return the share of the points that was rejected, from :attr:`.Estimator.counts`."""
-    return counts['rejected_landmark'] / max(counts['observed_point'], 1)
+def point_share(counts: Counter[str], name: str) -> float:
+    """Return the share of the points that ``name`` counts, from :attr:`.Estimator.counts`."""
+    return counts[name] / max(counts['observed_point'], 1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.commands.replay_checks import list_dropped
 from slam_observer_ros.estimates import (
     MOST_REJECTED,
-    rejected_share,
+    point_share,
     Smoothed,
     UNUSED_POINTS,
     used_points,
@@ -157,7 +157,7 @@ def _warn_of_missing_stamps(recording: Recording) -> None:
 
 def _warn_of_rejections(result: Replay) -> None:
     """Say what may be wrong if more points were rejected than a sensor has outliers."""
-    share = rejected_share(result.estimator.counts)
+    share = point_share(result.estimator.counts, 'rejected_landmark')
     if share > MOST_REJECTED:
         logger.warning(
             '%.0f %% of the points were rejected: look at the signs, units and frames of the '
@@ -169,8 +169,8 @@ def _warn_of_rejections(result: Replay) -> None:
 
 def _warn_of_unmapped(result: Replay) -> None:
     """Say what may be wrong if most points are of no landmark of a map that does not grow."""
-    counts, settings = result.estimator.counts, result.estimator.settings
-    share = counts['unmapped_landmark'] / max(counts['observed_point'], 1)
+    settings = result.estimator.settings
+    share = point_share(result.estimator.counts, 'unmapped_landmark')
     is_growing = not result.in_known_map or settings.localization_mode == 'off'
     if share > MOST_UNMAPPED and not is_growing:
         logger.warning(
@@ -282,7 +282,7 @@ def _told_points(counts: Counter[str]) -> str:
     """Tell how many points were used, and what befell the others."""
     told = [f'{used_points(counts)} used']
     told += [
-        f'{counts[name]} {fate} ({100.0 * counts[name] / counts["observed_point"]:.1f} %)'
+        f'{counts[name]} {fate} ({100.0 * point_share(counts, name):.1f} %)'
         for name, fate in UNUSED_POINTS.items()
         if counts[name]
     ]

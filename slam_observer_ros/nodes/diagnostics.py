@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from slam_observer_ros.estimates import MOST_REJECTED, rejected_share, UNUSED_POINTS
+from slam_observer_ros.estimates import MOST_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
@@ -136,7 +136,7 @@ class Diagnostics:
         """Tell that more points were rejected of late than a sensor has outliers."""
         self._recent_counts.append(new)
         recent = sum(self._recent_counts, Counter())
-        share = rejected_share(recent)
+        share = point_share(recent, 'rejected_landmark')
         if recent['observed_point'] < FEWEST_POINTS or share <= MOST_REJECTED:
             return ''
         return f'{100.0 * share:.0f} % of the points seen lately were rejected'

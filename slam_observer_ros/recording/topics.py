@@ -92,6 +92,11 @@ class _Role:
     types_by_name: Collection[str] = ()
     """Types that hold other things, too: taken only of a topic that the user names."""
 
+    @property
+    def all_types(self) -> tuple[str, ...]:
+        """All types that a topic may have which the user names."""
+        return (*self.message_types, *self.types_by_name)
+
 
 def select_topics(
     topics: Sequence[Topic],
@@ -124,7 +129,7 @@ def select_topics(
 
     def fits(topic: Topic, role: _Role) -> bool:
         if not role.is_truth and last_part(topic.name) == 'landmarks':
-            return topic.message_type in (*role.message_types, *role.types_by_name)
+            return topic.message_type in role.all_types
         if topic.message_type not in role.message_types:
             return False
         return topic.message_type not in CLOUD_DECODERS or identifies(topic)
@@ -210,7 +215,7 @@ def _landmark_choice(name: str | None, landmarks_type: str) -> tuple[_Role, str 
     if landmarks_type == ON_TF:
         types, name = [TRANSFORMS], name or '/tf'
     else:
-        known = (*_LANDMARKS.message_types, *_LANDMARKS.types_by_name)
+        known = _LANDMARKS.all_types
         types = [known_type for known_type in known if last_part(known_type) == landmarks_type]
     return replace(_LANDMARKS, message_types=types, types_by_name=()), name
 
@@ -221,13 +226,13 @@ def _is_truth(name: str) -> bool:
 
 def _named(topics: Sequence[Topic], role: _Role, name: str) -> Topic:
     same_name = [topic for topic in topics if topic.name.strip('/') == name.strip('/')]
-    types = (*role.message_types, *role.types_by_name)
-    fitting = [topic for topic in same_name if topic.message_type in types]
+    fitting = [topic for topic in same_name if topic.message_type in role.all_types]
     if fitting:
         return fitting[0]
     if same_name:
         raise RecordingError(
-            f'{same_name[0]} can not be the {role.name} topic, which is one of {_join(types)}'
+            f'{same_name[0]} can not be the {role.name} topic, '
+            f'which is one of {_join(role.all_types)}'
         )
     raise RecordingError(f'no topic {name}; the recording holds {_join(topics)}')
 
@@ -249,11 +254,10 @@ def _required(topic: Topic | None, role: _Role, topics: Sequence[Topic]) -> Topi
     if topic is not None:
         return topic
     with_ids = '' if CLOUD_DECODERS.keys().isdisjoint(role.message_types) else ' with ids'
-    types = (*role.message_types, *role.types_by_name)
     possible = [
         topic.name
         for topic in topics
-        if topic.message_type in types
+        if topic.message_type in role.all_types
         and _is_truth(topic.name) == role.is_truth
         and last_part(topic.name) != 'tf_static'
     ]
