@@ -174,6 +174,7 @@ BAD_FILES = [
     (changed('frame: hall', 'frame: hall\nframes: 1'), "has 'frames', which is not known"),
     ('\n'.join(SURVEYED.splitlines()[:3]), "lacks 'landmarks'"),
     ('\n'.join(SURVEYED.splitlines()[:4]), "'landmarks' is not a list"),
+    (SURVEYED[: SURVEYED.index('landmarks:')] + 'landmarks: []', 'it has no landmarks'),
     (changed('{id: 7, position: [1.5, -2, 0.3], sigma: 0.01}', '7'), 'entry 0 of landmarks'),
     (changed('id: 7, ', ''), "entry 0 of landmarks lacks 'id'"),
     (changed('id: 7', 'id: -7'), "entry 0 of landmarks: 'id' is -7"),

@@ -368,6 +368,27 @@ def test_truth_of_a_type_that_is_not_read_is_told(slam_observer, tmp_path, has_p
         assert '/ground_truth/path (nav_msgs/msg/Path, 1 messages)' in errors
 
 
+@pytest.mark.parametrize('is_placed', [True, False])
+def test_true_poses_of_another_frame_are_moved_to_the_base(slam_observer, tmp_path, is_placed):
+    path, marker = tmp_path / 'run.mcap', pose_from_rpy((0.5, 0.2, 0.3, 0.0, 0.0, 2.0))
+    with RecordingWriter(path) as writer:
+        drive = Drive(writer)
+        if is_placed:
+            drive.transforms('/tf_static', ros.STAMP_NS, ('base_link', 'marker', marker, 0))
+        for stamp_ns in stamps_ns():
+            writer.write_velocity(VelocityEvent(stamp_ns, V))
+            drive.landmarks(stamp_ns)
+            seen = true_pose(stamp_ns) @ marker
+            turn = so3.to_quaternion(seen[:3, :3])
+            frames = ('world', 'marker')
+            odometry = ros.odometry(V, np.eye(6), seen[:3, 3], turn, frames, stamp_ns)
+            drive.write('/ground_truth/odom', odometry, stamp_ns)
+    done = slam_observer('replay', path, '--json')
+    told = "The true poses are of 'marker', and the estimated ones of 'base_link'"
+    assert (told in done.errors) != is_placed
+    assert (done.json['ate_rmse_m'] < 1e-3) == is_placed
+
+
 def test_the_base_frame_of_the_nodes_file_counts(slam_observer, tmp_path):
     path, config = tmp_path / 'run.mcap', tmp_path / 'robot.yaml'
     base_in_wheels = pose_from_rpy((0.5, 0.0, 0.0, 0.0, 0.0, 0.0))

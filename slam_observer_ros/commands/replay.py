@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
             logger.warning('%s', recording.warning)
         selected = recording.find_topics(topic_names(args), inputs)
         inputs = with_base_frame(inputs, recording, selected)
-        truth = recording.truth(selected)
+        truth = recording.truth(selected, inputs.base_frame)
         truth = truth.flattened() if settings.two_d_mode else truth
         events = show_progress(
             recording.events(selected, inputs, settings.velocity_timeout),

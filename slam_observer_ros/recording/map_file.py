@@ -172,6 +172,7 @@ def _parse(content: Any) -> LandmarkMap:
     frame_id, rows = content['frame'], content['landmarks']
     _expect(isinstance(frame_id, str) and frame_id != '', f"'frame' is {frame_id!r}, not a name")
     _expect(isinstance(rows, list), "'landmarks' is not a list")
+    _expect(len(rows) > 0, 'it has no landmarks')
     ids = [_landmark_id(row, place) for place, row in enumerate(rows)]
     for landmark_id, times in Counter(ids).items():
         _expect(times == 1, f'landmark {landmark_id} is there {times} times')

@@ -37,7 +37,7 @@ from slam_observer_ros.recording.point_cloud_layout import ID_NAME
 from slam_observer_ros.recording.point_clouds import field_names
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
-from slam_observer_ros.recording.truth import Truth
+from slam_observer_ros.recording.truth import base_in_frames, Truth
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.transform_buffer import TransformBuffer
 from slam_observer_ros.units import to_s
@@ -155,9 +155,7 @@ class Recording:
             If the file turns out to be damaged.
 
         """
-        transforms = TransformBuffer()
-        for raw in self._source.messages(selected.transforms.static):
-            self._insert(transforms, raw, is_static=True)
+        transforms = self._static_transforms(selected)
         builder = EventBuilder(
             BaseFrame(inputs, transforms), inputs.transform_timeout, velocity_timeout_s, self._drop
         )
@@ -211,13 +209,16 @@ class Recording:
         poses = (message.pose for message in self._all_decoded(topic, decode_pose))
         return any(not np.array_equal(pose, after) for pose, after in pairwise(poses))
 
-    def truth(self, selected: SelectedTopics) -> Truth:
+    def truth(self, selected: SelectedTopics, base_frame: str = '') -> Truth:
         """Read the true poses and landmarks.
 
         Parameters
         ----------
         selected : SelectedTopics
             From :meth:`find_topics`.
+        base_frame : str
+            Whose poses these shall be. Those of another frame are moved to it by /tf_static, or
+            left as they are, with a warning.
 
         Raises
         ------
@@ -225,10 +226,19 @@ class Recording:
             If the file turns out to be damaged.
 
         """
+        poses = list(self._all_decoded(selected.pose_truth, decode_pose))
+        frames = {message.child_frame_id for message in poses}
         return Truth.from_messages(
-            self._all_decoded(selected.pose_truth, decode_pose),
+            poses,
+            base_in_frames(frames, base_frame, self._static_transforms(selected)),
             self._all_decoded(selected.landmark_truth, decode_landmarks),
         )
+
+    def _static_transforms(self, selected: SelectedTopics) -> TransformBuffer:
+        transforms = TransformBuffer()
+        for raw in self._source.messages(selected.transforms.static):
+            self._insert(transforms, raw, is_static=True)
+        return transforms
 
     def _decoded(
         self, raw: RawMessage, decode: Callable[[RawMessage], _Decoded]

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+import logging
 
 import numpy as np
 
+from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import LandmarkTruth, UNKNOWN_ID
+from slam_observer_ros.recording.frames import TransformSource
 from slam_observer_ros.recording.messages import pose_stack, PoseMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.types import FloatArray, IntArray
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +39,20 @@ class Truth:
 
     @classmethod
     def from_messages(
-        cls, poses: Iterable[PoseMessage], landmarks: Iterable[ObservationMessage]
+        cls,
+        poses: Sequence[PoseMessage],
+        base_in: Mapping[str, FloatArray],
+        landmarks: Iterable[ObservationMessage],
     ) -> Truth:
-        """Gather poses of any order, and landmarks of which the last position counts."""
-        return cls(*_gathered_poses(list(poses)), _gathered_landmarks(landmarks))
+        """Gather poses of any order, and landmarks of which the last position counts.
+
+        ``base_in`` has the pose (4, 4) of the robot's base in each frame whose poses these are.
+        """
+        stamps_ns = np.array([message.stamp_ns for message in poses], dtype=np.int64)
+        stamps_ns, order = np.unique(stamps_ns, return_index=True)
+        bases = np.array([base_in[message.child_frame_id] for message in poses])
+        world_poses = pose_stack(poses) @ bases.reshape(-1, 4, 4)
+        return cls(stamps_ns, world_poses[order], _gathered_landmarks(landmarks))
 
     def flattened(self) -> Truth:
         """Return it with the landmarks at the robot's height, where a planar map has them."""
@@ -48,11 +63,28 @@ class Truth:
         return replace(self, landmarks=replace(self.landmarks, world_points=points))
 
 
-def _gathered_poses(messages: Sequence[PoseMessage]) -> tuple[IntArray, FloatArray]:
-    stamps_ns, order = np.unique(
-        np.array([message.stamp_ns for message in messages], dtype=np.int64), return_index=True
-    )
-    return stamps_ns, pose_stack([messages[i] for i in order])
+def base_in_frames(
+    frames: Collection[str], base_frame: str, transforms: TransformSource
+) -> dict[str, FloatArray]:
+    """Return the pose (4, 4) of the base frame in each of ``frames``, by name.
+
+    Identity where a name is empty, and, with a warning, where ``transforms`` don't have both.
+    """
+    base_in = dict.fromkeys(frames, np.eye(4))
+    for frame in frames:
+        if frame.lstrip('/') in ('', base_frame.lstrip('/')) or not base_frame:
+            continue
+        try:
+            base_in[frame] = transforms.lookup(frame, base_frame, 0)
+        except TransformError as error:
+            _logger.warning(
+                "The true poses are of '%s', and the estimated ones of '%s': they are compared "
+                'as if that were one place (%s).',
+                frame,
+                base_frame,
+                error,
+            )
+    return base_in
 
 
 def _gathered_landmarks(messages: Iterable[ObservationMessage]) -> LandmarkTruth | None:
