@@ -1,6 +1,7 @@
 """Which landmarks the points of an observation are, where the sensor gave no ids.
 
-An *assignment* takes each such point for a landmark, or for a new one. What matters about it is
+An *assignment* takes each such point for a landmark, or for a new one. A point whose id is new
+may be of a landmark that had none so far. What matters about it is
 where it puts the robot: among those that agree on that, within what the sensor can tell, the most
 likely one is taken. Those that don't agree are all returned, for later observations to decide
 (:mod:`slam_observer_ros.hypotheses`).
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.axes import axes_of, SPATIAL
+from slam_observer_ros.events import is_automatic, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
@@ -25,9 +27,10 @@ from slam_observer_ros.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.landmark_index import LandmarkIndex
+from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""
@@ -53,10 +56,11 @@ class Assignment:
 def find_assignments(
     observer: Observer,
     gains: RiccatiGains,
+    landmarks: LandmarkTable,
     index: LandmarkIndex,
+    ids: IntArray,
     points: FloatArray,
     noise: FloatArray,
-    known_rows: IntArray,
     settings: Settings,
     budget: float,
 ) -> list[Assignment]:
@@ -66,14 +70,16 @@ def find_assignments(
     ----------
     observer, gains : Observer, RiccatiGains
         State and its covariance.
+    landmarks : LandmarkTable
+        Their ids.
     index : LandmarkIndex
         Index over the observer's landmarks.
+    ids : IntArray
+        (m,) what the sensor says the points are, ``UNKNOWN_ID`` where it doesn't.
     points : FloatArray
         (m, 3) Â y_i, metres, reference frame.
     noise : FloatArray
         (m, 3, 3) their covariances, m².
-    known_rows : IntArray
-        (m,) row of the landmark that the sensor says it is, −1 where it gives no id.
     settings : Settings
         ``rejection_distance`` is how far a point may be from its landmark, in σ.
     budget : float
@@ -87,16 +93,20 @@ def find_assignments(
     """
     axes = axes_of(settings.two_d_mode)
     gate, m, k = settings.rejection_distance, len(points), axes.point
-    at, rows = _pairs_within(gate, observer, gains, index, points, noise, known_rows)
+    at, rows = _pairs_near(gate, observer, gains, index, points, noise)
+    allowed = _may_be(landmarks, ids, at, rows)
+    at, rows = _pairs_within(gate, observer, gains, at[allowed], rows[allowed], points, noise)
     residuals = _as_residuals(observer, rows, points[at], noise[at])
     PC, CPC = gains.foretold(residuals)
     own_noise = residuals.covariances[:, :k, :k]
     S = with_blocks(CPC, own_noise)
     pairs = Pairs(at, rows, residuals.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
+    is_new_id = (ids != UNKNOWN_ID) & (landmarks.rows_of(ids) < 0)
+    certain = nearly & ~is_new_id[at]
     lonely_cost = (m - len(np.unique(at))) * unpaired_cost(gate)
-    margin = 0.0 if nearly.all() else MARGIN
-    search = JointSearch(pairs, nearly, gate, margin, budget - lonely_cost)
+    margin = 0.0 if certain.all() else MARGIN
+    search = JointSearch(pairs, certain, gate, margin, budget - lonely_cost)
     J = np.linalg.inv(np.linalg.cholesky(noise[:, :k, :k])) @ axes.output_matrix(points)
     assignments: list[Assignment] = []
     moves: list[FloatArray] = []
@@ -110,23 +120,39 @@ def find_assignments(
     return assignments
 
 
-def _pairs_within(
+def _pairs_near(
     gate: float,
     observer: Observer,
     gains: RiccatiGains,
     index: LandmarkIndex,
     points: FloatArray,
     noise: FloatArray,
-    known_rows: IntArray,
 ) -> tuple[IntArray, IntArray]:
-    """Return the pairs (q,), (q,) of a point and a landmark that pass the gate alone."""
-    landmarks = observer.y_ref + observer.a
+    """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
     C = SPATIAL.output_matrix(points)
     seen = C @ gains.pose_covariance @ C.swapaxes(1, 2) + noise
     spread_m = _spread_m(seen) + np.max(_spread_m(gains.landmark_covariances), initial=0.0)
-    at, rows = index.near(landmarks, points, gate * spread_m)
-    allowed = np.where(known_rows[at] >= 0, rows == known_rows[at], ~np.isin(rows, known_rows))
-    at, rows = at[allowed], rows[allowed]
+    return index.near(observer.y_ref + observer.a, points, gate * spread_m)
+
+
+def _may_be(landmarks: LandmarkTable, ids: IntArray, at: IntArray, rows: IntArray) -> BoolArray:
+    """Return which pairs (q,) of a point and a landmark the ids (m,) of the points allow."""
+    known_rows = landmarks.rows_of(ids)
+    are_nameless = is_automatic(landmarks.ids)
+    others = ~np.isin(rows, known_rows) & ((ids[at] == UNKNOWN_ID) | are_nameless[rows])
+    return np.asarray(np.where(known_rows[at] >= 0, rows == known_rows[at], others))
+
+
+def _pairs_within(
+    gate: float,
+    observer: Observer,
+    gains: RiccatiGains,
+    at: IntArray,
+    rows: IntArray,
+    points: FloatArray,
+    noise: FloatArray,
+) -> tuple[IntArray, IntArray]:
+    """Return which of the pairs (q,), (q,) of a point and a landmark pass the gate alone."""
     distances = gains.distances(_as_residuals(observer, rows, points[at], noise[at]))
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])

@@ -23,7 +23,7 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
 )
 from slam_observer_ros.joint_compatibility import MARGIN
-from slam_observer_ros.readings import are_one, is_ambiguous, Reading, readings
+from slam_observer_ros.readings import are_one, is_ambiguous, may_name, Reading, readings
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.sighting import Outcome
 from slam_observer_ros.slam import Slam
@@ -103,7 +103,8 @@ class Hypotheses:
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
         if len(self._states) == 1 and not some_are_unknown:
             sighting = self.best.look(event)
-            if self._limit == 1 or not is_ambiguous(self.best, sighting):
+            is_clear = self._limit == 1 or not is_ambiguous(self.best, sighting)
+            if is_clear and not may_name(self.best, event):
                 return self.best.observe(event, sighting)
         possible = self._possible(event)
         uses = Counter(number for number, _ in possible)
@@ -111,6 +112,7 @@ class Hypotheses:
         for number, reading in possible:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
+            slam.landmarks.renumber(reading.named_rows, reading.names)
             if reading.has_slipped:
                 slip(slam, slam.look(reading.event))
             outcome = slam.observe(reading.event)

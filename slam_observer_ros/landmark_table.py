@@ -83,6 +83,7 @@ class LandmarkTable:
     def renumber(self, rows: IntArray, ids: IntArray) -> None:
         """Give ``rows`` (m,) other ids (m,)."""
         self.ids[rows] = ids
+        self.tentative[rows] &= is_automatic(ids)
         self._order = np.argsort(self.ids)
 
     def see(self, rows: IntArray, stamp_ns: int) -> None:

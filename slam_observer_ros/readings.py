@@ -12,13 +12,13 @@ and would be lost if it went on without what it sees.
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from slam_observer_ros.association import Assignment, find_assignments
 from slam_observer_ros.axes import axes_of
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
@@ -39,6 +39,10 @@ MOST_OF_ONE_CAUSE = 3
 """Points that cost this, at most: one garbled message is one, however much it tells."""
 
 
+def _none() -> IntArray:
+    return np.empty(0, dtype=np.int64)
+
+
 @dataclass(frozen=True, slots=True)
 class Reading:
     """What an observation is taken for.
@@ -51,12 +55,16 @@ class Reading:
         −2 ln of its likelihood, up to what all readings of the observation share.
     has_slipped : bool
         Whether the robot may have moved in any way since the observation before.
+    named_rows, names : IntArray
+        (j,) landmarks that had no id of their own so far, and the ids that they have now.
 
     """
 
     event: ObservationEvent
     cost: float
     has_slipped: bool = False
+    named_rows: IntArray = field(default_factory=_none)
+    names: IntArray = field(default_factory=_none)
 
 
 def readings(
@@ -86,7 +94,7 @@ def readings(
         return [Reading(event, 0.0)]
     sighting = slam.look(event)
     suspects = _suspect_ids(slam, gains, sighting.residuals)
-    if (event.ids == UNKNOWN_ID).any():
+    if (event.ids == UNKNOWN_ID).any() or may_name(slam, event):
         return _named(slam, gains, event, new_ids, suspects, budget)
     m, residuals = len(event.ids), sighting.residuals
     if gains.are_all_rejected(residuals):
@@ -107,6 +115,13 @@ def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     if not isinstance(gains, RiccatiGains) or gains.are_all_near(residuals):
         return False
     return bool(gains.suspects(residuals).any()) or gains.are_all_rejected(residuals)
+
+
+def may_name(slam: Slam, event: ObservationEvent) -> bool:
+    """Return whether a point's id may be that of a landmark which had none of its own so far."""
+    if not is_automatic(slam.landmarks.ids).any() or not isinstance(slam.gains, RiccatiGains):
+        return False
+    return bool((slam.landmarks.rows_of(event.ids) < 0).any())
 
 
 def _rejected_or_slipped(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
@@ -168,43 +183,47 @@ def _named(
     suspects: IntArray,
     budget: float,
 ) -> list[Reading]:
-    """Return the readings of points some of which have no id.
+    """Return the readings of points that may be of landmarks without an id.
 
     An id is believed here, too, until something contradicts it: without a suspect a reading
     costs no less than with all of them.
     """
-    is_new = (event.ids != UNKNOWN_ID) & (slam.landmarks.rows_of(event.ids) < 0)
-    judged = event.select(~is_new)
-    new_cost = np.sum(is_new) * unpaired_cost(slam.settings.rejection_distance)
     found = find_assignments(
         slam.observer,
         gains,
+        slam.landmarks,
         slam.index,
-        se3.transform(slam.observer.A, judged.points),
-        slam.observer.turned(slam.noise.observation(judged)),
-        slam.landmarks.rows_of(judged.ids),
+        event.ids,
+        se3.transform(slam.observer.A, event.points),
+        slam.observer.turned(slam.noise.observation(event)),
         slam.settings,
-        budget - new_cost,
+        budget,
     )
-    outliers = [np.isin(judged.ids, suspects) & (one.rows < 0) for one in found]
+    outliers = [np.isin(event.ids, suspects) & (one.rows < 0) for one in found]
     pairs = list(zip(found, outliers, strict=True))
     trusting = min((one.cost for one, some in pairs if not some.any()), default=0.0)
     named = []
     for one, some in pairs:
-        ids, kept = event.ids.copy(), np.ones(len(event.ids), dtype=np.bool_)
-        ids[~is_new], kept[~is_new] = _ids_of(slam, judged, one, new_ids[~is_new]), ~some
         cost = max(one.cost, trusting) if some.any() else one.cost
-        named.append(Reading(replace(event, ids=ids).select(kept), new_cost + cost))
+        reading = _with_ids(slam, event, one, new_ids)
+        named.append(replace(reading, event=reading.event.select(~some), cost=cost))
     return named
 
 
-def _ids_of(
+def _with_ids(
     slam: Slam, event: ObservationEvent, assignment: Assignment, new_ids: IntArray
-) -> IntArray:
-    """Return the ids (m,) of points, where they have none those that an assignment gives them."""
-    known = np.append(slam.landmarks.ids, UNKNOWN_ID)[assignment.rows]
-    assigned = np.where(assignment.rows < 0, new_ids, known)
-    return np.where(event.ids == UNKNOWN_ID, assigned, event.ids)
+) -> Reading:
+    """Return an assignment of m points as a reading, ``new_ids`` (m,) for landmarks not known."""
+    rows, has_id = assignment.rows, event.ids != UNKNOWN_ID
+    known_ids = np.append(slam.landmarks.ids, UNKNOWN_ID)[rows]
+    ids = np.where(has_id, event.ids, np.where(rows < 0, new_ids, known_ids))
+    names = has_id & (rows >= 0) & (known_ids != event.ids)
+    return Reading(
+        replace(event, ids=ids),
+        assignment.cost,
+        named_rows=rows[names],
+        names=event.ids[names],
+    )
 
 
 def _cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:

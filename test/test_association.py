@@ -388,6 +388,39 @@ def test_a_point_with_a_new_id_takes_no_landmark_from_a_point_without():
     assert estimator.landmark_counts.tolist() == [20, 20, 10]
 
 
+@pytest.mark.parametrize('settings', [PLANAR, SPATIAL], ids=['planar', 'spatial'])
+@pytest.mark.parametrize('max_hypotheses', [1, 8])
+def test_a_landmark_first_seen_without_its_id_takes_it_when_it_is_told(settings, max_hypotheses):
+    settings = replace(settings, max_hypotheses=max_hypotheses)
+    world = gain_worlds.drive(settings, 40.0, noise=0.5, landmarks=8)
+    rng = np.random.default_rng(0)
+
+    def now_and_then_named(_, event):
+        is_read = rng.random(len(event.ids)) < 0.3
+        return replace(event, ids=np.where(is_read, event.ids, UNKNOWN_ID))
+
+    named = gain_worlds.estimate(world, settings)
+    estimator = gain_worlds.estimate(world.with_observations(now_and_then_named), settings)
+    assert sorted(estimator.landmark_ids) == sorted(named.landmark_ids)
+    order = np.argsort(estimator.landmark_ids)
+    expected = named.world_points[np.argsort(named.landmark_ids)]
+    assert_allclose(estimator.world_points[order], expected, atol=1e-6)
+    assert_allclose(estimator.pose, named.pose, atol=1e-6)
+
+
+def test_ids_name_the_landmarks_of_a_fixed_map_that_has_none():
+    estimator = Estimator(replace(SPATIAL, localization_mode='fixed'))
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    counts = np.full(2, 9)
+    nameless_map = LandmarkMap(FIRST_AUTOMATIC_ID + np.arange(2), points, None, counts)
+    estimator.load_map(nameless_map, pose=np.eye(4))
+    stand(estimator, 0.0)
+    observe(estimator, 0.0, [*points, [0.0, -3.0, 0.0]], [7, 4, 9])
+    assert estimator.landmark_ids.tolist() == [7, 4]
+    assert_array_equal(estimator.world_points, points)
+    assert estimator.counts['unmapped_landmark'] == 1
+
+
 @pytest.mark.parametrize('seed', range(30))
 def test_many_points_seen_after_a_blind_stretch_are_told_apart_together(seed):
     """Each of them alone could be any landmark within metres."""
