@@ -8,10 +8,10 @@ import logging
 
 import numpy as np
 
-from slam_observer_ros.counted_warnings import CountedWarnings
 from slam_observer_ros.errors import InvalidEventError, ParameterError
 from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
 from slam_observer_ros.event_queue import EventQueue
+from slam_observer_ros.event_warnings import EventWarnings
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
@@ -33,17 +33,6 @@ from slam_observer_ros.units import to_ns, to_s
 from slam_observer_ros.validation import check_event
 
 logger = logging.getLogger(__name__)
-
-MOST_NAMED = 10
-"""Ids that a warning lists at most."""
-
-
-PLACE_WARNINGS = {
-    'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
-    'strange_place': 'Nothing that is seen is where the map has it: if the robot slipped or was '
-    'carried, it is not found again, as the points have no ids',
-}
-"""What is wrong with the robot's place when these counts grow."""
 
 
 class Estimator:
@@ -104,8 +93,7 @@ class Estimator:
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
-        self._warnings = CountedWarnings(logger)
-        self._told: Counter[str] = Counter()
+        self._warnings = EventWarnings()
         self._on_update, self._on_stamp, self._on_motion = on_update, on_stamp, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
@@ -390,7 +378,7 @@ class Estimator:
 
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
-        self._warnings.warn(error.reason, f'Dropped an event, {error.reason}: {error}')
+        self._warnings.dropped(error)
 
     def _process(self, event: Event) -> None:
         if event.stamp_ns > (self.stamp_ns or 0):
@@ -415,8 +403,7 @@ class Estimator:
         self._counts['velocity'] += is_used
         if is_late:
             self._counts['late_velocity'] += 1
-            text = 'A velocity came later than reorder_window allows and counts only from then on'
-            self._warnings.warn('late_velocity', text)
+            self._warnings.late_velocity()
         if self._timeline.is_full:
             self._catch_up()
 
@@ -425,7 +412,8 @@ class Estimator:
             event = flatten(event)
         self._counts['observed_point'] += len(event.ids)
         event = self._without_repeated(event)
-        self._warn_of_unknown_ids(event)
+        if self.settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
+            self._warnings.unknown_ids(self.settings.gains)
         timeline = self._timeline
         timeline.begin(event.stamp_ns)
         if event.stamp_ns < (timeline.state_ns or 0):
@@ -433,9 +421,9 @@ class Estimator:
             self._counts['late_observation'] += 1
         timeline.advance(self._frame.states, event.stamp_ns)
         outcome = self._frame.states.observe(event)
-        if len(moved_ids := outcome.moved_ids):
-            self._warnings.warn('moved_landmark', f'Landmarks {moved_ids.tolist()} have moved')
-        self._warn_of_place()
+        if len(outcome.moved_ids):
+            self._warnings.moved_landmarks(outcome.moved_ids)
+        self._warnings.lost_places(self._frame.counts)
         self._counts['observation'] += 1
         self._frame.find_place(outcome)
         observer = self._slam.observer
@@ -450,19 +438,6 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self._last)
 
-    def _warn_of_place(self) -> None:
-        counts = self._frame.counts
-        for name, text in PLACE_WARNINGS.items():
-            if counts[name] > self._told[name]:
-                self._warnings.warn(name, text)
-                self._told[name] = counts[name]
-
-    def _warn_of_unknown_ids(self, event: ObservationEvent) -> None:
-        if self.settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
-            gains = self.settings.gains
-            text = f'Points without an id are not used by {gains} gains, only by riccati'
-            self._warnings.warn('unknown_id', text)
-
     def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:
         """Leave out points with one id: nobody knows which of them is right."""
         repeated = event.repeated_ids()
@@ -470,10 +445,7 @@ class Estimator:
             return event
         left = event.select(~np.isin(event.ids, repeated))
         self._counts['repeated_id'] += len(event.ids) - len(left.ids)
-        named = ', '.join(str(landmark_id) for landmark_id in repeated[:MOST_NAMED])
-        more = ' and others' if len(repeated) > MOST_NAMED else ''
-        text = f'Not used: an observation has several points of the ids {named}{more}'
-        self._warnings.warn('repeated_id', text)
+        self._warnings.repeated_ids(repeated)
         return left
 
     def _catch_up(self) -> None:

@@ -1,0 +1,69 @@
+"""What the log is told of events, at the 1st, the 10th, the 100th time that it happens."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+import logging
+
+from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.types import IntArray
+
+logger = logging.getLogger(__name__)
+
+MOST_NAMED = 10
+"""Ids that a warning lists at most."""
+
+LOST_PLACES = {
+    'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
+    'strange_place': 'Nothing that is seen is where the map has it: if the robot slipped or was '
+    'carried, it is not found again, as the points have no ids',
+}
+"""What is wrong with the robot's place when these counts grow."""
+
+
+class EventWarnings:
+    """Counts what there is to warn of, and logs it more and more seldom."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._places: Counter[str] = Counter()
+
+    def dropped(self, error: InvalidEventError) -> None:
+        """Tell that an event is not used, and why."""
+        self._warn(error.reason, f'Dropped an event, {error.reason}: {error}')
+
+    def late_velocity(self) -> None:
+        """Tell that a velocity came too late to be put in order."""
+        text = 'A velocity came later than reorder_window allows and counts only from then on'
+        self._warn('late_velocity', text)
+
+    def repeated_ids(self, ids: Sequence[int]) -> None:
+        """Tell that an observation has several points of each of these ids."""
+        named = ', '.join(str(landmark_id) for landmark_id in ids[:MOST_NAMED])
+        more = ' and others' if len(ids) > MOST_NAMED else ''
+        text = f'Not used: an observation has several points of the ids {named}{more}'
+        self._warn('repeated_id', text)
+
+    def unknown_ids(self, gains: str) -> None:
+        """Tell that these gains can't use points without an id."""
+        text = f'Points without an id are not used by {gains} gains, only by riccati'
+        self._warn('unknown_id', text)
+
+    def moved_landmarks(self, ids: IntArray) -> None:
+        """Tell that landmarks are not any more where they were."""
+        self._warn('moved_landmark', f'Landmarks {ids.tolist()} have moved')
+
+    def lost_places(self, counts: Mapping[str, int]) -> None:
+        """Tell that the robot is not where it was taken to be, if ``counts`` say so once more."""
+        for name, text in LOST_PLACES.items():
+            if counts[name] > self._places[name]:
+                self._warn(name, text)
+                self._places[name] = counts[name]
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Count one more of a kind; ``text`` is logged if their number is a power of ten."""
+        self._counts[kind] += 1
+        count = self._counts[kind]
+        if str(count).rstrip('0') == '1':
+            logger.warning('%s (%d so far).', text, count)
