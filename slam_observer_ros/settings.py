@@ -11,7 +11,7 @@ Vector3 = tuple[float, float, float]
 
 
 MAX_DELAY_S = 1.0
-"""Delay of velocities, either way, that is made up for at most."""
+"""Delay of velocities that is made up for at most."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from strategies import generators
 from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.gains.calibration import Calibration
+from slam_observer_ros.gains.calibration import Calibration, LEAST_DELAY_S
 from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
@@ -138,11 +138,24 @@ def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
     assert np.mean(errors_m) < np.mean(errors_left_m)
 
 
+def test_velocities_stamped_far_too_late_do_not_throw_the_pose():
+    settings = Settings(
+        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_error=0.3
+    )
+    left_alone = replace(settings, velocity_delay_error=0.0)
+    worlds = [drive(settings, 60.0, seed, delay_ns=-3 * DELAY_NS) for seed in range(4)]
+    errors_m, errors_left_m = (
+        [configuration_error_m(estimate(world, some), world) for world in worlds]
+        for some in (settings, left_alone)
+    )
+    assert np.mean(errors_m) < np.mean(errors_left_m)
+
+
 def test_a_delay_stays_within_what_is_made_up_for():
     calibration = Calibration(Settings(velocity_delay_error=0.1), PLANAR)
-    for change_s in (-5.0, 10.0):
+    for change_s, limit_s in ((-5.0, LEAST_DELAY_S), (10.0, MAX_DELAY_S)):
         calibration.shift(np.array([change_s]))
-        assert calibration.delay_ns == np.sign(change_s) * round(MAX_DELAY_S * 1e9)
+        assert calibration.delay_ns == round(limit_s * 1e9)
 
 
 def test_the_velocity_that_is_told_is_the_one_that_moves_the_pose():

@@ -228,7 +228,8 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
     broken = tmp_path / 'broken.yaml'
     broken.write_text('landmarks: []')
     elsewhere = tmp_path / 'hall.yaml'
-    elsewhere.write_text(SURVEYED.replace('frame: map', 'frame: hall') + '- {id: 1, position: [0, 0, 0]}')
+    landmark = '- {id: 1, position: [0, 0, 0]}'
+    elsewhere.write_text(SURVEYED.replace('frame: map', 'frame: hall') + landmark)
     with running('observer_node', tmp_path / 'log'):
         assert call(ros, 'save_map').message == "no file is named: set the parameter 'map_path'"
         for path, reason in (
