@@ -36,8 +36,9 @@ class Accuracy:
     configuration_rmse_m : float or None
         See :class:`ConfigurationError`, metres.
     anees : float or None
-        Of the pose, per degree of freedom; None where the gains know no covariance, too, and in
-        a known map: the first pose there is no certain one, to which the truth could be moved.
+        Of the pose, per degree of freedom; None where the gains know no covariance, too, and
+        where no pose is certain to which the truth could be moved: in a known map, or if the
+        truth begins too late.
 
     """
 
@@ -51,15 +52,12 @@ class Accuracy:
 def measure(result: Replay, truth: Truth) -> Accuracy:
     """Compare a replay with the truth."""
     pose_truth = Trajectory(truth.stamps_ns, truth.poses)
-    anees = None
-    if result.pose_covariances is not None and not result.in_known_map:
-        anees = anchored_average_nees(result.trajectory, result.pose_covariances, pose_truth)
     return Accuracy(
         _pose_errors('trajectory', result.trajectory, pose_truth),
         _pose_errors('dead reckoning', result.dead_reckoning, pose_truth),
         _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
         result.configuration.rmse_m,
-        anees,
+        _anees(result, pose_truth),
     )
 
 
@@ -95,6 +93,16 @@ def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> Trajecto
         return trajectory_errors(estimate, truth)
     except EvaluationError as error:
         logger.warning('The %s is not compared with the truth: %s', name, error)
+        return None
+
+
+def _anees(result: Replay, truth: Trajectory) -> float | None:
+    if result.pose_covariances is None or result.in_known_map:
+        return None
+    try:
+        return anchored_average_nees(result.trajectory, result.pose_covariances, truth)
+    except EvaluationError as error:
+        logger.warning('No ANEES is told: %s', error)
         return None
 
 

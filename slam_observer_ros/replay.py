@@ -130,7 +130,7 @@ class _Run:
         self._in_known_map = landmark_map is not None
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
-        self._landmark_truth = truth.landmarks if truth else None
+        self._landmark_tracks = truth.tracks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
         self._observations = self._used_points = 0
         self._jumps = self._events = 0
@@ -214,7 +214,7 @@ class _Run:
         self._used_points = used
 
     def _compare(self, update: Update) -> None:
-        if self._pose_truth is None or self._landmark_truth is None:
+        if self._pose_truth is None or self._landmark_tracks is None:
             return
         true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
         if covered[0]:
@@ -224,5 +224,5 @@ class _Run:
                 self._estimator.landmark_ids,
                 self._estimator.world_points,
                 true_poses[0],
-                self._landmark_truth,
+                self._landmark_tracks.at(update.stamp_ns),
             )

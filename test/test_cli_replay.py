@@ -18,8 +18,9 @@ from tum_files import read_tum
 import yaml
 
 from slam_observer_ros.cli import main
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, PoseTruth, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.simulation import Scenario, Simulation
 
 REPORT_KEYS = {
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
@@ -114,6 +115,41 @@ class TestReport:
             'anees', 'localised_after_s',
         }  # fmt: skip
         assert 'no truth to compare with' in slam_observer('replay', path).output
+
+    def test_the_configuration_error_is_that_of_landmarks_where_they_are(
+        self, slam_observer, tmp_path
+    ):
+        path = tmp_path / 'moving.mcap'
+        scenario = Scenario(duration=10.0, landmark_speed=0.3, initial_bias=0.0)
+        simulation = Simulation(scenario, ros.STAMP_NS)
+        with RecordingWriter(path) as writer:
+            for delivery in simulation.deliveries():
+                event = delivery.event
+                if isinstance(event, VelocityEvent):
+                    writer.write_velocity(event)
+                elif isinstance(event, PoseTruth):
+                    writer.write_pose(event)
+                    truth = simulation.landmark_truth(event.stamp_ns)
+                    writer.write_landmarks(event.stamp_ns, truth)
+                else:
+                    writer.write_observation(event)
+        report = slam_observer('replay', path, '--json').json
+        assert report['configuration_rmse_m'] < 0.02
+
+    def test_the_share_of_the_trajectory_that_the_truth_covers_is_told(
+        self, slam_observer, tmp_path
+    ):
+        path = tmp_path / 'half.mcap'
+        with RecordingWriter(path) as writer:
+            for event in recordings.events():
+                if isinstance(event, VelocityEvent):
+                    writer.write_velocity(event)
+                else:
+                    writer.write_observation(event)
+            for truth in list(recordings.true_poses())[:50]:
+                writer.write_pose(truth)
+        told = slam_observer('replay', path).output
+        assert re.search(r'truth +│ covers (49|50)\.\d % of the trajectory', told)
 
     def test_truth_at_another_time_is_no_truth(self, slam_observer, tmp_path):
         path = tmp_path / 'run.mcap'

@@ -179,11 +179,44 @@ def test_anchored_nees_ignores_the_worlds_and_starts_at_zero(
 ) -> None:
     estimate, truth = random_pair(rng)
     covariances = np.tile(np.eye(6), (len(STAMPS_NS), 1, 1))
+    covariances[0] = 0.0
     here = consistency.anchored_average_nees(estimate, covariances, truth)
     there = consistency.anchored_average_nees(estimate, covariances, truth.moved(G))
     assert here == pytest.approx(there, rel=1e-6)
     exact = consistency.anchored_average_nees(truth.moved(G), covariances, truth)
     assert exact == pytest.approx(0.0, abs=1e-15)
+
+
+def test_the_anees_is_honest_or_not_told_where_the_truth_begins_late() -> None:
+    """What counts is not how late, but how uncertain the pose is by then."""
+    rng = np.random.default_rng(0)
+    steps = np.diag([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
+    told = []
+    for _ in range(100):
+        random = rng.normal(size=(len(STAMPS_NS), 6)) @ steps
+        random[:5] = 0.0  # it stands still
+        walk = np.cumsum(random, axis=0)
+        covariances = np.maximum(np.arange(len(STAMPS_NS)) - 4, 0)[:, None, None] * steps**2
+        rest = np.tile(np.eye(4), (len(STAMPS_NS), 1, 1))
+        truth = Trajectory(STAMPS_NS, rest)
+        moved = se3.pose(se3.exp(walk)[:, :3, :3], walk[:, 3:])
+        estimate = Trajectory(STAMPS_NS, moved)
+        for start in (0, 4):
+            late = Trajectory(STAMPS_NS[start:], rest[start:])
+            told.append(consistency.anchored_average_nees(estimate, covariances, late))
+        for start in (7, 30):
+            late = Trajectory(STAMPS_NS[start:], truth.poses[start:])
+            with pytest.raises(EvaluationError, match=r'begins .* s after the estimate'):
+                consistency.anchored_average_nees(estimate, covariances, late)
+    assert 0.7 < np.mean(told) < 1.3
+
+
+@pytest.mark.parametrize('count', [0, 1, 2])
+def test_so_few_poses_that_any_truth_fits_have_no_error(count: int) -> None:
+    estimate, truth = random_pair(np.random.default_rng(0))
+    few = Trajectory(estimate.stamps_ns[:count], estimate.poses[:count])
+    with pytest.raises(EvaluationError, match=f'{count} of its {count} poses .* it takes 3'):
+        metrics.trajectory_errors(few, truth)
 
 
 def test_a_report_is_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:

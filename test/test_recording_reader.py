@@ -8,6 +8,7 @@ from pathlib import Path
 import shutil
 
 import numpy as np
+from numpy.testing import assert_allclose
 import pytest
 import recordings
 import ros_messages as ros
@@ -424,6 +425,25 @@ def test_last_position_of_a_true_landmark_counts(tmp_path):
         landmarks = recording.truth(recording.find_topics()).landmarks
     assert landmarks.ids.tolist() == [7, 8]
     assert landmarks.world_points[:, 0].tolist() == [1.0, 2.0]
+
+
+def test_true_landmarks_that_move_are_where_they_are_at_the_time(tmp_path):
+    path = tmp_path / 'moving.mcap'
+    with RecordingWriter(path) as writer:
+        writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
+        writer.write_observation(ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3))))
+        for second, ids in enumerate(([7], [7], [7, 8], [7, 8])):
+            points = np.full((len(ids), 3), float(max(second - 1, 0)))
+            stamp_ns = ros.STAMP_NS + second * 1_000_000_000
+            writer.write_landmarks(stamp_ns, LandmarkTruth(np.array(ids), points))
+    with open_recording(path) as recording:
+        tracks = recording.truth(recording.find_topics()).tracks
+    assert tracks.ids.tolist() == [7, 8]
+    at_rest_s, between_s, end_s, later_s = 0.0, 2.5, 3.0, 9.0
+    for time_s, x in ((at_rest_s, (0, 1)), (between_s, (1.5, 1.5)), (end_s, (2, 2)),
+                      (later_s, (2, 2))):  # fmt: skip
+        landmarks = tracks.at(ros.STAMP_NS + int(time_s * 1e9))
+        assert_allclose(landmarks.world_points[:, 0], x)
 
 
 def test_bag_of_several_files_is_read_whole(tmp_path):

@@ -31,6 +31,9 @@ MALFORMED = 'malformed'
 MOST_UNMAPPED = 0.5
 """Share of the points beyond which they are more than what a map lacks."""
 
+NEARLY_ALL = 0.99
+"""Share of the trajectory that the truth covers, up to which it is told."""
+
 LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
 """What befalls landmarks that are in the map."""
 
@@ -289,6 +292,14 @@ def _told_points(counts: Counter[str]) -> str:
     return ', '.join(told)
 
 
+def _covered_rows(outcome: Outcome) -> dict[str, str]:
+    """Tell of how much of the trajectory the figures are, if not of nearly all."""
+    errors = outcome.accuracy.pose_errors
+    if errors is None or errors.covered.mean() > NEARLY_ALL:
+        return {}
+    return {'truth': f'covers {100.0 * errors.covered.mean():.1f} % of the trajectory'}
+
+
 def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
     report = outcome.report
     figures = {
@@ -311,7 +322,7 @@ def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
         ),
         'smoothed: landmark error, RMS': (outcome.smoothed_landmark_rmse_m, 'm after alignment'),
     }
-    rows = {
+    rows = _covered_rows(outcome) | {
         name: f'{value:.3f} {unit}' for name, (value, unit) in figures.items() if value is not None
     }
     if rows:

@@ -174,7 +174,7 @@ def _print_summary(args: argparse.Namespace, result: SimulatedRun) -> None:
         'landmarks': str(result.landmark_tracks.shape[1]),
         'log10 L, first': f'{result.log10_lyapunov[0]:.2f}',
         'log10 L, last': f'{result.log10_lyapunov[-1]:.2f}',
-        'slope of log10 L': 'none: L is only rounding'
+        'slope of log10 L': 'none: too few values of L that are more than rounding'
         if slope is None
         else f'{slope:.4f} per second after the transient',
     }

@@ -10,6 +10,10 @@ from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.units import to_s
+
+MOST_OF_ANCHOR = 0.1
+"""ANEES that the anchor's own error may make up at most; 1 is what all errors together have."""
 
 _SINGULAR = 1e-12
 """Eigenvalues of a correlation matrix below this are zero but for rounding."""
@@ -129,9 +133,35 @@ def anchored_average_nees(
     float or None
         As :func:`average_nees`; None where the truth covers no pose.
 
+    Raises
+    ------
+    EvaluationError
+        The truth begins when the pose is uncertain already.
+
     """
     paired, true_paired, covered = associate(estimate, truth)
     if len(paired) == 0:
         return None
+    if _nees_of_anchor(paired, covariances[covered]) > MOST_OF_ANCHOR:
+        late_s = to_s(paired.stamps_ns[0] - estimate.stamps_ns[0])
+        raise EvaluationError(
+            f'the truth begins {late_s:.1f} s after the estimate, when the pose is uncertain '
+            'already'
+        )
     anchored = true_paired.moved(paired.poses[0] @ se3.inverse(true_paired.poses[0]))
     return average_nees(pose_errors(paired.poses, anchored.poses), covariances[covered])
+
+
+def _nees_of_anchor(estimate: Trajectory, covariances: FloatArray) -> float:
+    """Return what the first pose's error adds to the ANEES if the truth is moved onto it.
+
+    It turns all other poses about the first one, and shifts them.
+    """
+    variances, directions = np.linalg.eigh(covariances[0])
+    turns, shifts = np.split(
+        directions.T * np.sqrt(np.maximum(variances, 0.0))[:, None], 2, axis=1
+    )
+    arms = estimate.positions - estimate.positions[0]
+    moved = shifts + np.cross(turns, arms[:, None])
+    errors = np.concatenate([np.broadcast_to(turns, moved.shape), moved], axis=2)
+    return average_nees(errors, covariances[:, None]) or 0.0

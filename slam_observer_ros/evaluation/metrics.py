@@ -8,10 +8,14 @@ import numpy as np
 
 from slam_observer_ros.evaluation.alignment import align
 from slam_observer_ros.evaluation.errors import EvaluationError
-from slam_observer_ros.evaluation.trajectory import associate, Trajectory
+from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
 from slam_observer_ros.events import LandmarkTruth
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.units import to_s
+
+LEAST_POSES = 3
+"""Fewer positions can be aligned without an error left."""
 
 
 def root_mean_square(errors: FloatArray) -> float:
@@ -86,12 +90,15 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
     Raises
     ------
     EvaluationError
-        The truth covers no pose of the estimate.
+        The truth covers fewer than three poses of the estimate: others fit in any case.
 
     """
     paired, true_paired, covered = associate(estimate, truth)
-    if len(paired) == 0:
-        raise EvaluationError('no pose of the estimate is at a time that the truth covers')
+    if len(paired) < LEAST_POSES:
+        raise EvaluationError(
+            f'{len(paired)} of its {len(estimate)} poses are at times that the truth covers, '
+            f'where true poses are no more than {to_s(MAX_GAP_NS)} s apart; it takes {LEAST_POSES}'
+        )
     alignment = align(paired.positions, true_paired.positions)
     aligned = paired.moved(alignment)
     errors = pose_errors(aligned.poses, true_paired.poses)

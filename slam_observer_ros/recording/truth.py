@@ -18,7 +18,60 @@ from slam_observer_ros.types import FloatArray, IntArray
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkTracks:
+    """Where landmarks truly were, at the times from when on they were told to be elsewhere.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (j,) the times, nanoseconds; one where all are at rest.
+    ids : IntArray
+        (n,) landmark ids.
+    world_points : FloatArray
+        (j, n, 3) their positions in the world, metres; of one that was not told of yet, its first.
+
+    """
+
+    stamps_ns: IntArray
+    ids: IntArray
+    world_points: FloatArray
+
+    @classmethod
+    def from_messages(cls, messages: Iterable[ObservationMessage]) -> LandmarkTracks | None:
+        """Gather positions of any order; None if no message has a landmark."""
+        stamps_ns: list[int] = []
+        states: list[dict[int, tuple[float, ...]]] = [{}]
+        for event in sorted((message.event for message in messages), key=lambda e: e.stamp_ns):
+            told = dict(zip(event.ids.tolist(), map(tuple, event.points.tolist()), strict=True))
+            told.pop(UNKNOWN_ID, None)
+            if not told.items() <= states[-1].items():
+                stamps_ns.append(event.stamp_ns)
+                states.append(states[-1] | told)
+        ids = sorted(states[-1])
+        first: dict[int, tuple[float, ...]] = {}
+        for state in reversed(states):
+            first |= state
+        points = [[state.get(i, first[i]) for i in ids] for state in states[1:]]
+        return cls(np.array(stamps_ns), np.array(ids), np.array(points)) if ids else None
+
+    def at(self, stamp_ns: int) -> LandmarkTruth:
+        """Return where they were, in a line from one position to the next."""
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right'))
+        before, after = max(after - 1, 0), min(after, len(self.stamps_ns) - 1)
+        start_ns, end_ns = self.stamps_ns[[before, after]].tolist()
+        share = (stamp_ns - start_ns) / (end_ns - start_ns) if end_ns > start_ns else 0.0
+        points = (1.0 - share) * self.world_points[before] + share * self.world_points[after]
+        return LandmarkTruth(self.ids, points if share else self.world_points[before])
+
+    def flattened(self, height_m: float) -> LandmarkTracks:
+        """Return it with all landmarks at one height."""
+        points = self.world_points.copy()
+        points[..., 2] = height_m
+        return replace(self, world_points=points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Truth:
     """What the estimate is compared with, in the axes of the recording's world frame.
 
@@ -28,14 +81,19 @@ class Truth:
         (k,) strictly increasing stamps of the true poses, nanoseconds.
     poses : FloatArray
         (k, 4, 4) true poses, body to world; k is 0 if the recording has none.
-    landmarks : LandmarkTruth or None
-        True landmark positions; None if the recording has none.
+    tracks : LandmarkTracks or None
+        Where the landmarks truly were; None if the recording doesn't tell.
 
     """
 
     stamps_ns: IntArray
     poses: FloatArray
-    landmarks: LandmarkTruth | None
+    tracks: LandmarkTracks | None
+
+    @property
+    def landmarks(self) -> LandmarkTruth | None:
+        """True landmark positions at the end; None if the recording has none."""
+        return None if self.tracks is None else self.tracks.at(int(self.tracks.stamps_ns[-1]))
 
     @classmethod
     def from_messages(
@@ -44,7 +102,7 @@ class Truth:
         base_in: Mapping[str, FloatArray],
         landmarks: Iterable[ObservationMessage],
     ) -> Truth:
-        """Gather poses of any order, and landmarks of which the last position counts.
+        """Gather poses and landmarks of any order.
 
         ``base_in`` has the pose (4, 4) of the robot's base in each frame whose poses these are.
         """
@@ -52,15 +110,14 @@ class Truth:
         stamps_ns, order = np.unique(stamps_ns, return_index=True)
         bases = np.array([base_in[message.child_frame_id] for message in poses])
         world_poses = pose_stack(poses) @ bases.reshape(-1, 4, 4)
-        return cls(stamps_ns, world_poses[order], _gathered_landmarks(landmarks))
+        return cls(stamps_ns, world_poses[order], LandmarkTracks.from_messages(landmarks))
 
     def flattened(self) -> Truth:
         """Return it with the landmarks at the robot's height, where a planar map has them."""
-        if self.landmarks is None:
+        if self.tracks is None:
             return self
-        points = self.landmarks.world_points.copy()
-        points[:, 2] = np.median(self.poses[:, 2, 3]) if len(self.poses) else 0.0
-        return replace(self, landmarks=replace(self.landmarks, world_points=points))
+        height_m = float(np.median(self.poses[:, 2, 3])) if len(self.poses) else 0.0
+        return replace(self, tracks=self.tracks.flattened(height_m))
 
 
 def base_in_frames(
@@ -85,14 +142,3 @@ def base_in_frames(
                 error,
             )
     return base_in
-
-
-def _gathered_landmarks(messages: Iterable[ObservationMessage]) -> LandmarkTruth | None:
-    positions: dict[int, FloatArray] = {}
-    for message in messages:
-        positions |= zip(message.event.ids.tolist(), message.event.points, strict=True)
-    positions.pop(UNKNOWN_ID, None)
-    if not positions:
-        return None
-    ids = np.array(sorted(positions), dtype=np.int64)
-    return LandmarkTruth(ids, np.array([positions[landmark_id] for landmark_id in ids]))
