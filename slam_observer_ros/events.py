@@ -32,7 +32,8 @@ class VelocityEvent:
         (6,) angular then linear velocity (Ω, v) as in the paper's (9), in the base frame,
         rad/s and m/s.
     covariance : FloatArray or None
-        (6, 6) covariance of ``body_velocity``, same order and units squared; None if unknown.
+        (6, 6) covariance of ``body_velocity``, same order and units squared; None if unknown. A
+        part, angular or linear, of which it is all zero is unknown as well.
 
     """
 
@@ -77,7 +78,8 @@ class ObservationEvent:
     points : FloatArray
         (m, 3) positions in the base frame, metres.
     covariances : FloatArray or None
-        (m, 3, 3) covariance of each point in the base frame, m²; None if unknown.
+        (m, 3, 3) covariance of each point in the base frame, m²; None if unknown, and all zero
+        for a point of which it is.
     velocities : FloatArray or None
         (m, 3) velocity of each landmark itself, expressed in the base frame, m/s (the paper's
         v_i (19)); None for static landmarks.

@@ -55,5 +55,10 @@ def move_velocity(event: VelocityEvent, pose: FloatArray) -> VelocityEvent:
 
     """
     Ad = se3.adjoint(pose)
-    covariance = None if event.covariance is None else Ad @ event.covariance @ Ad.T
+    covariance = event.covariance
+    if covariance is not None:
+        is_linear_known = covariance[3:, 3:].any()
+        covariance = Ad @ covariance @ Ad.T
+        if not is_linear_known:  # what the lever arm adds to it would pass for all of it
+            covariance[3:] = covariance[:, 3:] = 0.0
     return replace(event, body_velocity=Ad @ event.body_velocity, covariance=covariance)

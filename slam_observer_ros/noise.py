@@ -77,18 +77,24 @@ class NoiseModel(Immutable):
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
 
-    def observation(self, event: ObservationEvent) -> FloatArray:
+    def observation(self, event: ObservationEvent, sights: FloatArray | None = None) -> FloatArray:
         """Return the covariances (m, 3, 3) of an observation's points, body frame, m².
 
         All of them can be inverted, even if a message or a point at the sensor itself says that
-        some direction is known exactly.
+        some direction is known exactly. ``sights`` (m, 3) lead from the sensor to where points of
+        unknown covariance should be; default where they were measured.
         """
+        sights = event.sights if sights is None else sights
         if event.covariances is None:
-            return self.at(event.sights)
+            return self.at(sights)
         # Else far points that are said to be exact are lost beside an uncertain heading.
         squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
         least = RELATIVE_RESOLUTION**2 * squared_m2
-        return _invertible(event.covariances + least[:, None, None] * _IDENTITY)
+        covariances = _invertible(event.covariances + least[:, None, None] * _IDENTITY)
+        unknown = ~event.covariances.any(axis=(1, 2))
+        if unknown.any():
+            covariances[unknown] = self.at(sights[unknown])
+        return covariances
 
     def at(self, sights: FloatArray) -> FloatArray:
         """Return what the settings say of points that a message has no covariances for.

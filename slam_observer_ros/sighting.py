@@ -111,8 +111,9 @@ class Outlook:
 
     def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:
         """Return what there is to look back at later."""
-        stated = None if event.covariances is None else self._noise.observation(event)
-        return Seen(event.stamp_ns, rows, event.points, self._sights(event, rows), stated)
+        sights = self._sights(event, rows)
+        stated = None if event.covariances is None else self._noise.observation(event, sights)
+        return Seen(event.stamp_ns, rows, event.points, sights, stated)
 
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return the covariances (m, 3, 3) of observed points, body frame, m².
@@ -121,9 +122,7 @@ class Outlook:
         measured too near would be believed more than one measured too far, and all would be
         drawn towards the robot.
         """
-        if event.covariances is not None:
-            return self._noise.observation(event)
-        return self._noise.at(self._sights(event, rows))
+        return self._noise.observation(event, self._sights(event, rows))
 
     def _sights(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return where points should be (m, 3), from the sensor, metres, body frame.

@@ -235,7 +235,12 @@ class _Joined:
         self.since_ns[rows] = [[velocity.stamp_ns] for velocity, _ in events]
         for row, (velocity, angular) in enumerate(events, first):
             if velocity.covariance is not None:
-                self.covariances[row], self.is_stated[row] = velocity.covariance, True
+                angular_part, linear_part = (
+                    velocity.covariance[:3, :3],
+                    velocity.covariance[3:, 3:],
+                )
+                self.covariances[row] = velocity.covariance
+                self.is_stated[row] = angular_part.any(), linear_part.any()
             if angular is not None:
                 self._write_angular(row, angular)
 

@@ -13,7 +13,7 @@ from strategies import generators
 from slam_observer_ros.axes import SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation
+from slam_observer_ros.extrinsics import move_observation, move_velocity
 from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.noise import NoiseModel
@@ -188,6 +188,30 @@ def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
     assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize('unknown', [slice(0, 3), slice(3, 6)], ids=['angular', 'linear'])
+def test_the_part_of_a_velocity_whose_covariance_is_zero_has_the_settings_noise(unknown):
+    """Also where the sensor is off the base, and its turns move the base."""
+    stated = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    stated[unknown] = 0.0
+    sensor = se3.pose(np.eye(3), np.array([0.3, 0.1, 0.0]))
+    history = VelocityHistory(10**9)
+    history.append(move_velocity(VelocityEvent(0, np.ones(6), stated), sensor))
+    (Q,) = NoiseModel(Settings()).motion(history.held(0, 10**8))
+    (expected,) = NoiseModel(Settings()).motion(held(np.ones((1, 6)), [0.1]))
+    np.testing.assert_allclose(Q[unknown, unknown], expected[unknown, unknown])
+    known = slice(3, 6) if unknown.start == 0 else slice(0, 3)
+    np.testing.assert_allclose(Q[known, known], stated[known, known] * 0.1**2)
+
+
+def test_a_point_whose_covariance_is_zero_has_the_settings_noise():
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
+    covariances = np.array([np.zeros((3, 3)), np.diag([0.1, 0.2, 0.3])])
+    event = ObservationEvent(0, np.arange(2), points, covariances)
+    found = NoiseModel(Settings()).observation(event)
+    np.testing.assert_array_equal(found[0], observed(points)[0])
+    np.testing.assert_allclose(found[1], covariances[1], rtol=1e-4, atol=1e-9)
+
+
 def test_no_motion_has_no_covariances():
     assert NoiseModel(Settings()).motion(held(np.empty((0, 6)), [])).shape == (0, 6, 6)
 
@@ -302,7 +326,8 @@ def awkward_observations():
         'next to the sensor': ([[1e-9, 0.0, 0.0], [1.0, 2.0, 0.0]], None),
         'straight above': ([[0.0, 0.0, 2.0], [1.0, 2.0, 0.0]], None),
         'very far': ([[1e6, 1e6, 0.0], [1.0, 2.0, 0.0]], None),
-        'all exact': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], np.zeros((3, 3))),
+        'all unknown': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], np.zeros((3, 3))),
+        'all exact': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], np.diag([1e-300] * 3)),
         'exact height': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], np.diag([0.1, 0.1, 0.0])),
         'known but for a line': ([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]], on_a_line.astype(float)),
     }
