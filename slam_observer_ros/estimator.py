@@ -30,7 +30,7 @@ from slam_observer_ros.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_ns, to_s
-from slam_observer_ros.validation import check_event
+from slam_observer_ros.validation import check_event, check_map, check_pose
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class Estimator:
     Raises
     ------
     ParameterError
-        If a setting does not fit its table.
+        If a setting does not fit its table, or the pose is none.
 
     """
 
@@ -107,7 +107,14 @@ class Estimator:
             (4, 4) body to world. By default the one of the settings, if there is one; otherwise
             identity, or unknown in a map that was loaded.
 
+        Raises
+        ------
+        ParameterError
+            If the pose is no rigid motion.
+
         """
+        if pose is not None:
+            check_pose(pose)
         self._start_pose = pose
         # By somebody, so that the settings don't say any more where it is.
         self._is_placed = pose is not None
@@ -160,7 +167,15 @@ class Estimator:
         pose_covariance : FloatArray, optional
             (6, 6) covariance of ``pose`` as :attr:`pose_covariance` has it; default exact.
 
+        Raises
+        ------
+        MapError, ParameterError
+            If the map, or the pose or its covariance, can't be right; nothing is changed then.
+
         """
+        check_map(landmark_map)
+        if pose is not None:
+            check_pose(pose, pose_covariance)
         self._frame.load(landmark_map)
         if pose is not None:
             self.set_pose(pose, pose_covariance)
@@ -181,7 +196,13 @@ class Estimator:
         covariance : FloatArray, optional
             (6, 6) its covariance, as :attr:`pose_covariance` has it; default exact.
 
+        Raises
+        ------
+        ParameterError
+            If one of them can't be right; nothing is changed then.
+
         """
+        check_pose(pose, covariance)
         self._catch_up()
         self._is_placed = True
         self._frame.set_pose(pose, covariance)

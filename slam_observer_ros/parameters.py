@@ -184,9 +184,11 @@ def checked(settings: SettingsT) -> SettingsT:
     Raises
     ------
     ParameterError
-        If a value does not fit the table.
+        If a value does not fit the table, or these are no settings.
 
     """
+    if not dataclasses.is_dataclass(settings):
+        raise ParameterError(f'settings are wanted, not a {type(settings).__name__}')
     return from_parameters(type(settings), dataclasses.asdict(settings))
 
 

@@ -1,10 +1,10 @@
-"""Refuses events that can't be used, before they touch the state."""
+"""Refuses events and poses that can't be used, before they touch the state."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.errors import InvalidEventError, MapError, ParameterError
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
@@ -12,10 +12,17 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.types import FloatArray, IntArray
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 """Relative error of a covariance whose message has it in single precision."""
+
+ROTATION_TOLERANCE = 1e-3
+"""How far RᵀR of a pose may be from identity: much further than single precision puts it."""
+
+LARGEST_STAMP_NS = 2**63 - 1
+"""What fits into the integers of numpy."""
 
 LARGEST = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
@@ -31,17 +38,66 @@ def check_event(event: Event) -> None:
         ``'not_finite'``, ``'too_large'``, ``'negative_id'`` or ``'bad_covariance'``.
 
     """
+    if not isinstance(event, Event):
+        raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
     if not isinstance(event.stamp_ns, int | np.integer):
         reason = f'stamp {event.stamp_ns!r} is no integer: stamps are in nanoseconds'
         raise InvalidEventError('wrong_type', reason)
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
+    if event.stamp_ns > LARGEST_STAMP_NS:
+        raise InvalidEventError('too_large', f'stamp {event.stamp_ns} ns is beyond 64 bits')
     if isinstance(event, VelocityEvent):
         _check_velocity(event.body_velocity, event.covariance, 6)
     elif isinstance(event, AngularVelocityEvent):
         _check_velocity(event.angular_velocity, event.covariance, 3)
     else:
         _check_observation(event)
+
+
+def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
+    """Check that ``pose`` is a rigid motion (4, 4), and its ``covariance`` (6, 6) is one.
+
+    Raises
+    ------
+    ParameterError
+        If one of them is not.
+
+    """
+    try:
+        _check_array('pose', pose, (4, 4))
+        if covariance is not None:
+            _check_array('pose covariance', covariance, (6, 6))
+            _check_definite('pose covariance', covariance)
+    except InvalidEventError as error:
+        raise ParameterError(str(error)) from error
+    R = pose[:3, :3]
+    is_rotation = np.abs(R.T @ R - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0
+    if not is_rotation or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
+        raise ParameterError('pose: no matrix [[R, x], [0, 1]] with a rotation R')
+
+
+def check_map(landmark_map: LandmarkMap) -> None:
+    """Check a map's shapes and values.
+
+    Raises
+    ------
+    MapError
+        If an array does not fit, a value can't be right, or an id is there twice.
+
+    """
+    try:
+        ids, n = landmark_map.ids, len(landmark_map.ids)
+        _check_array('map ids', ids, (n,))
+        _check_array('map counts', landmark_map.counts, (n,))
+        _check_array('map points', landmark_map.world_points, (n, 3))
+        if landmark_map.covariances is not None:
+            _check_array('map covariances', landmark_map.covariances, (n, 3, 3))
+            _check_definite('map covariances', landmark_map.covariances)
+    except InvalidEventError as error:
+        raise MapError(str(error)) from error
+    if len(np.unique(ids)) < n:
+        raise MapError('an id is there more than once in the map')
 
 
 def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: int) -> None:
@@ -58,7 +114,7 @@ def _check_observation(event: ObservationEvent) -> None:
         raise InvalidEventError('wrong_type', 'landmark ids are not an array of integers')
     _check_coordinates('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
-        raise InvalidEventError('wrong_shape', f'{len(event.ids)} ids for {m} landmark points')
+        raise InvalidEventError('wrong_shape', f'ids {event.ids.shape} for {m} landmark points')
     negative = [i for i in event.ids.tolist() if i < 0 and i != UNKNOWN_ID]
     if negative:
         raise InvalidEventError('negative_id', f'landmark id {negative[0]} is negative')
@@ -82,7 +138,7 @@ def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> 
         raise InvalidEventError('too_large', f'an entry of the {name} is beyond {LARGEST:g}')
 
 
-def _check_array(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+def _check_array(name: str, array: FloatArray | IntArray, shape: tuple[int, ...]) -> None:
     if not isinstance(array, np.ndarray) or array.dtype.kind not in 'fiu':
         raise InvalidEventError('wrong_type', f'{name}: no numpy array of numbers')
     if array.shape != shape:

@@ -9,17 +9,19 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 import numpy as np
+from numpy.testing import assert_array_equal
 import pytest
 
-from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.errors import MapError, ParameterError
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.event_queue import CONFIRMATIONS
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.hypotheses import Hypotheses
+from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import Slam
 from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
@@ -270,6 +272,10 @@ def bad_events():
         ('wrong_type', VelocityEvent(stamp_ns, BODY_VELOCITY.tolist())),
         ('wrong_type', ObservationEvent(stamp_ns, np.array([1.5, 2.0]), points)),
         ('wrong_type', ObservationEvent(stamp_ns, [1, 2], points)),
+        ('wrong_type', None),
+        ('wrong_type', PoseTruth(stamp_ns, np.eye(4))),
+        ('too_large', VelocityEvent(2**70, BODY_VELOCITY)),
+        ('wrong_shape', ObservationEvent(stamp_ns, np.array(1), points)),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, points.tolist())),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, None)),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, points.astype(str))),
@@ -551,3 +557,56 @@ def test_only_settings_that_may_change_while_running_do():
     with pytest.raises(ParameterError, match='gains, confirmations can only be set'):
         estimator.change_settings(Settings(gains='constant', confirmations=9, gain_k=7.0))
     assert estimator.settings == Settings(gain_k=1.0, rejection_distance=4.0)
+
+
+def test_what_is_no_settings_is_refused():
+    with pytest.raises(ParameterError, match='settings are wanted, not a dict'):
+        Estimator({'gains': 'riccati'})
+
+
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ('pose', 'covariance'),
+    [
+        (np.full((4, 4), np.nan), None),
+        (2.0 * np.eye(4), None),
+        (MIRRORED, None),
+        (np.eye(3), None),
+        (np.eye(4).tolist(), None),
+        (np.eye(4), -np.eye(6)),
+        (np.eye(4), np.eye(3)),
+    ],
+    ids=['NaN', 'scaled', 'mirrored', '3 × 3', 'list', 'negative', 'small'],
+)
+def test_no_pose_that_can_not_be_right_is_taken(pose, covariance):
+    estimator = Estimator(Settings())
+    with pytest.raises(ParameterError, match='pose'):
+        estimator.set_pose(pose, covariance)
+    surveyed = LandmarkMap(np.arange(2), np.ones((2, 3)), None, np.zeros(2, dtype=np.int64))
+    with pytest.raises(ParameterError, match='pose'):
+        estimator.load_map(surveyed, pose, covariance)
+    if covariance is None:
+        with pytest.raises(ParameterError, match='pose'):
+            Estimator(Settings(), pose)
+    assert estimator.is_localised
+    assert_array_equal(estimator.pose, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'reason'),
+    [
+        ({'world_points': np.full((2, 3), np.nan)}, 'map points is NaN'),
+        ({'world_points': np.zeros((1, 3))}, r'map points: shape \(1, 3\)'),
+        ({'ids': np.array([7, 7])}, 'more than once'),
+        ({'counts': np.zeros(1, dtype=np.int64)}, 'map counts: shape'),
+        ({'covariances': -np.tile(np.eye(3), (2, 1, 1))}, 'negative eigenvalue'),
+    ],
+)
+def test_no_map_that_can_not_be_right_is_taken(changes, reason):
+    good = LandmarkMap(np.arange(2), np.ones((2, 3)), None, np.zeros(2, dtype=np.int64))
+    estimator = Estimator(Settings())
+    with pytest.raises(MapError, match=reason):
+        estimator.load_map(replace(good, **changes))
+    assert estimator.is_localised
