@@ -25,6 +25,9 @@ def generate_launch_description():
                 'imu', default_value='imu', description='topic of the angular velocity'
             ),
             DeclareLaunchArgument(
+                'map', default_value='map', description='topic of the landmark map'
+            ),
+            DeclareLaunchArgument(
                 'namespace', default_value='', description='namespace of the robot'
             ),
             DeclareLaunchArgument('use_sim_time', default_value='false'),
@@ -41,6 +44,7 @@ def generate_launch_description():
                     ('twist', LaunchConfiguration('twist')),
                     ('landmarks', LaunchConfiguration('landmarks')),
                     ('imu', LaunchConfiguration('imu')),
+                    ('map', LaunchConfiguration('map')),
                 ],
                 output='screen',
             ),
