@@ -1,10 +1,12 @@
 """Which landmarks the points of an observation are, where the sensor gave no ids.
 
-An *assignment* takes each such point for a landmark, or for a new one. A point whose id is new
-may be of a landmark that had none so far. What matters about it is
+An *assignment* takes each such point for a landmark, or for a new one. What matters about it is
 where it puts the robot: among those that agree on that, within what the sensor can tell, the most
 likely one is taken. Those that don't agree are all returned, for later observations to decide
 (:mod:`slam_observer_ros.hypotheses`).
+
+A point whose id is new may be of a landmark that had none so far. Only where the state foretells
+that landmark as well as the sensor can tell: an id that is new speaks for one that is.
 """
 
 from __future__ import annotations
@@ -104,9 +106,10 @@ def find_assignments(
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
     is_new_id = (ids != UNKNOWN_ID) & (landmarks.rows_of(ids) < 0)
     certain = nearly & ~is_new_id[at]
-    lonely_cost = (m - len(np.unique(at))) * unpaired_cost(gate)
+    unpaired_costs = np.where(is_new_id, unpaired_cost(RESOLUTION), unpaired_cost(gate))
+    lonely_cost = float(np.delete(unpaired_costs, at).sum())
     margin = 0.0 if certain.all() else MARGIN
-    search = JointSearch(pairs, certain, gate, margin, budget - lonely_cost)
+    search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - lonely_cost)
     J = np.linalg.inv(np.linalg.cholesky(noise[:, :k, :k])) @ axes.output_matrix(points)
     assignments: list[Assignment] = []
     moves: list[FloatArray] = []

@@ -133,8 +133,8 @@ class JointSearch:
         The pairs to choose from.
     certain : BoolArray
         (q,) pairs whose point is of a known landmark in any case, if not of this then of another.
-    gate : float
-        Mahalanobis distance at which a point is as likely to be of no known landmark.
+    unpaired_costs : FloatArray
+        (q,) what the pair's point costs if it is of no known landmark.
     margin, budget : float
         How much more than the cheapest a pairing may cost, and how much at all.
 
@@ -144,13 +144,13 @@ class JointSearch:
         self,
         pairs: Pairs,
         certain: BoolArray,
-        gate: float,
+        unpaired_costs: FloatArray,
         margin: float,
         budget: float = math.inf,
     ) -> None:
         self._pairs = pairs
         self._certain = certain
-        self._unpaired_cost = unpaired_cost(gate)
+        self._unpaired_costs = unpaired_costs
         self._margin, self._budget = margin, budget
         points, counts = np.unique(pairs.points, return_counts=True)
         # Points with the fewest options first: they are the surest, and the others follow them.
@@ -202,7 +202,7 @@ class JointSearch:
         rises[self._are_taken(pairings, options)] = np.inf
         rises -= self._noise_log_dets[options]
         is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
-        without = np.where(is_certain, np.inf, self._unpaired_cost)
+        without = np.where(is_certain, np.inf, self._unpaired_costs[options[0]])
         costs = np.array([[one.cost] for one in pairings]) + np.column_stack([rises, without])
         rows = np.concatenate([-corners @ so3.transpose(W) @ L[:, None], corners], axis=3)
         return _Extensions(pairings, options, costs, rows, tails)
@@ -229,7 +229,7 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
 
 
 def unpaired_cost(gate: float) -> float:
-    """Return what a point costs that is taken for no known landmark."""
+    """Return what a point costs of no known landmark, as likely as a pair at ``gate`` σ is."""
     return float(huber_loss(gate))
 
 

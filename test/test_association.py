@@ -350,13 +350,15 @@ def test_where_few_pairings_are_possible_the_search_finds_the_cheapest(seed, poi
         if len({at[i] for i in chosen}) == len({rows[i] for i in chosen}) == count
     ]
     pairs = Pairs(at, rows, r, S, noise)
-    certain = np.zeros(q, dtype=bool)
-    found = JointSearch(pairs, certain, gate, np.inf).pairings()
+    certain, unpaired_costs = np.zeros(q, dtype=bool), np.full(q, huber_loss(gate))
+    found = JointSearch(pairs, certain, unpaired_costs, np.inf).pairings()
     least = min(cost(chosen) for chosen in possible)
     assert found[0].cost == pytest.approx(least)
     assert found[0].cost == pytest.approx(cost(found[0].chosen))
     assert len(found) == min(len(possible), MAX_PARTIAL)
-    costs = [pairing.cost for pairing in JointSearch(pairs, certain, gate, 10.0).pairings()]
+    costs = [
+        pairing.cost for pairing in JointSearch(pairs, certain, unpaired_costs, 10.0).pairings()
+    ]
     assert costs == sorted(costs)
     assert costs[-1] <= costs[0] + 10.0
 
@@ -435,7 +437,8 @@ def test_many_points_seen_after_a_blind_stretch_are_told_apart_together(seed):
     joint, own = C[rows].reshape(-1, 3) * deviations, sigma_m**2 * np.eye(2)
     S = joint @ joint.T + np.kron(np.eye(len(at)), own)
     pairs = Pairs(at, rows, points[at] - landmarks[rows], S, np.tile(own, (len(at), 1, 1)))
-    found = JointSearch(pairs, np.zeros(len(at), dtype=bool), 6.0, MARGIN).pairings()
+    certain, unpaired_costs = np.zeros(len(at), dtype=bool), np.full(len(at), huber_loss(6.0))
+    found = JointSearch(pairs, certain, unpaired_costs, MARGIN).pairings()
     assert len(found[0].chosen) == 16
     assert_array_equal(at[found[0].chosen], rows[found[0].chosen])
 
