@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from hashlib import blake2b
 import heapq
 from typing import TypeAlias
@@ -18,6 +19,12 @@ CONFIRMATIONS = 5
 NEAR_NS = 1_000_000_000
 """Stamps nearer than this to the newest one tell of no pause or jump, nanoseconds."""
 
+RECENT = 1000
+"""Events that tell how far ahead of their reception stamps are.
+
+More than inputs keep while the node is busy: those were received late, and tell of no delay.
+"""
+
 LEAST_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
 
@@ -32,7 +39,8 @@ class EventQueue:
 
     A stamp ahead by more than events may be late would make all that follow too late if it were
     wrong. Unless events come that seldom, it waits until time has come there, or until others
-    say that there was a pause.
+    say that there was a pause. How long it may be is not limited by ``max_jump_ns`` if nothing was
+    received for as long: then it was a silence, not the clock.
 
     Parameters
     ----------
@@ -62,6 +70,7 @@ class EventQueue:
         self._stray_ns = 0
         # The newest stamp that is taken, believed or not; how far the believed one moved last.
         self._lead_ns = self._step_ns = 0
+        self._ahead_of_reception_ns: deque[int] = deque(maxlen=RECENT)
         self.newest_ns: int | None = None
 
     def push(self, event: Event) -> bool:
@@ -81,18 +90,20 @@ class EventQueue:
         usual_ns = min(max(self._near_ns, 2 * self._step_ns), self._max_jump_ns)
         is_near = -self._near_ns <= ahead_ns <= usual_ns
         too_late = ahead_ns < -self._reach_ns
-        too_early = stamp_ns > self._lead_ns + self._max_jump_ns
+        too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
         if too_late or too_early:
             if not is_near and self._is_confirmed(stamp_ns):
                 return True
             raise _refusal(ahead_ns)
         self._insert(event)
         if is_near:
+            self._note_reception(event)
             self._strays = 0
             self._believe(max(self.newest_ns, stamp_ns))
             return False
         self._lead_ns = max(self._lead_ns, stamp_ns)
         if self._is_confirmed(stamp_ns):
+            self._note_reception(event)
             self._believe(self._lead_ns)
         return False
 
@@ -128,6 +139,17 @@ class EventQueue:
         oldest_ns = (self.newest_ns or 0) - self._reach_ns
         self._known = {key for key in self._known if key[0] >= oldest_ns}
         self._most_known = max(2 * len(self._known), LEAST_KNOWN)
+
+    def _note_reception(self, event: Event) -> None:
+        if event.receive_ns is not None:
+            self._ahead_of_reception_ns.append(event.stamp_ns - event.receive_ns)
+
+    def _was_silent(self, event: Event) -> bool:
+        """Return whether the time of reception has gone on as far as the stamp, or nearly."""
+        if event.receive_ns is None or not self._ahead_of_reception_ns:
+            return False
+        expected_ns = event.receive_ns + max(self._ahead_of_reception_ns)
+        return event.stamp_ns <= expected_ns + self._max_jump_ns
 
     def _believe(self, newest_ns: int) -> None:
         step_ns = newest_ns - (self.newest_ns or 0)

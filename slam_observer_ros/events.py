@@ -34,12 +34,15 @@ class VelocityEvent:
     covariance : FloatArray or None
         (6, 6) covariance of ``body_velocity``, same order and units squared; None if unknown. A
         part, angular or linear, of which it is all zero is unknown as well.
+    receive_ns : int or None
+        When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
 
     """
 
     stamp_ns: int
     body_velocity: FloatArray
     covariance: FloatArray | None = None
+    receive_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +60,15 @@ class AngularVelocityEvent:
         (3,) in the base frame, rad/s.
     covariance : FloatArray or None
         (3, 3) its covariance, rad²/s²; None if unknown.
+    receive_ns : int or None
+        When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
 
     """
 
     stamp_ns: int
     angular_velocity: FloatArray
     covariance: FloatArray | None = None
+    receive_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +92,8 @@ class ObservationEvent:
     sensor : FloatArray or None
         (m, 3) where each was measured from, in the base frame, metres: noise grows with the
         distance from there. None for the base itself.
+    receive_ns : int or None
+        When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
 
     """
 
@@ -95,6 +103,7 @@ class ObservationEvent:
     covariances: FloatArray | None = None
     velocities: FloatArray | None = None
     sensor: FloatArray | None = None
+    receive_ns: int | None = None
 
     @property
     def sights(self) -> FloatArray:

@@ -363,6 +363,19 @@ def test_events_released_in_between_leave_one_stamp_ahead_waiting():
     assert not estimator.dropped
 
 
+def test_a_silence_of_both_sensors_erases_no_map_but_a_jump_of_the_clock_does():
+    """Both have the same stamps; time of reception tells them apart."""
+    before, after = drive(), [observation(60.0 + 0.05 * step) for step in range(20)]
+    for receive_s, jumps in ((60.0, 0), (4.0, 1)):
+        received = [replace(event, receive_ns=event.stamp_ns) for event in before]
+        received += [
+            replace(event, receive_ns=START_NS + round(receive_s * 1e9)) for event in after
+        ]
+        estimator = run(received)
+        assert estimator.jumps == jumps
+        assert (estimator.landmark_counts.max() > 20) == (not jumps)
+
+
 def test_an_empty_observation_moves_the_state_on_and_nothing_else():
     empty = ObservationEvent(START_NS + 10**9, np.empty(0, dtype=np.int64), np.empty((0, 3)))
     estimator = run([velocity(0.0), empty], velocity_timeout=2.0)

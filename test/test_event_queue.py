@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +20,10 @@ START_NS = 1_700_000_000 * SECOND
 
 def velocity(stamp_ns):
     return VelocityEvent(START_NS + stamp_ns, np.zeros(6))
+
+
+def received(event, receive_ns):
+    return dataclasses.replace(event, receive_ns=receive_ns)
 
 
 def observation(stamp_ns, ids=(1,)):
@@ -165,6 +170,46 @@ def test_a_pause_is_believed_when_enough_events_agree_and_none_of_them_is_lost()
         assert not queue.push(event)
         assert queue.newest_ns == event.stamp_ns
     assert queue.pop_all() == events
+
+
+LONG_NS = 900 * SECOND
+
+
+def before_and_after_a_silence(received_before_ns=0):
+    """Events at 50 Hz for a second, and for another one after a silence of 15 minutes."""
+    before, after = dense(SECOND), [velocity(LONG_NS + n * SECOND // 50) for n in range(50)]
+    delayed = [received(event, 7 * n + received_before_ns) for n, event in enumerate(before)]
+    return delayed, [received(event, LONG_NS + SECOND) for event in after]
+
+
+def test_a_silence_of_any_length_is_no_jump_of_the_clock():
+    before, after = before_and_after_a_silence()
+    assert filled(*before, *after).pop_all() == [*before, *after]
+
+
+def test_what_was_received_only_after_a_silence_does_not_make_it_a_jump():
+    before, after = before_and_after_a_silence()
+    kept = [received(event, LONG_NS) for event in before[30:]]
+    assert filled(*before[:30], *kept, *after).newest_ns == after[-1].stamp_ns
+
+
+def test_a_stamp_ahead_waits_after_a_silence_and_is_refused_where_there_was_none():
+    before, after = before_and_after_a_silence()
+    queue = filled(*before, after[0])
+    assert queue.newest_ns == before[-1].stamp_ns
+    with pytest.raises(InvalidEventError):
+        queue.push(received(velocity(LONG_NS + 20 * SECOND), LONG_NS + SECOND))
+    with pytest.raises(InvalidEventError):
+        filled(*before).push(received(velocity(12 * SECOND), SECOND))
+
+
+def test_stamps_that_go_on_further_than_time_does_are_a_jump_of_the_clock():
+    before, after = before_and_after_a_silence(received_before_ns=LONG_NS - 5 * SECOND)
+    queue = filled(*before)
+    for event in after[: CONFIRMATIONS - 1]:
+        with pytest.raises(InvalidEventError):
+            queue.push(event)
+    assert queue.push(after[CONFIRMATIONS - 1])
 
 
 def test_where_events_come_seldom_none_waits_for_others():

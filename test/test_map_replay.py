@@ -40,12 +40,14 @@ def record(
     """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
 
     At each step ids go up from ``first_id``, and the landmarks' world is ``scale`` times as large.
+    Messages are received every 0.1 s, whatever their stamps.
     """
     random = np.random.default_rng(seed)
     with RecordingWriter(path) as writer:
         for step in range(80):
             noise = random.normal(scale=0.01, size=6)
-            writer.write_velocity(VelocityEvent(stamp_ns(step), BODY_VELOCITY + noise))
+            velocity = VelocityEvent(stamp_ns(step), BODY_VELOCITY + noise)
+            writer.write_velocity(velocity, receive_stamp_ns=step * 10**8)
             pose = start @ se3.exp(BODY_VELOCITY * 0.1 * step)
             writer.write_pose(PoseTruth(stamp_ns(step), pose))
             near = np.linalg.norm(LANDMARKS - pose[:3, 3], axis=1) < 6.0
@@ -53,7 +55,8 @@ def record(
             points = se3.transform(se3.inverse(pose), points)
             points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
             ids = first_id(step) + seen if has_ids else np.full(len(seen), UNKNOWN_ID)
-            writer.write_observation(ObservationEvent(stamp_ns(step), ids, points))
+            observation = ObservationEvent(stamp_ns(step), ids, points)
+            writer.write_observation(observation, receive_stamp_ns=step * 10**8)
     return path
 
 

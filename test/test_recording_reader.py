@@ -39,6 +39,8 @@ def paths(tmp_path_factory) -> dict[str, Path]:
 def assert_same_events(actual: list[Event], expected: list[Event]) -> None:
     assert [type(event) for event in actual] == [type(event) for event in expected]
     for one, other in zip(actual, expected, strict=True):
+        assert one.receive_ns is not None
+        other = dataclasses.replace(other, receive_ns=one.receive_ns)
         for name, value in dataclasses.asdict(other).items():
             np.testing.assert_array_equal(getattr(one, name), value)
 

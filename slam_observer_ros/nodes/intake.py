@@ -145,7 +145,7 @@ class Intake:
 
     def _use(self, event: Event) -> None:
         start_s = time.perf_counter()
-        self._estimator.add(event)
+        self._estimator.add(replace(event, receive_ns=time.monotonic_ns()))
         self._processing_s += time.perf_counter() - start_s
         self._processed += 1
 

@@ -164,10 +164,12 @@ class Recording:
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:
                 self._insert(transforms, raw, is_static=False)
-            yield from builder.retry(raw.receive_stamp_ns)
+            events = builder.retry(raw.receive_stamp_ns)
             if raw.topic in decoders:
                 for measured in self._decoded(raw, decoders[raw.topic]) or ():
-                    yield from builder.add(self._timed(measured, raw), raw.receive_stamp_ns)
+                    events += builder.add(self._timed(measured, raw), raw.receive_stamp_ns)
+            for event in events:
+                yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
         yield from builder.finish()
 
     def frames(
