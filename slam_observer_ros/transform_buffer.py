@@ -19,6 +19,9 @@ from slam_observer_ros.units import to_s
 HISTORY_NS = 10_000_000_000
 """How far back transforms are kept, nanoseconds; tf2's default."""
 
+ALWAYS_NS = 2**63 - 1
+"""Newest stamp of what is static, nanoseconds."""
+
 
 @dataclass(slots=True)
 class _Track:
@@ -94,14 +97,33 @@ class TransformBuffer:
             If the frames are not connected, or not at that time.
 
         """
+        target_chain, source_chain = self._chains(target, source)
+        return se3.inverse(self._pose(target_chain, stamp_ns)) @ self._pose(source_chain, stamp_ns)
+
+    def newest_ns(self, target: str, source: str) -> int | None:
+        """Return the newest stamp at which both frames are known, nanoseconds.
+
+        None if they are not connected; :data:`ALWAYS_NS` if all between them is static.
+        """
+        try:
+            chains = self._chains(target, source)
+        except TransformError:
+            return None
+        tracks = [self._tracks[frame] for chain in chains for frame in chain]
+        moving = (track.stamps_ns[-1] for track in tracks if not track.is_static)
+        return min(moving, default=ALWAYS_NS)
+
+    def _chains(self, target: str, source: str) -> tuple[list[str], list[str]]:
+        """Return the frames from each of the two up to below the first that both have above."""
         target, source = target.lstrip('/'), source.lstrip('/')
         target_chain, source_chain = self._ancestry(target), self._ancestry(source)
         common = next((frame for frame in source_chain if frame in target_chain), None)
         if common is None:
             raise TransformError(f"'{source}' and '{target}' are not connected on /tf")
-        target_pose = self._pose(target_chain[: target_chain.index(common)], stamp_ns)
-        source_pose = self._pose(source_chain[: source_chain.index(common)], stamp_ns)
-        return se3.inverse(target_pose) @ source_pose
+        return (
+            target_chain[: target_chain.index(common)],
+            source_chain[: source_chain.index(common)],
+        )
 
     def _ancestry(self, frame: str) -> list[str]:
         """Return the frame, its parent, and so on up to the root."""

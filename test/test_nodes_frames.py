@@ -24,10 +24,12 @@ from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.nodes import frames
+from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.recording.messages import pose_matrices
 from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 from slam_observer_ros.simulation import Scenario, Simulation
+from slam_observer_ros.transform_buffer import ALWAYS_NS
 
 pytestmark = pytest.mark.ros
 
@@ -172,6 +174,12 @@ def test_observations_wait_for_their_transform_and_are_dropped_without(ros, tmp_
         Robot(ros, namespace='/late', sensor_frame_id='turret') as robot,
     ):
         ros.wait_for_subscriber(sender.dynamic)
+
+        def found():
+            return {
+                (t.header.frame_id, t.child_frame_id) for m in transforms for t in m.transforms
+            }
+
         now_ns = ros.node.get_clock().now().nanoseconds
         point = np.array([[1.0, 2.0, 3.0]])
         robot.send(VelocityEvent(now_ns, np.zeros(6)))
@@ -188,11 +196,12 @@ def test_observations_wait_for_their_transform_and_are_dropped_without(ros, tmp_
             lambda: _values(diagnostics).get('dropped: no_transform') == '1', 'the drop'
         )
         node.wait_for_output("no_transform.*'base_link' to 'turret' is known from")
+        node.wait_for_output("publishing 'map' to 'base_link'")  # 2 s after the first pose
+        ros.spin_until(lambda: ('map', 'base_link') in found(), 'the transform')
     assert known_ids(maps).tolist() == [1]
     assert_allclose(landmarks(maps), [[-1.0, 1.0, 3.0]], atol=1e-6)
     assert "publishing 'map' to 'base_link' on /tf: nobody publishes 'odom'" in node.output
-    found = {(t.header.frame_id, t.child_frame_id) for m in transforms for t in m.transforms}
-    assert found == {('base_link', 'turret'), ('map', 'base_link')}
+    assert found() == {('base_link', 'turret'), ('map', 'base_link')}
 
 
 def _values(diagnostics):
@@ -212,6 +221,11 @@ class FakeBuffer:
         stamped.transform.rotation.w = 1.0
         return stamped
 
+    def get_latest_common_time(self, target, source):
+        if source not in ('camera', 'mast'):
+            raise LookupError(f'"{source}" does not exist')
+        return SimpleNamespace(nanoseconds=42 if source == 'camera' else 0)
+
     def clear(self):
         """Forget nothing."""
 
@@ -222,9 +236,24 @@ def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
     )
     monkeypatch.setattr(frames, 'tf2_ros', fake)
     node = Mock()
-    transforms = frames.open_transforms(node)
+    transforms = frames.open_transforms(node, ('map', 'base'))
     assert fake.TransformListener.call_args.args[1] is node
     assert_allclose(transforms.lookup('base', 'camera', 42)[:3, 3], [42.0, 0.0, 0.0])
     with pytest.raises(TransformError, match='does not exist'):
         transforms.lookup('base', 'sonar', 42)
+    assert transforms.newest_ns('base', 'camera') == 42
+    assert transforms.newest_ns('base', 'mast') == ALWAYS_NS
+    assert transforms.newest_ns('base', 'sonar') is None
     transforms.clear()
+
+
+def test_the_nodes_own_transform_takes_no_other_ones_place():
+    node = Mock()
+    transforms = frames.TopicTransforms(node, ('map', 'base_link'))
+    receive = node.create_subscription.call_args_list[0].args[2]
+    for parent in ('odom', 'map'):
+        header = header_message(SECOND, parent)
+        transform = TransformStamped(header=header, child_frame_id='base_link')
+        receive(serialize_message(TFMessage(transforms=[transform])))
+    assert transforms.newest_ns('odom', 'base_link') == SECOND
+    assert transforms.newest_ns('map', 'base_link') is None

@@ -13,7 +13,7 @@ from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.transform_buffer import HISTORY_NS, TransformBuffer
+from slam_observer_ros.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
 
 SECOND = 1_000_000_000
 
@@ -53,6 +53,17 @@ def test_nothing_is_extrapolated_and_old_transforms_are_forgotten():
     buffer.insert('odom', 'base', 2 * SECOND + HISTORY_NS, np.eye(4))
     with pytest.raises(TransformError):
         buffer.lookup('odom', 'base', SECOND)
+
+
+def test_the_newest_stamp_of_a_chain_is_that_of_its_oldest_link():
+    buffer = TransformBuffer()
+    buffer.insert('odom', 'base', 3 * SECOND, np.eye(4))
+    buffer.insert('base', 'turret', 2 * SECOND, np.eye(4))
+    buffer.insert('turret', 'camera', 0, np.eye(4), is_static=True)
+    assert buffer.newest_ns('odom', 'base') == 3 * SECOND
+    assert buffer.newest_ns('/odom', 'camera') == buffer.newest_ns('camera', 'odom') == 2 * SECOND
+    assert buffer.newest_ns('turret', 'camera') == ALWAYS_NS
+    assert buffer.newest_ns('map', 'base') is None
 
 
 def test_unconnected_frames_and_loops_are_errors():

@@ -13,7 +13,7 @@ from slam_observer_ros.errors import MessageError, TransformError
 from slam_observer_ros.nodes.transforms import TFMessage
 from slam_observer_ros.recording.frames import insert_transforms, TransformSource
 from slam_observer_ros.recording.messages import decode_transforms, pose_matrices
-from slam_observer_ros.transform_buffer import TransformBuffer
+from slam_observer_ros.transform_buffer import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.types import FloatArray
 
 try:
@@ -32,13 +32,18 @@ class TopicTransforms:
     ----------
     node : Node
         Node that subscribes; without tf2_msgs no transform is ever known.
+    own : tuple of str
+        Parent and child of the transform that the node itself publishes where nobody else tells
+        the child's parent: heard back, it would take the place of another parent.
 
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, own: tuple[str, str]) -> None:
         self._node = node
+        self._own = own
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
+        self.newest_ns = self._buffer.newest_ns
         self.clear = self._buffer.clear
         if TFMessage is not None:
             self._subscribe('/tf', TF_QOS, is_static=False)
@@ -53,7 +58,8 @@ class TopicTransforms:
                     f"malformed message on '{topic}' dropped: {error}", throttle_duration_sec=10.0
                 )
                 return
-            insert_transforms(self._buffer, transforms, is_static=is_static)
+            others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
+            insert_transforms(self._buffer, others, is_static=is_static)
 
         self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
 
@@ -84,7 +90,19 @@ class Tf2Transforms:
             np.array([position.x, position.y, position.z]), np.array([q.x, q.y, q.z, q.w])
         )
 
+    def newest_ns(self, target: str, source: str) -> int | None:
+        """As :meth:`TransformSource.newest_ns`."""
+        try:
+            newest_ns: int = self._buffer.get_latest_common_time(target, source).nanoseconds
+        except tf2_ros.TransformException:
+            return None
+        return newest_ns or ALWAYS_NS  # tf2 has zero for what is static
 
-def open_transforms(node: Node) -> TransformSource:
-    """Return tf2_ros's buffer where ROS provides it, else a listener of our own."""
-    return TopicTransforms(node) if tf2_ros is None else Tf2Transforms(node)
+
+def open_transforms(node: Node, own: tuple[str, str]) -> TransformSource:
+    """Return tf2_ros's buffer where ROS provides it, else a listener of our own.
+
+    ``own`` are parent and child of what the node itself may publish.
+    """
+    # tf2 keeps the parent of each stamp, so that one does not take the place of another.
+    return TopicTransforms(node, own) if tf2_ros is None else Tf2Transforms(node)

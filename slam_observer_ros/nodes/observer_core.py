@@ -52,7 +52,7 @@ class ObserverCore:
         estimator_settings = read_settings(node, Settings)
         self._estimator = Estimator(estimator_settings)
         self._jumps_followed = 0
-        self._transforms = open_transforms(node)
+        self._transforms = open_transforms(node, (settings.map_frame, settings.base_frame))
         self._intake = Intake(
             node, settings, self._estimator, BaseFrame(settings, self._transforms)
         )

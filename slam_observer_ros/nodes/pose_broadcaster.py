@@ -14,13 +14,20 @@ from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.nodes.transforms import TransformPublisher
 from slam_observer_ros.recording.frames import TransformSource
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import to_ns
+from slam_observer_ros.units import to_ns, to_s
 
 DISCOVERY_S = 2.0
-"""How long to look for odom to base on /tf before the base is taken to have no parent there."""
+"""How long, from the first pose on, to look for odom to base on /tf before the base is taken to
+have no parent there."""
 
-MAX_WAITING = 25
-"""Most poses that wait for odometry of their time."""
+MAX_WAITING_NS = 10_000_000_000
+"""How long a pose waits for odometry of its time, nanoseconds: as long as tf keeps transforms."""
+
+LATE_NS = 500_000_000
+"""Odometry that is further behind the poses than this is reported, nanoseconds."""
+
+REPORT_PERIOD_S = 10.0
+"""Shortest time between two reports of odometry that is behind."""
 
 
 class PoseBroadcaster:
@@ -28,8 +35,8 @@ class PoseBroadcaster:
 
     Nothing goes out before it is known who is the base frame's parent. Where that is the odometry
     frame, its correction goes out post-dated by ``transform_tolerance``, so that it holds until
-    the next one; while the observer is paused, the last correction is repeated. A frame is never
-    published twice with one stamp.
+    the next one; while the observer is paused, the last correction is repeated. Odometry that
+    begins later takes over. A frame is never published twice with one stamp.
 
     Parameters
     ----------
@@ -38,7 +45,12 @@ class PoseBroadcaster:
     settings : ObserverNodeSettings
         Frames and tolerances.
     transforms : TransformSource
-        Where the odometry is.
+        Where the odometry is, without what is published here.
+
+    Attributes
+    ----------
+    trouble : str
+        Why no correction goes out, or late ones do; empty while all is well.
 
     """
 
@@ -50,24 +62,32 @@ class PoseBroadcaster:
         self._transforms = transforms
         self._publisher = TransformPublisher(node, '/tf', RELIABLE_QOS)
         self._tolerance_ns = to_ns(settings.transform_tolerance)
-        self._begin_s = time.monotonic()
+        self._begin_s: float | None = None
         self._child = '' if settings.odom_frame else settings.base_frame
-        self._waiting: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_WAITING)
+        self._waiting: deque[tuple[int, FloatArray]] = deque()
         self._correction: FloatArray | None = None
         self._last_ns: int | None = None
+        self.trouble = ''
 
     def add(self, stamp_ns: int, pose: FloatArray) -> None:
         """Publish a pose (4, 4) of the base in the map, now or once its odometry is there."""
+        if self._begin_s is None:
+            self._begin_s = time.monotonic()
         self._waiting.append((stamp_ns, pose))
+        while self._waiting[0][0] < stamp_ns - MAX_WAITING_NS:
+            self._waiting.popleft()
         self.retry()
 
     def retry(self) -> None:
         """Publish the newest pose that can be."""
-        if not self._waiting or self._publish_correction():
+        if not self._waiting:
             return
-        if not self._child and time.monotonic() - self._begin_s > DISCOVERY_S:
-            self._settle(self._settings.base_frame, 'nobody publishes')
-        if self._child == self._settings.base_frame:
+        newest_ns = self._odometry_ns()
+        self._find_parent(newest_ns)
+        self._look_for_delay(newest_ns)
+        if self._child == self._settings.odom_frame:
+            self._publish_correction(newest_ns)
+        elif self._child:
             stamp_ns, pose = self._waiting.pop()
             self._waiting.clear()
             self._publish(stamp_ns, pose)
@@ -81,26 +101,52 @@ class PoseBroadcaster:
         """Begin anew, as after a reset or a jump of the clock."""
         self._waiting.clear()
         self._correction = None
+        self.trouble = ''
 
-    def _publish_correction(self) -> bool:
-        """Publish the newest correction that the odometry known by now gives."""
+    def _odometry_ns(self) -> int | None:
+        """Return the newest stamp of the odometry on /tf; None if it has none."""
         settings = self._settings
-        for index in reversed(range(len(self._waiting) if settings.odom_frame else 0)):
-            stamp_ns, pose = self._waiting[index]
-            try:
-                odometry = self._transforms.lookup(
-                    settings.odom_frame, settings.base_frame, stamp_ns
-                )
-            except TransformError:
-                continue
-            for _ in range(index + 1):
-                self._waiting.popleft()
-            if self._child != settings.odom_frame:
-                self._settle(settings.odom_frame, '/tf has')
-            self._correction = pose @ se3.inverse(odometry)
-            self._publish(stamp_ns + self._tolerance_ns, self._correction)
-            return True
-        return False
+        if not settings.odom_frame:
+            return None
+        return self._transforms.newest_ns(settings.odom_frame, settings.base_frame)
+
+    def _find_parent(self, newest_ns: int | None) -> None:
+        """Look who is the base's parent; odometry on /tf is, however late it comes."""
+        if newest_ns is not None and self._child != self._settings.odom_frame:
+            self._settle(self._settings.odom_frame, '/tf has')
+        searched_s = time.monotonic() - (self._begin_s or 0.0)
+        if not self._child and searched_s > DISCOVERY_S:
+            self._settle(self._settings.base_frame, 'nobody publishes')
+
+    def _look_for_delay(self, newest_ns: int | None) -> None:
+        """Report odometry that is far behind the poses, or has ended."""
+        settings = self._settings
+        self.trouble = ''
+        known_ns = self._waiting[0][0] if newest_ns is None else newest_ns
+        behind_ns = self._waiting[-1][0] - known_ns
+        if self._child != settings.odom_frame or behind_ns <= LATE_NS:
+            return
+        self.trouble = (
+            f"'{settings.odom_frame}' to '{settings.base_frame}' on /tf is "
+            f"{to_s(behind_ns):.1f} s behind the estimate: '{settings.map_frame}' to "
+            f"'{settings.odom_frame}' waits for it; look at what publishes it"
+        )
+        self._node.get_logger().warning(self.trouble, throttle_duration_sec=REPORT_PERIOD_S)
+
+    def _publish_correction(self, newest_ns: int | None) -> None:
+        """Publish the newest correction that the odometry known by now gives."""
+        settings, found = self._settings, None
+        while self._waiting and newest_ns is not None and self._waiting[0][0] <= newest_ns:
+            found = self._waiting.popleft()
+        if found is None:
+            return
+        stamp_ns, pose = found
+        try:
+            odometry = self._transforms.lookup(settings.odom_frame, settings.base_frame, stamp_ns)
+        except TransformError:  # it is of the time before the odometry began
+            return
+        self._correction = pose @ se3.inverse(odometry)
+        self._publish(stamp_ns + self._tolerance_ns, self._correction)
 
     def _settle(self, child: str, reason: str) -> None:
         self._child = child

@@ -52,6 +52,9 @@ class TransformSource(Protocol):
 
         """
 
+    def newest_ns(self, target: str, source: str) -> int | None:
+        """Return the newest stamp at which both frames are known, nanoseconds; None if never."""
+
     def clear(self) -> None:
         """Forget what has a time, after a jump of the clock."""
 

@@ -1,0 +1,133 @@
+"""Who is whose parent on /tf: odometry that begins later, is late, or ends."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from robots import pose_of, stamp_ns
+
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.nodes import pose_broadcaster
+from slam_observer_ros.nodes.pose_broadcaster import DISCOVERY_S, PoseBroadcaster
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.transform_buffer import TransformBuffer
+
+pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not installed')
+
+STEP_NS = 20_000_000
+POSE = se3.exp(np.array([0.0, 0.0, 0.3, 1.0, 2.0, 0.0]))
+ODOMETRY = se3.exp(np.array([0.0, 0.0, -0.2, 3.0, 1.0, 0.0]))
+
+
+class Robot:
+    """Poses at 50 Hz, and odometry on /tf while it is alive, ``lag_s`` late."""
+
+    def __init__(self, monkeypatch, rate_factor=1):
+        self.buffer = TransformBuffer()
+        self.node = Mock()
+        self.settings = ObserverNodeSettings()
+        self.now_ns = 1_000_000_000_000
+        self.step_ns = STEP_NS // rate_factor
+        clock = SimpleNamespace(monotonic=lambda: self.now_ns * 1e-9)
+        monkeypatch.setattr(pose_broadcaster, 'time', clock)
+        self.broadcaster = PoseBroadcaster(self.node, self.settings, self.buffer)
+
+    def wait(self, duration_s):
+        self.now_ns += round(duration_s * 1e9)
+
+    def run(self, duration_s, lag_s=None):
+        """Go on for a while; without lag there is no odometry."""
+        for _ in range(round(duration_s * 1e9 / self.step_ns)):
+            self.now_ns += self.step_ns
+            if lag_s is not None:
+                stamp = self.now_ns - round(lag_s * 1e9)
+                self.buffer.insert('odom', 'base_link', stamp, ODOMETRY)
+            self.broadcaster.add(self.now_ns, POSE)
+
+    def take(self):
+        """Return the transforms sent since the last time."""
+        publish = self.node.create_publisher.return_value.publish
+        sent = [call.args[0].transforms[0] for call in publish.call_args_list]
+        publish.reset_mock()
+        return sent
+
+    @property
+    def logged(self):
+        logger = self.node.get_logger.return_value
+        calls = logger.info.call_args_list + logger.warning.call_args_list
+        return ' '.join(call.args[0] for call in calls)
+
+
+@pytest.fixture
+def robot(monkeypatch):
+    return Robot(monkeypatch)
+
+
+def children(sent):
+    return {t.child_frame_id for t in sent}
+
+
+def test_the_search_for_odometry_begins_with_the_first_pose(robot):
+    robot.wait(100.0)
+    robot.run(DISCOVERY_S - 0.5)
+    assert not robot.take()
+    robot.run(1.0, lag_s=0.0)
+    sent = robot.take()
+    assert children(sent) == {'odom'}
+    np.testing.assert_allclose(
+        pose_of(sent[-1].transform), POSE @ se3.inverse(ODOMETRY), atol=1e-9
+    )
+
+
+def test_without_odometry_the_base_is_published_until_there_is_some(robot):
+    robot.run(DISCOVERY_S + 1.0)
+    assert children(robot.take()) == {'base_link'}
+    robot.run(1.0, lag_s=0.0)
+    assert children(robot.take()) == {'odom'}
+    assert "publishing 'map' to 'odom' on /tf: /tf has 'odom' to 'base_link'" in robot.logged
+
+
+@pytest.mark.parametrize('rate_factor', [1, 10])
+@pytest.mark.parametrize('lag_s', [0.1, 0.7, 3.0])
+def test_odometry_that_is_late_is_waited_for(monkeypatch, rate_factor, lag_s):
+    robot = Robot(monkeypatch, rate_factor)
+    robot.run(6.0, lag_s)
+    sent = robot.take()
+    assert children(sent) == {'odom'}
+    age_ns = robot.now_ns + round(robot.settings.transform_tolerance * 1e9) - stamp_ns(sent[-1])
+    assert age_ns == pytest.approx(lag_s * 1e9, abs=robot.step_ns)
+    assert (f'is {lag_s} s behind the estimate' in robot.broadcaster.trouble) == (lag_s > 0.5)
+
+
+def test_odometry_that_ends_is_reported_until_it_is_back(robot):
+    robot.run(1.0, lag_s=0.0)
+    assert not robot.broadcaster.trouble
+    robot.take()
+    robot.run(3.0)
+    assert not robot.take()
+    assert "'odom' to 'base_link' on /tf is 3.0 s behind" in robot.broadcaster.trouble
+    assert "'map' to 'odom' waits for it" in robot.logged
+    robot.run(0.1, lag_s=0.0)
+    assert not robot.broadcaster.trouble
+    assert children(robot.take()) == {'odom'}
+
+
+def test_odometry_that_does_not_come_back_after_a_jump_of_the_clock_is_reported(robot):
+    robot.run(1.0, lag_s=0.0)
+    robot.buffer.clear()
+    robot.broadcaster.forget()
+    robot.run(0.4)
+    assert not robot.broadcaster.trouble
+    robot.run(1.0)
+    assert 's behind' in robot.broadcaster.trouble
+
+
+def test_no_odometry_is_looked_for_unless_its_frame_is_named(robot):
+    settings = ObserverNodeSettings(odom_frame='')
+    robot.broadcaster = PoseBroadcaster(robot.node, settings, robot.buffer)
+    robot.run(0.1, lag_s=0.0)
+    assert children(robot.take()) == {'base_link'}
