@@ -114,6 +114,25 @@ def test_correction_of_the_odometry_holds_while_paused(ros, tmp_path):
     assert len(set(stamps)) == len(stamps)
 
 
+def test_odometry_that_ends_on_tf_is_told_by_log_and_diagnostics(ros, tmp_path):
+    if TFMessage is None:
+        pytest.skip('tf2_msgs is not installed')
+    diagnostics = Diagnostics(ros, '/stranded')
+    sender = TransformSender(ros, '/stranded')
+    with (
+        running('observer_node', tmp_path / 'log', *own_topics('/stranded')) as node,
+        Robot(ros, namespace='/stranded') as robot,
+    ):
+        ros.wait_for_subscriber(sender.dynamic)
+        sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=time.time_ns())
+        told = "'odom' to 'base_link' on /tf is .* s behind the estimate"
+        diagnostics.wait(
+            lambda d: robot.send_zeros() or re.search(told, d.status.message), 'the warning'
+        )
+        assert diagnostics.status.level == DiagnosticStatus.WARN
+        node.wait_for_output(told)
+
+
 def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
     maps = ros.collect(PointCloud2, '/forgetful/map', LATCHED_QOS)
     forget = ros.node.create_publisher(Int64, '/forgetful/observer_node/forget_landmark', 10)

@@ -14,6 +14,7 @@ from slam_observer_ros.estimates import MOST_REJECTED, point_share, UNUSED_POINT
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
+from slam_observer_ros.nodes.outputs import Outputs
 
 SILENT_S = 2.0
 """An input without messages for this long is a warning."""
@@ -41,6 +42,8 @@ class Diagnostics:
         Source of further drops, and of the clocks' offsets.
     inputs : sequence of Input
         Topics to watch.
+    outputs : Outputs
+        What can't be published.
 
     """
 
@@ -50,11 +53,13 @@ class Diagnostics:
         estimator: Estimator,
         intake: Intake,
         inputs: Sequence[Input[Any]],
+        outputs: Outputs,
     ) -> None:
         self._node = node
         self._estimator = estimator
         self._intake = intake
         self._inputs = inputs
+        self._outputs = outputs
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
@@ -128,6 +133,7 @@ class Diagnostics:
         warnings.append(self._rejections_warning(new))
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
+        warnings.append(self._outputs.trouble)
         if not self._estimator.is_localised:
             warnings.append('the place in the loaded map is not known yet: no pose is published')
         return [warning for warning in warnings if warning]

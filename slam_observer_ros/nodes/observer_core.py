@@ -58,7 +58,9 @@ class ObserverCore:
         )
         self._outputs = Outputs(node, settings, self._estimator, self._transforms)
         self._inputs = open_inputs(node, settings, self._intake)
-        self._diagnostics = Diagnostics(node, self._estimator, self._intake, self._inputs)
+        self._diagnostics = Diagnostics(
+            node, self._estimator, self._intake, self._inputs, self._outputs
+        )
         self._maps = Maps(node, settings, self._estimator, self._outputs.begin_anew)
         InitialPose(node, settings.map_frame, self._estimator, self._outputs.begin_anew)
         Controls(node, self._estimator, self._intake, self._outputs.begin_anew)

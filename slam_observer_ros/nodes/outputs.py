@@ -82,6 +82,11 @@ class Outputs:
         if settings.publish_tf:
             self._broadcaster = PoseBroadcaster(node, settings, transforms)
 
+    @property
+    def trouble(self) -> str:
+        """Why the transform is not published as it should be; empty while it is."""
+        return '' if self._broadcaster is None else self._broadcaster.trouble
+
     def publish_state(self) -> None:
         """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
         if self._broadcaster is not None:
