@@ -18,6 +18,7 @@ from robots import own_topics, pose_of, Robot, stamp_ns, TransformSender
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.nodes.conversions import header_message
@@ -153,6 +154,40 @@ def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
         robot.send(ObservationEvent(time.time_ns(), np.array([2]), np.ones((1, 3))))
         robot.send_zeros()
         ros.spin_until(lambda: ids(maps) == [0, 1, 2, 3], 'it again')
+
+
+def test_forgotten_landmarks_stay_neither_in_the_latched_map_nor_drawn(ros, tmp_path):
+    maps = ros.collect(PointCloud2, '/retracted/map', LATCHED_QOS)
+    markers = ros.collect(MarkerArray, '/retracted/markers')
+    forget = ros.node.create_publisher(Int64, '/retracted/observer_node/forget_landmark', 10)
+
+    def call(name):
+        assert ros.call(Trigger, f'/retracted/observer_node/{name}', Trigger.Request()).success
+
+    parameters = {'confirmations': 1, 'map_path': tmp_path / 'map.yaml'}
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/retracted', **parameters),
+        Robot(ros, namespace='/retracted') as robot,
+    ):
+        robot.run(RUN)
+        ros.spin_until(lambda: ids(maps) == [0, 1, 2, 3] and markers, 'four landmarks')
+        call('save_map')
+        call('pause')
+        ros.wait_for_subscriber(forget)
+        forget.publish(Int64(data=2))
+        ros.spin_until(lambda: ids(maps) == [0, 1, 3], 'three landmarks')
+        for service in ('reset', 'load_map'):
+            call(service)
+            ros.spin_until(lambda: not ids(maps), 'an empty map')
+            ros.spin_until(lambda: len(markers[-1].markers) == 1, 'no markers')
+            assert markers[-1].markers[0].action == Marker.DELETEALL
+            call('resume')
+            robot.send_zeros()
+            robot.send(ObservationEvent(time.time_ns(), np.array([7]), np.ones((1, 3))))
+            robot.send_zeros()
+            if service == 'reset':
+                ros.spin_until(lambda: ids(maps) == [7], 'a new landmark')
+        assert not ids(maps), 'published before the place in the loaded map is known'
 
 
 DELAYED = ('-p', 'velocity_delay_error:=0.1')

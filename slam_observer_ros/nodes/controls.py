@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from rclpy.node import Node
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.intake import Intake
+from slam_observer_ros.nodes.outputs import Outputs
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
 
 
@@ -24,18 +23,16 @@ class Controls:
         What is steered.
     intake : Intake
         What is paused.
-    on_reset : callable
-        Called after the estimate has begun anew.
+    outputs : Outputs
+        What has to follow.
 
     """
 
-    def __init__(
-        self, node: Node, estimator: Estimator, intake: Intake, on_reset: Callable[[], None]
-    ) -> None:
+    def __init__(self, node: Node, estimator: Estimator, intake: Intake, outputs: Outputs) -> None:
         self._node = node
         self._estimator = estimator
         self._intake = intake
-        self._on_reset = on_reset
+        self._outputs = outputs
         node.create_service(Trigger, '~/reset', self._reset)
         node.create_service(Trigger, '~/pause', self._pause)
         node.create_service(Trigger, '~/resume', self._resume)
@@ -43,7 +40,7 @@ class Controls:
 
     def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._estimator.reset()
-        self._on_reset()
+        self._outputs.begin_anew()
         return self._answer(response, 'pose and what was mapped are forgotten')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -64,6 +61,8 @@ class Controls:
     def _forget(self, message: Int64) -> None:
         self._estimator.release()  # else a sighting that is held back would bring it back
         was_known = self._estimator.forget(message.data)
+        if was_known:
+            self._outputs.renew_landmarks()
         self._node.get_logger().info(
             f'landmark {message.data} is {"forgotten" if was_known else "not known"}'
         )

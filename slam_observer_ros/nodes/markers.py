@@ -44,16 +44,23 @@ def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
 
     """
     points = estimator.world_points
+    if not len(points):
+        return no_markers(header)
     labels = [
         _label(header, number, landmark_id, point)
         for number, (landmark_id, point) in enumerate(
             zip(estimator.landmark_ids[:MAX_LABELS].tolist(), points, strict=False)
         )
     ]
-    clear = Marker(header=header, action=Marker.DELETEALL)
     lines = _residual_lines(header, estimator)
     ellipsoids = _ellipsoids(header, points, estimator.landmark_covariances)
-    return MarkerArray(markers=[clear, _points(header, points), lines, *ellipsoids, *labels])
+    drawn = [_points(header, points), lines, *ellipsoids, *labels]
+    return MarkerArray(markers=[*no_markers(header).markers, *drawn])
+
+
+def no_markers(header: Header) -> MarkerArray:
+    """Return what takes all earlier markers away."""
+    return MarkerArray(markers=[Marker(header=header, action=Marker.DELETEALL)])
 
 
 def _points(header: Header, points: FloatArray) -> Marker:

@@ -63,7 +63,7 @@ class ObserverCore:
         )
         self._maps = Maps(node, settings, self._estimator, self._outputs.begin_anew)
         InitialPose(node, settings.map_frame, self._estimator, self._outputs.begin_anew)
-        Controls(node, self._estimator, self._intake, self._outputs.begin_anew)
+        Controls(node, self._estimator, self._intake, self._outputs)
         node.add_post_set_parameters_callback(self._apply_parameters)
         self._timers = self._create_timers(settings.publish_rate)
         self.stop()

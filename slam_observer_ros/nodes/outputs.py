@@ -26,7 +26,7 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
     unknown_covariance_field,
 )
-from slam_observer_ros.nodes.markers import landmark_markers
+from slam_observer_ros.nodes.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
@@ -42,7 +42,8 @@ class Outputs:
     """Publishers of the estimate.
 
     Each message carries the stamp of the estimator's state, never the present time, and no stamp
-    is published twice. Nothing is published while the place in a loaded map is unknown.
+    is published twice, unless landmarks were forgotten. Nothing is published while the place in a
+    loaded map is unknown, but an empty map in place of one that is out.
 
     Parameters
     ----------
@@ -111,17 +112,21 @@ class Outputs:
         self._slow_stamp_ns = stamp_ns
         header = header_message(stamp_ns, self._settings.map_frame)
         self._path_publisher.publish(Path(header=header, poses=list(self._path)))
-        self._map.publish(
-            point_cloud2_message(
-                stamp_ns,
-                self._settings.map_frame,
-                self._estimator.landmark_ids,
-                self._estimator.world_points,
-                self._estimator.landmark_covariances,
-            )
-        )
-        if self._markers.get_subscription_count() > 0:
-            self._markers.publish(landmark_markers(header, self._estimator))
+        self._publish_landmarks(stamp_ns)
+
+    def renew_landmarks(self) -> None:
+        """Replace map and markers, if any are out, as some of their landmarks are forgotten."""
+        if self._slow_stamp_ns is None:
+            return
+        stamp_ns, map_frame = self._estimator.stamp_ns, self._settings.map_frame
+        if stamp_ns is None:
+            stamp_ns = self._node.get_clock().now().nanoseconds
+        if self._estimator.is_localised:
+            self._publish_landmarks(stamp_ns)
+            return
+        no_ids = np.empty(0, dtype=np.int64)
+        self._map.publish(point_cloud2_message(stamp_ns, map_frame, no_ids, np.empty((0, 3))))
+        self._markers.publish(no_markers(header_message(stamp_ns, map_frame)))
 
     def repeat_transform(self) -> None:
         """Publish the odometry's correction as of now, while no new one comes."""
@@ -129,11 +134,15 @@ class Outputs:
             self._broadcaster.repeat(self._node.get_clock().now().nanoseconds)
 
     def begin_anew(self) -> None:
-        """Forget the path and what waits: the estimate is at another place, frame or time."""
+        """Forget the path and what waits: the estimate is at another place, frame or time.
+
+        The map that is out, which is latched, and the markers are replaced.
+        """
         self._path.clear()
         self._path_stamp_ns = None
         if self._broadcaster is not None:
             self._broadcaster.forget()
+        self.renew_landmarks()
 
     def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
         header = header_message(stamp_ns, self._settings.map_frame)
@@ -152,6 +161,21 @@ class Outputs:
                 twist=twist,
             )
         )
+
+    def _publish_landmarks(self, stamp_ns: int) -> None:
+        estimator, map_frame = self._estimator, self._settings.map_frame
+        self._map.publish(
+            point_cloud2_message(
+                stamp_ns,
+                map_frame,
+                estimator.landmark_ids,
+                estimator.world_points,
+                estimator.landmark_covariances,
+            )
+        )
+        if self._markers.get_subscription_count() > 0:
+            header = header_message(stamp_ns, map_frame)
+            self._markers.publish(landmark_markers(header, estimator))
 
     def _publish_estimates(self, stamp_ns: int) -> None:
         ids = self._estimator.landmark_ids
