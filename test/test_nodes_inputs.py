@@ -5,6 +5,8 @@ from __future__ import annotations
 from contextlib import ExitStack
 import importlib.util
 import time
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 from geometry_msgs.msg import Pose, PoseArray, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
@@ -19,6 +21,7 @@ from sensor_msgs.msg import Imu, PointCloud2
 
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.nodes import inputs
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_message,
@@ -28,6 +31,7 @@ from slam_observer_ros.nodes.conversions import (
 )
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.recording.message_types import IMU
 from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 
 pytestmark = pytest.mark.ros
@@ -166,6 +170,34 @@ def test_optional_packages_are_named_when_they_are_missing(tmp_path):
         assert node.wait() == 2
         assert f'apt install ros-jazzy-{package.replace("_", "-")}' in node.output
         assert 'Traceback' not in node.output
+
+
+def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatch):
+    clock = SimpleNamespace(now_s=1000.0)
+    monkeypatch.setattr(inputs, 'time', SimpleNamespace(monotonic=lambda: clock.now_s))
+    node, qos = Mock(), QoSProfile(depth=1)
+    node.resolve_topic_name.return_value = '/twist'
+    publisher = SimpleNamespace(topic_type=IMU, qos_profile=qos, node_name='driver')
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    source = inputs.Input(node, 'twist', {IMU: lambda raw, receive_ns: raw}, Mock(), qos)
+    receive = node.create_subscription.call_args.args[2]
+    warning = node.get_logger.return_value.warning
+
+    def look_for(duration_s):
+        for _ in range(duration_s):
+            clock.now_s += 1.0
+            source.look()
+        return [call.args[0] for call in warning.call_args_list]
+
+    for _ in range(20):
+        receive(b'')
+        assert not look_for(1)
+    told = look_for(20)
+    assert told[0] == "no message on '/twist' for 6 s, though it has a publisher"
+    assert len(told) == 2, 'not throttled'
+    receive(b'')
+    assert len(look_for(4)) == 2
+    assert not source.trouble
 
 
 def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_path):

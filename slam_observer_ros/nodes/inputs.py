@@ -19,7 +19,7 @@ REPORT_PERIOD_S = 10.0
 """Shortest time between two reports about one topic."""
 
 DISCOVERY_S = 5.0
-"""How long a topic may be without publisher or message before that is reported.
+"""How long a topic may be without publisher or message before that is logged.
 
 Where an announcement was lost, as on a busy machine, DDS repeats it after 3 s only.
 """
@@ -154,6 +154,9 @@ class Input(Generic[MessageT]):
                 )
         if self.received == 0:
             return f"no message yet on '{self.topic}' ({self._type_name})"
+        age_s = self.age_s or 0.0
+        if age_s > DISCOVERY_S:
+            return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
         return ''
 
 
