@@ -113,6 +113,33 @@ def test_unstamped_velocity_waits_for_the_clock_to_begin(ros, clock, tmp_path):
     assert 0 < stamp_ns(poses[0]) < SECOND
 
 
+def test_a_clock_that_steps_back_a_little_has_not_jumped(ros, tmp_path):
+    maps = ros.collect(PointCloud2, '/jittery/map', LATCHED_QOS)
+    own_clock = ros.node.create_publisher(Clock, '/jittery/clock', 100)
+    arguments = ('-r', '__ns:=/jittery', '-r', '/clock:=/jittery/clock')
+    parameters = {'use_sim_time': True, 'confirmations': 1}
+    with (
+        running('observer_node', tmp_path / 'log', *arguments, **parameters) as node,
+        Robot(ros, namespace='/jittery') as robot,
+    ):
+        ros.wait_for_subscriber(own_clock)
+
+        def play_a_second(start_ns):
+            for stamp in range(start_ns, start_ns + SECOND, SECOND // 20):
+                own_clock.publish(Clock(clock=time_message(stamp)))
+                own_clock.publish(Clock(clock=time_message(stamp - 1_000_000)))
+                robot.send(VelocityEvent(stamp, np.zeros(6)))
+                robot.send(ObservationEvent(stamp, np.array([1]), np.ones((1, 3))))
+                ros.spin_for(0.01)
+
+        play_a_second(100 * SECOND)
+        play_a_second(101 * SECOND)
+        ros.spin_until(lambda: landmark_count(maps), 'the map')
+        assert 'The clock has jumped' not in node.output
+        own_clock.publish(Clock(clock=time_message(101 * SECOND + SECOND // 2)))
+        node.wait_for_output('The clock has jumped')
+
+
 def test_stamps_from_another_clock_are_reported_and_corrected_if_asked(ros, tmp_path):
     poses = {
         name: ros.collect(PoseWithCovarianceStamped, f'/{name}/pose')

@@ -28,6 +28,9 @@ DIAGNOSTICS_PERIOD_S = 1.0
 LOOK_PERIOD_S = 0.25
 RETRY_PERIOD_S = 0.02
 
+CLOCK_JITTER_NS = 100_000_000
+"""/clock may step back by less without having jumped, nanoseconds: messages are then just late."""
+
 
 class ObserverCore:
     """Feeds what a node receives to an :class:`Estimator` and publishes the estimate.
@@ -70,7 +73,9 @@ class ObserverCore:
         # The clock forgets a handle that nobody holds.
         self._jump_handle = node.get_clock().create_jump_callback(
             JumpThreshold(
-                min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+                min_forward=None,
+                min_backward=Duration(nanoseconds=-CLOCK_JITTER_NS),
+                on_clock_change=False,
             ),
             post_callback=self._restart_time,
         )
