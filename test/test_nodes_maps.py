@@ -294,6 +294,8 @@ def test_off_is_a_mode_that_yaml_takes_for_false(ros, tmp_path):
             "'map_frame' and 'odom_frame' are both 'odom': give each a name of its own, or set "
             "'odom_frame' to '' to have 'odom' to the base published",
         ),
+        ({'map_frame': "''"}, "'map_frame' is empty: give it the name of a frame"),
+        ({'base_frame': '/'}, "'base_frame' is empty: give it the name of a frame"),
         ({'base_frame': '/map'}, "'map_frame' and 'base_frame' are both 'map': give each a name"),
     ],
 )

@@ -126,6 +126,12 @@ def test_odometry_that_does_not_come_back_after_a_jump_of_the_clock_is_reported(
     assert 's behind' in robot.broadcaster.trouble
 
 
+def test_frames_have_no_leading_slash():
+    settings = ObserverNodeSettings(base_frame='/base', sensor_frame='//eye', odom_frame='/')
+    plain = settings.with_checked_frames()
+    assert (plain.base_frame, plain.sensor_frame, plain.odom_frame) == ('base', 'eye', '')
+
+
 def test_no_odometry_is_looked_for_unless_its_frame_is_named(robot):
     settings = ObserverNodeSettings(odom_frame='')
     robot.broadcaster = PoseBroadcaster(robot.node, settings, robot.buffer)

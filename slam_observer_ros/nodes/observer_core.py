@@ -50,8 +50,7 @@ class ObserverCore:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._entities = Entities(node)
-        settings = read_settings(node, ObserverNodeSettings)
-        settings.check_frames()
+        settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
         self._estimator = Estimator(estimator_settings)
         self._jumps_followed = 0

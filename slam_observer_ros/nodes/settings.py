@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 from slam_observer_ros.errors import ParameterError
@@ -72,18 +72,28 @@ class ObserverNodeSettings(InputSettings):
     )
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
 
-    def check_frames(self) -> None:
-        """Check that map, odometry and base have frames of their own.
+    def with_checked_frames(self) -> ObserverNodeSettings:
+        """Return the settings with frames as tf2 has them, without a leading slash.
 
         Raises
         ------
         ParameterError
-            If two of them are the same; it says what to do.
+            If map or base has none, or two of map, odometry and base have the same; it says what
+            to do.
 
         """
+        names = ('map_frame', 'odom_frame', 'base_frame', 'sensor_frame')
+        plain = replace(self, **{name: getattr(self, name).lstrip('/') for name in names})
+        for name in ('map_frame', 'base_frame'):
+            if not getattr(plain, name):
+                raise ParameterError(f"'{name}' is empty: give it the name of a frame")
+        plain._check_frames_differ()
+        return plain
+
+    def _check_frames_differ(self) -> None:
         for one, other in combinations(('map_frame', 'odom_frame', 'base_frame'), 2):
-            frame = getattr(self, one).lstrip('/')
-            if frame != getattr(self, other).lstrip('/'):
+            frame = getattr(self, one)
+            if frame != getattr(self, other):
                 continue
             advice = 'give each a name of its own'
             if other == 'odom_frame':
