@@ -86,6 +86,28 @@ def test_managed_node_estimates_only_while_it_is_active(ros, tmp_path):
         assert 'error' not in node.output.lower()
 
 
+def test_simulated_time_that_is_set_while_configured_goes_on_after_the_cleanup(ros, tmp_path):
+    manager = Manager(ros, '/timed/observer_node')
+    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
+    request = SetParameters.Request(parameters=[Parameter(name='use_sim_time', value=value)])
+
+    def listens():
+        readers = ros.node.get_subscriptions_info_by_topic('/clock')
+        return [reader for reader in readers if reader.node_namespace == '/timed']
+
+    with running('lifecycle_observer_node', tmp_path / 'log', '-r', '__ns:=/timed'):
+        assert manager.change(Transition.TRANSITION_CONFIGURE)
+        ros.call(SetParameters, '/timed/observer_node/set_parameters', request)
+        ros.spin_until(listens, 'its reader of the clock')
+        assert manager.change(Transition.TRANSITION_CLEANUP)
+        ros.spin_until(
+            lambda: not ros.node.get_publishers_info_by_topic('/timed/odometry'), 'the cleanup'
+        )
+        ros.spin_for(0.5)
+        assert listens()
+        assert manager.change(Transition.TRANSITION_CONFIGURE)
+
+
 def test_what_can_not_be_configured_stays_unconfigured_until_it_can(ros, tmp_path):
     manager = Manager(ros, '/mapless/observer_node')
     arguments = ('-r', '__ns:=/mapless')

@@ -5,10 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
 
 
 class Entities:
     """Remembers the publishers, subscriptions, services and timers of a node.
+
+    A subscription to the clock is none of them: rclpy itself makes it whenever ``use_sim_time`` is
+    set, and needs it for as long.
 
     Parameters
     ----------
@@ -31,7 +35,7 @@ class Entities:
         node = self._node
         return {
             'timer': set(node.timers),
-            'subscription': set(node.subscriptions),
+            'subscription': {each for each in node.subscriptions if each.msg_type is not Clock},
             'service': set(node.services),
             'publisher': set(node.publishers),
         }
