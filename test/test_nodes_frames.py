@@ -35,6 +35,7 @@ pytestmark = pytest.mark.ros
 
 SECOND = 1_000_000_000
 TOLERANCE_NS = 200_000_000
+WINDOW_NS = 50_000_000
 SENSOR = (0.3, 0.1, 0.5, -1.5, 0.2, -1.6)
 SENSOR_POSE = pose_from_rpy(SENSOR)
 WHEEL_POSE = pose_from_rpy((-0.4, 0.3, 0.0, 0.0, 0.0, 0.7))
@@ -114,7 +115,7 @@ def test_sensors_on_tf_and_odometry_of_others_give_map_to_odom(ros, tmp_path):
     assert stamps == sorted(set(stamps))
     published = {stamp_ns(message): message.pose.pose for message in poses}
     for transform in sent:
-        at_ns = stamp_ns(transform) - TOLERANCE_NS
+        at_ns = stamp_ns(transform) - TOLERANCE_NS - WINDOW_NS
         estimate = published[at_ns]
         p, q = estimate.position, estimate.orientation
         pose = pose_matrices(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))

@@ -19,6 +19,7 @@ from slam_observer_ros.transform_buffer import TransformBuffer
 pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not installed')
 
 STEP_NS = 20_000_000
+WINDOW_S = 0.05
 POSE = se3.exp(np.array([0.0, 0.0, 0.3, 1.0, 2.0, 0.0]))
 ODOMETRY = se3.exp(np.array([0.0, 0.0, -0.2, 3.0, 1.0, 0.0]))
 
@@ -32,9 +33,10 @@ class Robot:
         self.settings = ObserverNodeSettings()
         self.now_ns = 1_000_000_000_000
         self.step_ns = STEP_NS // rate_factor
+        self.ahead_ns = round((WINDOW_S + self.settings.transform_tolerance) * 1e9)
         clock = SimpleNamespace(monotonic=lambda: self.now_ns * 1e-9)
         monkeypatch.setattr(pose_broadcaster, 'time', clock)
-        self.broadcaster = PoseBroadcaster(self.node, self.settings, self.buffer)
+        self.broadcaster = PoseBroadcaster(self.node, self.settings, self.buffer, WINDOW_S)
 
     def wait(self, duration_s):
         self.now_ns += round(duration_s * 1e9)
@@ -83,6 +85,17 @@ def test_the_search_for_odometry_begins_with_the_first_pose(robot):
     )
 
 
+def test_a_correction_holds_until_the_next_one_at_25_hz(robot):
+    """A pose is known when the second message after it has pushed it out of the window."""
+    period_ns, publish_period_ns = 40_000_000, 20_000_000
+    for number in range(20):
+        stamp = robot.now_ns + number * period_ns
+        robot.buffer.insert('odom', 'base_link', stamp, ODOMETRY)
+        robot.broadcaster.add(stamp, POSE)
+        next_comes_ns = stamp + 3 * period_ns + publish_period_ns
+        assert stamp_ns(robot.take()[-1]) >= next_comes_ns
+
+
 def test_without_odometry_the_base_is_published_until_there_is_some(robot):
     robot.run(DISCOVERY_S + 1.0)
     assert children(robot.take()) == {'base_link'}
@@ -98,7 +111,7 @@ def test_odometry_that_is_late_is_waited_for(monkeypatch, rate_factor, lag_s):
     robot.run(6.0, lag_s)
     sent = robot.take()
     assert children(sent) == {'odom'}
-    age_ns = robot.now_ns + round(robot.settings.transform_tolerance * 1e9) - stamp_ns(sent[-1])
+    age_ns = robot.now_ns + robot.ahead_ns - stamp_ns(sent[-1])
     assert age_ns == pytest.approx(lag_s * 1e9, abs=robot.step_ns)
     assert (f'is {lag_s} s behind the estimate' in robot.broadcaster.trouble) == (lag_s > 0.5)
 
@@ -134,6 +147,6 @@ def test_frames_have_no_leading_slash():
 
 def test_no_odometry_is_looked_for_unless_its_frame_is_named(robot):
     settings = ObserverNodeSettings(odom_frame='')
-    robot.broadcaster = PoseBroadcaster(robot.node, settings, robot.buffer)
+    robot.broadcaster = PoseBroadcaster(robot.node, settings, robot.buffer, WINDOW_S)
     robot.run(0.1, lag_s=0.0)
     assert children(robot.take()) == {'base_link'}

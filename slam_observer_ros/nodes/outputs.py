@@ -81,7 +81,9 @@ class Outputs:
         self._markers = node.create_publisher(MarkerArray, 'markers', RELIABLE_QOS)
         self._broadcaster: PoseBroadcaster | None = None
         if settings.publish_tf:
-            self._broadcaster = PoseBroadcaster(node, settings, transforms)
+            self._broadcaster = PoseBroadcaster(
+                node, settings, transforms, estimator.settings.reorder_window
+            )
 
     @property
     def trouble(self) -> str:

@@ -35,8 +35,9 @@ class PoseBroadcaster:
 
     Nothing goes out before it is known who is the base frame's parent. Where that is the odometry
     frame, its correction goes out post-dated by ``transform_tolerance``, so that it holds until
-    the next one; while the observer is paused, the last correction is repeated. Odometry that
-    begins later takes over. A frame is never published twice with one stamp.
+    the next one, and by how long poses are held back, which has passed by then; while the observer
+    is paused, the last correction is repeated. Odometry that begins later takes over. A frame is
+    never published twice with one stamp.
 
     Parameters
     ----------
@@ -46,6 +47,8 @@ class PoseBroadcaster:
         Frames and tolerances.
     transforms : TransformSource
         Where the odometry is, without what is published here.
+    reorder_window_s : float
+        How long poses are held back, seconds.
 
     Attributes
     ----------
@@ -55,13 +58,18 @@ class PoseBroadcaster:
     """
 
     def __init__(
-        self, node: Node, settings: ObserverNodeSettings, transforms: TransformSource
+        self,
+        node: Node,
+        settings: ObserverNodeSettings,
+        transforms: TransformSource,
+        reorder_window_s: float,
     ) -> None:
         self._node = node
         self._settings = settings
         self._transforms = transforms
         self._publisher = TransformPublisher(node, '/tf', RELIABLE_QOS)
         self._tolerance_ns = to_ns(settings.transform_tolerance)
+        self._held_back_ns = to_ns(reorder_window_s)
         self._begin_s: float | None = None
         self._child = '' if settings.odom_frame else settings.base_frame
         self._waiting: deque[tuple[int, FloatArray]] = deque()
@@ -146,7 +154,7 @@ class PoseBroadcaster:
         except TransformError:  # it is of the time before the odometry began
             return
         self._correction = pose @ se3.inverse(odometry)
-        self._publish(stamp_ns + self._tolerance_ns, self._correction)
+        self._publish(stamp_ns + self._held_back_ns + self._tolerance_ns, self._correction)
 
     def _settle(self, child: str, reason: str) -> None:
         self._child = child

@@ -34,7 +34,8 @@ class ObserverNodeSettings(InputSettings):
     )
     transform_tolerance: float = parameter(
         0.1,
-        'How far map_frame to odom_frame is post-dated, so that it holds until the next one',
+        'How far map_frame to odom_frame is post-dated beyond reorder_window, to hold until the '
+        'next one: three periods of twist',
         unit='s',
         minimum=0.0,
         maximum=10.0,
