@@ -82,6 +82,26 @@ def test_paused_observer_holds_its_pose_and_counts_what_it_drops(ros, tmp_path):
     assert poses[-1].pose.pose.position.x < held.pose.pose.position.x + 1.1
 
 
+def test_a_pause_longer_than_stamps_may_jump_erases_nothing(ros, tmp_path):
+    maps = ros.collect(PointCloud2, '/breaking/map', LATCHED_QOS)
+    with (
+        running(
+            'observer_node', tmp_path / 'log', '-r', '__ns:=/breaking', max_stamp_jump=0.5
+        ) as node,
+        Robot(ros, namespace='/breaking') as robot,
+    ):
+        robot.run(RUN)
+        ros.spin_until(lambda: ids(maps) == [0, 1, 2, 3], 'four landmarks')
+        ros.call(Trigger, '/breaking/observer_node/pause', Trigger.Request())
+        ros.spin_for(1.5)
+        ros.call(Trigger, '/breaking/observer_node/resume', Trigger.Request())
+        resumed_ns = time.time_ns()
+        robot.send_zeros()
+        ros.spin_until(lambda: stamp_ns(maps[-1]) > resumed_ns, 'the map after the pause')
+        assert ids(maps) == [0, 1, 2, 3]
+        assert 'The clock has jumped' not in node.output
+
+
 def test_correction_of_the_odometry_holds_while_paused(ros, tmp_path):
     if TFMessage is None:
         pytest.skip('tf2_msgs is not installed')
