@@ -36,18 +36,19 @@ def record(
     stamp_ns=lambda s: s * 10**8,
     scale=lambda s: 1.0,
     has_ids=True,
+    receive_ns=lambda s: s * 10**8,
 ):
     """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
 
     At each step ids go up from ``first_id``, and the landmarks' world is ``scale`` times as large.
-    Messages are received every 0.1 s, whatever their stamps.
+    Messages are received every 0.1 s, whatever their stamps, unless ``receive_ns`` says when.
     """
     random = np.random.default_rng(seed)
     with RecordingWriter(path) as writer:
         for step in range(80):
             noise = random.normal(scale=0.01, size=6)
             velocity = VelocityEvent(stamp_ns(step), BODY_VELOCITY + noise)
-            writer.write_velocity(velocity, receive_stamp_ns=step * 10**8)
+            writer.write_velocity(velocity, receive_stamp_ns=receive_ns(step))
             pose = start @ se3.exp(BODY_VELOCITY * 0.1 * step)
             writer.write_pose(PoseTruth(stamp_ns(step), pose))
             near = np.linalg.norm(LANDMARKS - pose[:3, 3], axis=1) < 6.0
@@ -56,7 +57,7 @@ def record(
             points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
             ids = first_id(step) + seen if has_ids else np.full(len(seen), UNKNOWN_ID)
             observation = ObservationEvent(stamp_ns(step), ids, points)
-            writer.write_observation(observation, receive_stamp_ns=step * 10**8)
+            writer.write_observation(observation, receive_stamp_ns=receive_ns(step))
     return path
 
 
@@ -292,6 +293,17 @@ def test_nothing_to_smooth_is_an_error_and_writes_nothing(slam_observer, tmp_pat
     told = slam_observer.fail('replay', path, *outputs, *window, *SETTINGS)
     assert 'nothing to smooth: no observation since the history was cut' in told
     assert not (tmp_path / 'smoothed.tum').exists()
+
+
+def test_a_silence_of_the_sensors_is_no_jump_of_the_clock(slam_observer, tmp_path):
+    def late(step):
+        return 10**8 * step + 12 * 10**9 * (step >= 50)
+
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1, stamp_ns=late, receive_ns=late)
+    ended = slam_observer('replay', path, '--tum', tmp_path / 'poses.tum', *SETTINGS)
+    assert ended.code == 0
+    assert 'The clock has jumped' not in ended.errors
+    assert read_tum(tmp_path / 'poses.tum').stamps_ns[0] < 10**9
 
 
 @pytest.mark.parametrize('resets', [True, False])
