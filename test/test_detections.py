@@ -9,6 +9,7 @@ import pytest
 import ros_messages as ros
 
 from slam_observer_ros.errors import MessageError
+from slam_observer_ros.events import LARGEST_ID
 from slam_observer_ros.recording.detections import (
     decode_apriltags,
     decode_detections,
@@ -16,6 +17,7 @@ from slam_observer_ros.recording.detections import (
     observed_tags,
 )
 from slam_observer_ros.recording.messages import PoseMessage
+from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
 
 
 def test_poses_are_landmarks_without_ids():
@@ -73,10 +75,32 @@ def test_apriltag_detections_give_ids_and_families():
         decode_apriltags(ros.serialise(negative))
 
 
-def test_fiducials_on_tf_are_told_by_their_names():
-    def transform(parent, child, x, stamp_ns=5):
-        return PoseMessage(stamp_ns, parent, child, np.array([x, 0.0, 0.0]), detector.NO_TURN)
+def transform(parent, child, x, stamp_ns=5):
+    return PoseMessage(stamp_ns, parent, child, np.array([x, 0.0, 0.0]), detector.NO_TURN)
 
+
+TOO_LARGE = [str(LARGEST_ID + 1), '20240501123', '9' * 19, '1' * 5000]
+
+
+@pytest.mark.parametrize('number', TOO_LARGE)
+def test_an_id_that_could_not_be_published_is_refused(number):
+    reason = f'landmark id {number[:30]} is beyond {LARGEST_ID}'
+    for item in (detector.detection(number), detector.detection('', f'reflector_{number}')):
+        with pytest.raises(MessageError, match=reason):
+            detections(item)
+    for frame in (f'tag_{number}', f'tag36h11:{number}'):
+        with pytest.raises(MessageError, match=reason):
+            observed_tags([transform('camera', frame, 1.0)], 'tag_')
+
+
+def test_the_largest_id_is_taken():
+    assert_array_equal(detections(detector.detection(f'000{LARGEST_ID}')).ids, [LARGEST_ID])
+    (seen,) = observed_tags([transform('camera', f'tag_{LARGEST_ID}', 1.0)], 'tag_')
+    layout = point_cloud2_layout(seen.event.ids, seen.event.points)
+    assert layout.width == 1
+
+
+def test_fiducials_on_tf_are_told_by_their_names():
     seen = observed_tags(
         [
             transform('left', 'tag36h11:7', 1.0),

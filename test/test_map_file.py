@@ -14,6 +14,7 @@ import yaml
 
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError, SlamObserverError
+from slam_observer_ros.events import LARGEST_ID
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.recording.map_file import check_writable, read_map, write_map
 from slam_observer_ros.settings import Settings
@@ -32,7 +33,7 @@ def a_map(n=5, seed=0):
     noise = np.random.default_rng(seed)
     roots = noise.normal(scale=0.1, size=(n, 3, 3))
     return LandmarkMap(
-        noise.choice(2**62, n, replace=False),
+        noise.choice(LARGEST_ID + 1, n, replace=False),
         noise.normal(scale=1e3, size=(n, 3)),
         roots @ roots.swapaxes(1, 2),
         noise.integers(0, 10**6, n),
@@ -181,6 +182,7 @@ BAD_FILES = [
     (changed('id: 7', 'id: seven'), "'id' is 'seven'"),
     (changed('id: 7', 'id: true'), "'id' is True"),
     (changed('id: 7', f'id: {2**63}'), f"'id' is {2**63}"),
+    (changed('id: 7', 'id: 4294967295'), "'id' is 4294967295, beyond 4294967294"),
     (changed('id: 7', 'id: 3'), 'landmark 3 is there 2 times'),
     (changed('position: [1.5, -2, 0.3], ', ''), "lacks 'position'"),
     (changed('[1.5, -2, 0.3]', '[1.5, -2]'), "landmark 7: 'position' is .* 3 numbers"),

@@ -14,7 +14,7 @@ import re
 import numpy as np
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import LARGEST_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.recording.cdr import Buffer, CdrReader
 from slam_observer_ros.recording.messages import PoseMessage
 from slam_observer_ros.recording.point_clouds import measured, ObservationMessage
@@ -25,7 +25,7 @@ _COVARIANCE = 36
 _SIZE = 3
 _CORNERS = 10
 _HOMOGRAPHY = 9
-_TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d{1,18})')
+_TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,10 +106,15 @@ def observed_tags(
     list of ObservationMessage
         One for each camera and stamp.
 
+    Raises
+    ------
+    MessageError
+        If an id is beyond ``LARGEST_ID``.
+
     """
-    pattern = re.compile(rf'(?:{re.escape(tag_frame_prefix)}|\w+:)(\d{{1,18}})')
+    pattern = re.compile(rf'(?:{re.escape(tag_frame_prefix)}|\w+:)(\d+)')
     seen = [
-        (message, int(match[1]))
+        (message, _landmark_id(match[1]))
         for message in transforms
         if (match := pattern.fullmatch(message.child_frame_id))
     ]
@@ -118,6 +123,14 @@ def observed_tags(
         _observation(frame_id, stamp_ns, list(group))
         for (frame_id, stamp_ns), group in groupby(seen, key=_camera_and_stamp)
     ]
+
+
+def _landmark_id(digits: str) -> int:
+    significant = digits.lstrip('0') or '0'
+    # Python converts no number of thousands of digits.
+    if len(significant) > len(str(LARGEST_ID)) or int(significant) > LARGEST_ID:
+        raise MessageError(f'landmark id {significant[:30]} is beyond {LARGEST_ID}')
+    return int(significant)
 
 
 def _camera_and_stamp(sighting: tuple[PoseMessage, int]) -> tuple[str, int]:
@@ -139,7 +152,7 @@ def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
     centre = reader.float64(_POSE + _SIZE)[:3]
     names = [reader.string(), *(name for name, _, _ in results)]
     matches = (_TRAILING_NUMBER.fullmatch(name) for name in names)
-    landmark_id = next((int(match[1]) for match in matches if match), UNKNOWN_ID)
+    landmark_id = next((_landmark_id(match[1]) for match in matches if match), UNKNOWN_ID)
     if not results:
         return landmark_id, centre, np.zeros((3, 3))
     _, point, covariance = results[0]

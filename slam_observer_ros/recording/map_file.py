@@ -28,6 +28,7 @@ import yaml
 
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError
+from slam_observer_ros.events import LARGEST_ID
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
@@ -189,7 +190,9 @@ def _landmark_id(row: Any, place: int) -> int:
     who = f'entry {place} of landmarks'
     _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
     _check_names(who, row, ('id', 'position'), ('sigma', 'covariance', 'observations'))
-    return _natural(row['id'], f"{who}: 'id'")
+    landmark_id = _natural(row['id'], f"{who}: 'id'")
+    _expect(landmark_id <= LARGEST_ID, f"{who}: 'id' is {landmark_id}, beyond {LARGEST_ID}")
+    return landmark_id
 
 
 def _position(row: Mapping[str, Any]) -> list[float]:
