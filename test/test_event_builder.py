@@ -5,11 +5,14 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
+from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_velocity, pose_from_rpy
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.event_builder import EventBuilder, MAX_WAITING
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.input_settings import InputSettings
@@ -111,3 +114,41 @@ def test_what_too_many_wait_behind_is_dropped_and_told():
     events = builder.finish()
     assert [event.stamp_ns for event in events] == [k * MS for k in range(3, MAX_WAITING + 3)]
     assert len(drops) == 3
+
+
+def everything_placed():
+    """A map in which odometry, the robot, its camera and a tag are placed."""
+    transforms = TransformBuffer()
+    for parent, child in (('map', 'odom'), ('odom', 'base_link'), ('base_link', 'camera')):
+        transforms.insert(parent, child, 0, WHEEL, is_static=True)
+    transforms.insert('map', 'tag_3', 0, WHEEL, is_static=True)
+    return transforms
+
+
+@pytest.mark.parametrize('frame', ['map', '/map'])
+def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
+    event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
+    reason = "told in 'map', which is estimated from these very landmarks: publish them in the"
+    base_frame = BaseFrame(InputSettings(), everything_placed())
+    with pytest.raises(TransformError, match=reason):
+        base_frame.observation(ObservationMessage(frame, event))
+    with pytest.raises(TransformError, match=reason):
+        base_frame.tags(TagDetections(0, frame, (3,), ('tag36h11',)))
+    with pytest.raises(TransformError, match=reason):
+        settings = InputSettings(sensor_frame=frame)
+        BaseFrame(settings, everything_placed()).observation(ObservationMessage('camera', event))
+
+
+def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used():
+    event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
+    base_frame = BaseFrame(InputSettings(), everything_placed())
+    moved = base_frame.observation(ObservationMessage('odom', event))
+    assert_allclose(moved.points, se3.transform(se3.inverse(WHEEL), event.points))
+    settings = InputSettings(sensor_pose=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    placed = BaseFrame(settings, TransformBuffer()).observation(ObservationMessage('map', event))
+    assert_allclose(placed.points, [[1.0, 1.0, 2.0]])
+
+
+def test_without_an_odometry_frame_velocities_may_name_none():
+    message = VelocityMessage('', VelocityEvent(0, V))
+    assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(message)

@@ -144,6 +144,21 @@ class TestMovingMounts:
         assert ended.json['dropped'] == {'no_transform': 1}
         assert "'camera' and 'base_link' are not connected" in ended.errors
 
+    def test_landmarks_told_in_the_map_are_dropped_and_told_once(self, slam_observer, tmp_path):
+        path = tmp_path / 'loop.mcap'
+        with RecordingWriter(path) as writer:
+            drive = Drive(writer)
+            for stamp_ns in list(stamps_ns())[:20]:
+                writer.write_velocity(VelocityEvent(stamp_ns, V))
+                pose = true_pose(stamp_ns)
+                drive.transforms('/tf', stamp_ns, ('map', 'base_link', pose, stamp_ns))
+                drive.landmarks(stamp_ns, se3.inverse(pose), 'map')
+        ended = slam_observer('replay', path, '--json')
+        assert ended.json['dropped'] == {'no_transform': 20}
+        assert ended.json['landmarks'] == 0
+        reason = "landmarks are told in 'map', which is estimated from these very landmarks"
+        assert ended.errors.count(reason) == 1
+
     @pytest.fixture
     def camera_on(self, tmp_path):
         """Writes one observation of a camera that trees of transforms place, each 1 m apart."""

@@ -86,7 +86,8 @@ class BaseFrame:
     def __init__(self, settings: InputSettings, transforms: TransformSource) -> None:
         self._transforms = transforms
         self.name = settings.base_frame
-        self._world_frames = (settings.map_frame, settings.odom_frame)
+        self._map_frame = settings.map_frame.lstrip('/')
+        self._world_frames = {self._map_frame, settings.odom_frame.lstrip('/')} - {''}
         self._sensor_frame = settings.sensor_frame
         self._tag_frame_prefix = settings.tag_frame_prefix
         self._sensor_pose: FloatArray | None = None
@@ -105,12 +106,13 @@ class BaseFrame:
         Raises
         ------
         TransformError
-            If the sensor's pose is not known (yet).
+            If the sensor's pose is not known (yet), or the landmarks are told in the map's frame.
 
         """
         if self._sensor_pose is not None:
             return move_observation(message.event, self._sensor_pose)
         frame_id = self._sensor_frame or message.frame_id
+        self._refuse_map_frame(frame_id)
         return self._moved(move_observation, message.event, frame_id)
 
     def tags(self, detections: TagDetections) -> ObservationEvent:
@@ -119,10 +121,11 @@ class BaseFrame:
         Raises
         ------
         TransformError
-            If one of them is not known (yet).
+            If one of them is not known (yet), or the detections are told in the map's frame.
 
         """
         camera_frame = self._sensor_frame or detections.frame_id
+        self._refuse_map_frame(camera_frame)
         points = [
             self._tag_position(camera_frame, family, number, detections.stamp_ns)
             for family, number in zip(detections.families, detections.ids, strict=True)
@@ -140,7 +143,7 @@ class BaseFrame:
             If the pose of the message's frame is not known (yet), or it is no part of the robot.
 
         """
-        if message.frame_id in self._world_frames:
+        if message.frame_id.lstrip('/') in self._world_frames:
             raise TransformError(f"'{message.frame_id}' does not move with the robot")
         return self._moved(move_velocity, message.event, message.frame_id)
 
@@ -154,6 +157,14 @@ class BaseFrame:
 
         """
         return self._moved(_turn_imu, message, message.frame_id)
+
+    def _refuse_map_frame(self, frame_id: str) -> None:
+        """Refuse landmarks that the estimate itself would bring to where it has them."""
+        if frame_id.lstrip('/') == self._map_frame != '':
+            raise TransformError(
+                f"landmarks are told in '{self._map_frame}', which is estimated from these very "
+                "landmarks: publish them in the sensor's frame"
+            )
 
     def _moved(
         self,
