@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, field
+import logging
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from slam_observer_ros.errors import TransformError
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
+
+_logger = logging.getLogger(__name__)
 
 HISTORY_NS = 10_000_000_000
 """How far back transforms are kept, nanoseconds; tf2's default."""
@@ -60,11 +63,12 @@ class TransformBuffer:
 
     def __init__(self) -> None:
         self._tracks: dict[str, _Track] = {}
+        self._refused: set[str] = set()
 
     def insert(
         self, parent: str, child: str, stamp_ns: int, pose: FloatArray, *, is_static: bool = False
     ) -> None:
-        """Take a transform.
+        """Take a transform; one of a frame to itself says nothing, and is refused.
 
         Parameters
         ----------
@@ -79,10 +83,19 @@ class TransformBuffer:
 
         """
         parent, child = parent.lstrip('/'), child.lstrip('/')
+        if parent == child:
+            self.refuse(child, 'it is to the frame itself')
+            return
         track = self._tracks.get(child)
         if track is None or track.parent != parent or track.is_static != is_static:
             track = self._tracks[child] = _Track(parent, is_static)
         track.insert(stamp_ns, pose)
+
+    def refuse(self, child: str, reason: str) -> None:
+        """Tell, once for each frame, why a transform is not used."""
+        if child not in self._refused:
+            self._refused.add(child)
+            _logger.warning("A transform on /tf of frame '%s' is not used: %s.", child, reason)
 
     def clear(self) -> None:
         """Forget what has a time, as after a jump of the clock; static transforms stay."""

@@ -109,6 +109,7 @@ def test_fiducials_on_tf_are_told_by_their_names():
             transform('right', 'tag36h11:7', 4.0),
             transform('left', 'tag36h11:9', 5.0, stamp_ns=6),
             transform('base_link', 'marker8_mount', 6.0),
+            transform('left', 'marker10', np.nan),
         ],
         'marker',
     )

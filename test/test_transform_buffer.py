@@ -7,14 +7,18 @@ import hypothesis.strategies as st
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+import ros_messages as ros
 from strategies import poses
 
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.recording.frames import insert_transforms
+from slam_observer_ros.recording.messages import decode_transforms
 from slam_observer_ros.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
 
+NO_TURN = [0.0, 0.0, 0.0, 1.0]
 SECOND = 1_000_000_000
 
 
@@ -86,6 +90,44 @@ def test_a_new_parent_and_a_later_message_with_one_stamp_replace_what_was_known(
     assert_allclose(buffer.lookup('new', 'base', SECOND), moved)
     with pytest.raises(TransformError):
         buffer.lookup('old', 'base', SECOND)
+
+
+@pytest.mark.parametrize(
+    ('position', 'quaternion', 'reason'),
+    [
+        ([1.0, 2.0, 3.0], [0.0] * 4, 'quaternion of norm 0, not 1'),
+        ([1.0, 2.0, 3.0], [np.nan] * 4, 'quaternion of norm nan'),
+        ([np.nan, 2.0, 3.0], NO_TURN, 'a coordinate is NaN or infinite'),
+    ],
+)
+def test_one_bad_transform_of_a_message_is_left_out_and_told_once(
+    caplog, position, quaternion, reason
+):
+    transforms = [
+        ros.transform_stamped(('odom', 'base'), [1.0, 0.0, 0.0], NO_TURN),
+        ros.transform_stamped(('base', 'gripper'), position, quaternion),
+        ros.transform_stamped(('base', 'camera'), [0.0, 2.0, 0.0], NO_TURN),
+    ]
+    raw = ros.serialise(ros.make('tf2_msgs/msg/TFMessage', transforms))
+    buffer = TransformBuffer()
+    for _ in range(3):
+        insert_transforms(buffer, decode_transforms(raw), is_static=False)
+    found = buffer.lookup('odom', 'camera', ros.STAMP_NS)
+    assert_allclose(found[:3, 3], [1.0, 2.0, 0.0])
+    with pytest.raises(TransformError, match="'gripper' and 'odom' are not connected"):
+        buffer.lookup('odom', 'gripper', ros.STAMP_NS)
+    (record,) = caplog.records
+    assert f"A transform on /tf of frame 'gripper' is not used: {reason}" in record.getMessage()
+
+
+def test_a_transform_of_a_frame_to_itself_changes_nothing_and_is_told_once(caplog):
+    buffer = TransformBuffer()
+    for _ in range(3):
+        buffer.insert('odom', 'base', SECOND, np.eye(4))
+        buffer.insert('base', '/base', SECOND, np.eye(4))
+    assert_allclose(buffer.lookup('odom', 'base', SECOND), np.eye(4))
+    (record,) = caplog.records
+    assert "of frame 'base' is not used: it is to the frame itself" in record.getMessage()
 
 
 def test_after_a_jump_of_the_clock_only_static_transforms_are_left():

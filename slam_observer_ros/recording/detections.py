@@ -94,6 +94,8 @@ def observed_tags(
 ) -> list[ObservationMessage]:
     """Return what of /tf are sightings of fiducials: transforms from a camera to a tag.
 
+    Those that are no transforms, which have NaN in them for example, are left out.
+
     Parameters
     ----------
     transforms : iterable of PoseMessage
@@ -116,7 +118,7 @@ def observed_tags(
     seen = [
         (message, _landmark_id(match[1]))
         for message in transforms
-        if (match := pattern.fullmatch(message.child_frame_id))
+        if (match := pattern.fullmatch(message.child_frame_id)) and not message.trouble
     ]
     seen.sort(key=_camera_and_stamp)
     return [

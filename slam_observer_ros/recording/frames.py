@@ -28,8 +28,12 @@ MeasuredT = TypeVar('MeasuredT', ObservationEvent, VelocityEvent, ImuMessage)
 def insert_transforms(
     buffer: TransformBuffer, transforms: Sequence[PoseMessage], *, is_static: bool
 ) -> None:
-    """Put the transforms of a message on /tf or /tf_static into a buffer."""
-    for transform, pose in zip(transforms, pose_stack(transforms), strict=True):
+    """Put the transforms of a message on /tf or /tf_static into a buffer, without the bad ones."""
+    for transform in transforms:
+        if transform.trouble:
+            buffer.refuse(transform.child_frame_id, transform.trouble)
+    good = [transform for transform in transforms if not transform.trouble]
+    for transform, pose in zip(good, pose_stack(good), strict=True):
         buffer.insert(
             transform.frame_id,
             transform.child_frame_id,

@@ -76,7 +76,7 @@ class PoseMessage:
     position : FloatArray
         (3,) metres.
     quaternion : FloatArray
-        (4,) xyzw, of unit norm.
+        (4,) xyzw; of unit norm, but for transforms that say in ``trouble`` that it isn't.
     covariance : FloatArray or None
         (6, 6) of rotation vector and position in the axes of ``frame_id``; None if unknown.
 
@@ -93,6 +93,13 @@ class PoseMessage:
     def pose(self) -> FloatArray:
         """(4, 4) transform that takes points from ``child_frame_id`` to ``frame_id``."""
         return pose_matrices(self.position, self.quaternion)
+
+    @property
+    def trouble(self) -> str:
+        """Why it is no pose; empty if it is one."""
+        if np.isfinite(self.position).all():
+            return _turn_trouble(self.quaternion)
+        return 'a coordinate is NaN or infinite'
 
 
 def pose_stack(messages: Sequence[PoseMessage]) -> FloatArray:
@@ -184,9 +191,12 @@ def decode_transform_stamped(raw: Buffer) -> PoseMessage:
 
 
 def decode_transforms(raw: Buffer) -> list[PoseMessage]:
-    """Decode a tf2_msgs/TFMessage, as on /tf and /tf_static."""
+    """Decode a tf2_msgs/TFMessage, as on /tf and /tf_static.
+
+    A bad transform says so in ``trouble``: those beside it are of other frames, and good.
+    """
     reader = CdrReader(raw)
-    messages = [_checked(_read_transform(reader)) for _ in range(reader.uint32())]
+    messages = [_read_transform(reader) for _ in range(reader.uint32())]
     reader.finish()
     return messages
 
@@ -252,8 +262,15 @@ def _read_transform(reader: CdrReader) -> PoseMessage:
 
 
 def _checked(message: PoseMessage) -> PoseMessage:
-    norm = float(np.linalg.norm(message.quaternion))
-    # Written so that NaN is refused too.
-    if not abs(norm - 1.0) < _QUATERNION_NORM_TOLERANCE:
-        raise MessageError(f'quaternion of norm {norm:.3g}, not 1')
+    trouble = _turn_trouble(message.quaternion)
+    if trouble:
+        raise MessageError(trouble)
     return message
+
+
+def _turn_trouble(quaternion: FloatArray) -> str:
+    """Return why a quaternion is no rotation; empty if it is one."""
+    norm = float(np.linalg.norm(quaternion))
+    # Written so that NaN is refused too.
+    is_turn = abs(norm - 1.0) < _QUATERNION_NORM_TOLERANCE
+    return '' if is_turn else f'quaternion of norm {norm:.3g}, not 1'
