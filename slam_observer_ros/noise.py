@@ -73,7 +73,7 @@ class NoiseModel(Immutable):
         if held.is_stated.any():
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
             grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
-            stated = _limited(held.covariances)
+            stated = limited(held.covariances, LARGEST_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
 
@@ -116,20 +116,23 @@ class NoiseModel(Immutable):
         return _invertible(_along_and_across(sights, range_squared, along, across))
 
 
+def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
+    """Return covariances (..., d, d) without variances that would drown all others in rounding.
+
+    Standard deviations are at most ``largest`` (d,); the correlations stay.
+    """
+    # Rounding may have left a variance a hair below zero.
+    deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
+    scales = largest / np.maximum(deviations, largest)
+    scaled: FloatArray = covariances * scales[..., :, None] * scales[..., None, :]
+    return scaled
+
+
 def _invertible(covariances: FloatArray) -> FloatArray:
     """Return covariances (m, 3, 3) of which no direction is known exactly, m²."""
     least = RESOLUTION_M**2 + LEAST_SHARE * np.einsum('ijj->i', covariances)
     invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
     return invertible
-
-
-def _limited(covariances: FloatArray) -> FloatArray:
-    """Return covariances (k, 6, 6) without variances that would drown all others in rounding."""
-    # Rounding may have left a variance a hair below zero.
-    deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    scales = LARGEST_SPEED_ERRORS / np.maximum(deviations, LARGEST_SPEED_ERRORS)
-    limited: FloatArray = covariances * scales[:, :, None] * scales[:, None, :]
-    return limited
 
 
 def _along_and_across(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 import time
+from unittest.mock import Mock
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
@@ -15,10 +16,13 @@ from numpy.testing import assert_allclose
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.serialization import serialize_message
 from scipy.stats import chi2
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
+from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.nodes.conversions import (
     header_message,
@@ -27,8 +31,10 @@ from slam_observer_ros.nodes.conversions import (
     pose_message,
     twist_message,
 )
+from slam_observer_ros.nodes.initial_pose import InitialPose
 from slam_observer_ros.recording.map_file import read_map
 from slam_observer_ros.recording.messages import pose_matrices
+from slam_observer_ros.settings import Settings
 
 pytestmark = pytest.mark.ros
 
@@ -207,6 +213,49 @@ def test_the_initial_pose_places_the_robot_in_the_map(ros, robot, tmp_path):
         node.wait_for_output(r'the robot is set to \(')
         estimate, covariance = robot.see_until_published(pose, [3])
         assert nees(estimate, covariance, pose) < chi2.ppf(0.9973, 6)
+
+
+class GivenPose:
+    """What is given on ``initialpose``, to an observer that sees five landmarks."""
+
+    def __init__(self):
+        self.estimator = Estimator(Settings(reorder_window=0.0))
+        self.stamp_ns = 0
+        self.node = Mock()
+        InitialPose(self.node, 'map', self.estimator, Mock())
+        self.receive = self.node.create_subscription.call_args.args[2]
+        self.see()
+
+    def give(self, *arguments, **options):
+        self.receive(serialize_message(initial_pose(*arguments, **options)))
+
+    def see(self):
+        points = np.random.default_rng(1).normal(size=(5, 3))
+        for _ in range(5):
+            self.stamp_ns += 100_000_000
+            self.estimator.add(VelocityEvent(self.stamp_ns, np.zeros(6)))
+            self.estimator.add(ObservationEvent(self.stamp_ns, np.arange(5), points))
+
+
+@pytest.mark.parametrize('x', [1.1e7, -1e200])
+def test_an_initial_pose_beyond_what_the_parameter_allows_is_refused(x):
+    given = GivenPose()
+    given.give(se3.pose(np.eye(3), np.array([0.0, x, 0.0])))
+    given.see()
+    (reason,) = given.node.get_logger().error.call_args.args
+    assert reason == 'the pose given is not used: its position has an entry beyond 1e+07 m'
+    assert_allclose(given.estimator.pose, np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize('unknown', [1e9, 1e300, 1.7e308])
+def test_huge_variances_of_an_initial_pose_say_unknown(unknown):
+    given = GivenPose()
+    given.give(np.eye(4), variances=(unknown, unknown, 0.07, 0.25, 0.25, unknown))
+    given.node.get_logger().error.assert_not_called()
+    given.see()
+    deviations = np.sqrt(np.diag(given.estimator.pose_covariance))
+    assert (deviations < 0.6).all()
+    assert_allclose(given.estimator.pose, np.eye(4), atol=1e-3)
 
 
 def test_a_robot_that_starts_at_its_dock_is_placed_at_once(ros, robot, tmp_path):

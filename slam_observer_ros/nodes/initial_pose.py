@@ -12,10 +12,18 @@ from slam_observer_ros.errors import MessageError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.map_frame import GIVEN_POSE_STD
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
+from slam_observer_ros.noise import limited
+from slam_observer_ros.parameters import table
 from slam_observer_ros.recording.messages import decode_pose_with_covariance_stamped, PoseMessage
+from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 
 TOPICS = ('initialpose', '~/set_pose')
+
+LARGEST_ERRORS = np.repeat([np.pi, 1e4], 3)
+"""Standard deviations of a pose, rad and m, beyond which a message only says 'unknown'."""
+
+_LARGEST_M = next(row.maximum for row in table(Settings) if row.name == 'initial_position')
 
 
 class InitialPose:
@@ -50,11 +58,12 @@ class InitialPose:
         try:
             message = decode_pose_with_covariance_stamped(raw)
             self._check(message)
+            covariance = filled_in(message.covariance)
         except MessageError as error:
             self._node.get_logger().error(f'the pose given is not used: {error}')
             return
         self._estimator.release()  # what has come before belongs to where the robot was
-        self._estimator.set_pose(message.pose, filled_in(message.covariance))
+        self._estimator.set_pose(message.pose, covariance)
         self._on_move()
         x, y, z = message.position.tolist()
         self._node.get_logger().info(f'the robot is set to ({x:.2f}, {y:.2f}, {z:.2f}) m')
@@ -64,18 +73,27 @@ class InitialPose:
             raise MessageError(f"it is in frame '{message.frame_id}', not '{self._map_frame}'")
         if not np.isfinite(message.position).all():
             raise MessageError('its position has a NaN or infinite entry')
-        covariance = message.covariance
-        if covariance is not None and not (
-            np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance).min() > -1e-9
-        ):
-            raise MessageError('its covariance is not finite, or negative in some direction')
+        if np.abs(message.position).max() > _LARGEST_M:
+            raise MessageError(f'its position has an entry beyond {_LARGEST_M:g} m')
 
 
 def filled_in(covariance: FloatArray | None) -> FloatArray:
     """Return a covariance (6, 6) with variances assumed where the message gives none.
 
-    RViz's 2D Pose Estimate, for one, gives those of x, y and yaw only, and zeros else.
+    RViz's 2D Pose Estimate, for one, gives those of x, y and yaw only, and zeros else. Those
+    that are so large that they only say 'unknown' are made less, lest they drown all others.
+
+    Raises
+    ------
+    MessageError
+        If the covariance is not finite, or negative in some direction.
+
     """
     given = np.zeros((6, 6)) if covariance is None else covariance
+    if np.isfinite(given).all():
+        given = limited(given, LARGEST_ERRORS)
+    rounding = 1e-9 + 1e-12 * np.trace(given)
+    if not (np.isfinite(given).all() and np.linalg.eigvalsh(given).min() > -rounding):
+        raise MessageError('its covariance is not finite, or negative in some direction')
     assumed: FloatArray = np.where(np.diagonal(given) == 0.0, GIVEN_POSE_STD**2, 0.0)
     return given + np.diag(assumed)
