@@ -8,7 +8,7 @@ import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-from geometry_msgs.msg import Pose, PoseArray, TwistWithCovarianceStamped
+from geometry_msgs.msg import Pose, PoseArray, Twist, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from node_processes import NodeProcess, running
 import numpy as np
@@ -29,9 +29,11 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
     vector_message,
 )
+from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
 from slam_observer_ros.recording.message_types import IMU
+from slam_observer_ros.recording.messages import decode_twist
 from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 
 pytestmark = pytest.mark.ros
@@ -83,6 +85,63 @@ VELOCITY_INPUTS = {
         },
     ),
 }
+
+
+class FakeClock:
+    """The system clock 10 s ahead, which is then the ROS clock's; or a simulated one."""
+
+    def __init__(self, is_simulated=False):
+        self.ros_time_is_active = is_simulated
+
+    def now(self):
+        return SimpleNamespace(nanoseconds=time.time_ns() + 10 * SECOND)
+
+
+def unstamped_input(node, received, is_simulated=False):
+    """Return an input of Twist, and what its subscription calls with bytes and their info."""
+    node.get_clock.return_value = FakeClock(is_simulated)
+    node.resolve_topic_name.side_effect = lambda name: f'/{name}'
+    decoders = {'geometry_msgs/msg/Twist': decode_twist}
+    source = Input(node, 'twist', decoders, lambda *taken: received.append(taken), QOS)
+    return source, node.create_subscription.call_args.args[2]
+
+
+QOS = QoSProfile(depth=1)
+TWIST = serialize_message(Twist())
+
+
+@pytest.mark.parametrize('is_simulated', [False, True])
+def test_a_message_that_had_to_wait_was_received_when_the_middleware_had_it(is_simulated):
+    received = []
+    _, receive = unstamped_input(Mock(), received, is_simulated)
+    waited_since_ns = time.time_ns() - 3 * SECOND
+    receive(TWIST, {'received_timestamp': waited_since_ns})
+    receive(TWIST, {'received_timestamp': 0})  # as where the middleware does not tell
+    now_ns = time.time_ns() + 10 * SECOND
+    (first, first_ns), (last, last_ns) = received
+    assert (first.event.stamp_ns, last.event.stamp_ns) == (first_ns, last_ns)
+    assert 0 <= now_ns - last_ns < 5 * SECOND
+    if is_simulated:
+        assert 0 <= now_ns - first_ns < 5 * SECOND
+    else:
+        assert first_ns == waited_since_ns
+
+
+def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
+    node = Mock()
+    source, receive = unstamped_input(node, [])
+    steady_s = time.monotonic()
+    publisher = Mock(topic_type='geometry_msgs/msg/Twist', qos_profile=QOS)
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    troubles = []
+    for step, wait_s in enumerate([0.0, *[1.5] * 30, 0.0]):
+        monkeypatch.setattr(time, 'monotonic', lambda step=step: steady_s + 0.1 * step)
+        receive(TWIST, {'received_timestamp': time.time_ns() - round(wait_s * SECOND)})
+        source.look()
+        troubles.append(source.trouble)
+    assert troubles[:20] == [''] * 20, 'it may only have been busy for a moment'
+    assert troubles[30].startswith("the node does not keep up: messages on '/twist' wait 1.5 s")
+    assert troubles[-1] == ''
 
 
 def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):

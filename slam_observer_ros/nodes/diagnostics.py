@@ -98,6 +98,7 @@ class Diagnostics:
             age = 'never' if source.age_s is None else f'{source.age_s:.3f}'
             values[f'{source.topic} rate [Hz]'] = f'{new / elapsed_s:.1f}'
             values[f'{source.topic} age [s]'] = age
+            values[f'{source.topic} wait [s]'] = f'{source.backlog.wait_s:.3f}'
             values[f'{source.topic} malformed'] = str(source.malformed)
         return values
 

@@ -12,8 +12,10 @@ from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from slam_observer_ros.backlog import Backlog
 from slam_observer_ros.errors import MessageError, ParameterError
 from slam_observer_ros.recording.cdr import Buffer
+from slam_observer_ros.units import to_s
 
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports about one topic."""
@@ -54,7 +56,9 @@ class Input(Generic[MessageT]):
     malformed : int
         Messages that could not be decoded.
     trouble : str
-        Why no message comes; empty while they do.
+        Why no message comes, or comes late; empty while they come in time.
+    backlog : Backlog
+        How long messages wait to be read.
     last_received_s : float or None
         Steady time of the last message, seconds.
 
@@ -83,6 +87,7 @@ class Input(Generic[MessageT]):
         self.received = 0
         self.malformed = 0
         self.trouble = ''
+        self.backlog = Backlog()
         self.last_received_s: float | None = None
         self._quiet_until_s = time.monotonic() + DISCOVERY_S
         if len(decoders) == 1:
@@ -119,8 +124,8 @@ class Input(Generic[MessageT]):
         )
         self._node.get_logger().info(f"receiving {type_name} on '{self.topic}'")
 
-    def _receive(self, raw: bytes) -> None:
-        receive_ns = self._node.get_clock().now().nanoseconds
+    def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
+        receive_ns = self._reception_ns(info['received_timestamp'])
         self.received += 1
         self.last_received_s = time.monotonic()
         try:
@@ -130,6 +135,19 @@ class Input(Generic[MessageT]):
             self._warn(f"malformed message on '{self.topic}' dropped: {error}")
             return
         self._on_message(message, receive_ns)
+
+    def _reception_ns(self, received_ns: int) -> int:
+        """Return when a message was received, by the ROS clock.
+
+        That is not now: while the node is busy messages wait, as the system clock tells. A
+        simulated clock only has the present time, and some middlewares tell no time but zero.
+        """
+        clock = self._node.get_clock()
+        if received_ns > 0:
+            self.backlog.add(to_s(time.time_ns() - received_ns), time.monotonic())
+            if not clock.ros_time_is_active:
+                return received_ns
+        return int(clock.now().nanoseconds)
 
     def _warn(self, text: str) -> None:
         # rclpy throttles by line of code, so one topic's report would silence the other's.
@@ -157,7 +175,7 @@ class Input(Generic[MessageT]):
         age_s = self.age_s or 0.0
         if age_s > DISCOVERY_S:
             return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
-        return ''
+        return self.backlog.trouble(self.topic)
 
 
 def message_class(type_name: str) -> Any:

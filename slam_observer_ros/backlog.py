@@ -1,0 +1,53 @@
+"""How long messages wait to be read by a program that is busy."""
+
+from __future__ import annotations
+
+BEHIND_S = 0.3
+"""Messages that wait for less, as while a map is loaded, are no matter, seconds."""
+
+LASTING_S = 2.0
+"""How long messages have to wait for more than that before it is said, seconds."""
+
+
+class Backlog:
+    """Tells a program that does not keep up with a topic from one that was busy for a moment.
+
+    Attributes
+    ----------
+    wait_s : float
+        How long the last message has waited, seconds.
+
+    """
+
+    def __init__(self) -> None:
+        self.wait_s = 0.0
+        self._last_s = 0.0
+        self._behind_since_s: float | None = None
+
+    def add(self, wait_s: float, now_s: float) -> None:
+        """Take how long a message has waited that is read now.
+
+        Parameters
+        ----------
+        wait_s : float
+            Seconds from its reception; less than zero if the clock was set meanwhile.
+        now_s : float
+            Steady time, seconds.
+
+        """
+        self.wait_s, self._last_s = max(wait_s, 0.0), now_s
+        if self.wait_s <= BEHIND_S:
+            self._behind_since_s = None
+        elif self._behind_since_s is None:
+            self._behind_since_s = now_s
+
+    def trouble(self, topic: str) -> str:
+        """Say that messages have waited for long, up to the last one; empty if they have not."""
+        since_s = self._behind_since_s
+        if since_s is None or self._last_s - since_s < LASTING_S:
+            return ''
+        return (
+            f"the node does not keep up: messages on '{topic}' wait {self.wait_s:.1f} s to be "
+            'read; send fewer of them, or make observations cheaper (gains: scheduled, '
+            'max_landmarks)'
+        )
