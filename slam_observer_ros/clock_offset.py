@@ -40,15 +40,19 @@ class ClockOffset:
         """Whether the stamps are from another clock."""
         return self.offset_ns is not None and abs(self.offset_ns) > self._limit_ns
 
+    def __str__(self) -> str:
+        """Say how far off the stamps are."""
+        offset_ns = self.offset_ns or 0
+        side = 'ahead of' if offset_ns > 0 else 'behind'
+        return f"{to_s(abs(offset_ns)):.3f} s {side} this machine's clock"
+
     def trouble(self, source: str) -> str:
         """Say how far off the stamps of ``source`` are; empty if they are right."""
-        if self.offset_ns is None or not self.is_off:
+        if not self.is_off:
             return ''
-        side = 'ahead of' if self.offset_ns > 0 else 'behind'
         return (
-            f"stamps of {source} are {to_s(abs(self.offset_ns)):.3f} s {side} this machine's "
-            'clock: synchronise the clocks, or set use_sim_time (for a recording) or '
-            'correct_clock_offset'
+            f'stamps of {source} are {self}: synchronise the clocks, or set use_sim_time (for a '
+            'recording) or correct_clock_offset'
         )
 
     def add(self, stamp_ns: int, receive_ns: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 import time
+from unittest.mock import Mock
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
@@ -11,19 +12,29 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Path
 from node_processes import running
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from rclpy.serialization import serialize_message
 from robots import own_topics, Robot, stamp_ns, TransformSender
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
+from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.nodes.conversions import time_message
+from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.nodes.transforms import TFMessage
-from slam_observer_ros.recording.point_clouds import decode_point_cloud2
+from slam_observer_ros.recording.detections import TagDetections
+from slam_observer_ros.recording.frames import BaseFrame
+from slam_observer_ros.recording.messages import VelocityMessage
+from slam_observer_ros.recording.point_clouds import decode_point_cloud2, ObservationMessage
+from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
+from slam_observer_ros.transform_buffer import TransformBuffer
+from slam_observer_ros.units import to_s
 
 pytestmark = pytest.mark.ros
 
@@ -168,6 +179,69 @@ def test_stamps_from_another_clock_are_reported_and_corrected_if_asked(ros, tmp_
         lag_ns = {name: time.time_ns() - stamp_ns(poses[name][-1]) for name in poses}
     assert abs(lag_ns['reported'] - offset_ns) < 30 * SECOND
     assert abs(lag_ns['corrected']) < 30 * SECOND
+
+
+class AnotherClock:
+    """A robot whose clock, and that of its /tf, is behind; it stands and sees one landmark."""
+
+    def __init__(self, behind_ns, **parameters):
+        self.behind_ns = behind_ns
+        self.transforms = TransformBuffer()
+        settings = ObserverNodeSettings(**parameters)
+        self.node = Mock()
+        self.estimator = Estimator(Settings(reorder_window=0.0))
+        base_frame = BaseFrame(settings, self.transforms)
+        self.intake = Intake(self.node, settings, self.estimator, base_frame)
+        self.intake.is_active = True
+
+    def send(self, received_ns):
+        stamp_ns = received_ns - self.behind_ns
+        angle = to_s(received_ns)
+        for child, pose in (('turret', se3.exp(angle * TURN)), ('tag_9', np.eye(4))):
+            parent = 'base_link' if child == 'turret' else 'turret'
+            self.transforms.insert(parent, child, stamp_ns, pose)
+        self.intake.add_velocity(VelocityMessage('', VelocityEvent(stamp_ns, STILL)), received_ns)
+        seen = se3.transform(se3.exp(-angle * TURN), np.array([[3.0, 1.0, 0.0]]))
+        event = ObservationEvent(stamp_ns, np.array([4]), seen)
+        self.intake.add_observation(ObservationMessage('turret', event), received_ns)
+        self.intake.add_tags(TagDetections(stamp_ns, 'turret', (9,), ('none',)), received_ns + 1)
+
+    def send_all(self):
+        for step in range(40):
+            self.send(1000 * SECOND + step * SECOND // 20)
+        return 1000 * SECOND + step * SECOND // 20
+
+
+STILL = np.zeros(6)
+TURN = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize('behind_ns', [0, 100 * SECOND, -100 * SECOND])
+def test_what_places_a_sensor_has_the_stamps_of_the_same_clock(behind_ns):
+    robot = AnotherClock(behind_ns, correct_clock_offset=True)
+    last_ns = robot.send_all()
+    assert robot.intake.dropped['no_transform'] == 0
+    assert robot.estimator.dropped.total() == 0
+    assert robot.estimator.stamp_ns == last_ns
+    seen = dict(zip(robot.estimator.landmark_ids, robot.estimator.world_points, strict=True))
+    assert_allclose(seen[4], [3.0, 1.0, 0.0], atol=1e-6)
+    assert_allclose(seen[9], [0.0, 0.0, 0.0], atol=1e-6)
+
+
+def test_nothing_is_recommended_that_is_done_already():
+    robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
+    robot.send_all()
+    told = [call.args[0] for call in robot.node.get_logger().info.call_args_list]
+    assert told == [
+        f"stamps of {source} are 100.000 s behind this machine's clock, and corrected from now on"
+        for source in ('landmarks', 'twist')
+    ]
+    warned = [call.args[0] for call in robot.node.get_logger().warning.call_args_list]
+    assert not any('correct_clock_offset' in text for text in warned)
+    assert robot.intake.clock_troubles() == []
+    uncorrected = AnotherClock(100 * SECOND)
+    uncorrected.send_all()
+    assert len(uncorrected.intake.clock_troubles()) == 2
 
 
 def test_a_stamp_that_was_left_out_is_the_time_of_reception(ros, tmp_path):

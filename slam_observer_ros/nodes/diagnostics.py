@@ -125,7 +125,7 @@ class Diagnostics:
 
     def _warnings(self, dropped: int, new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
-        warnings += [clock.trouble(name) for name, clock in self._intake.clocks.items()]
+        warnings += self._intake.clock_troubles()
         if self._intake.is_paused:
             warnings.append('paused')
         elif dropped:

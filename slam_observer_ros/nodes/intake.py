@@ -13,7 +13,12 @@ from rclpy.node import Node
 from slam_observer_ros.clock_offset import ClockOffset
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    VelocityEvent,
+)
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.event_builder import EventBuilder, Measured, NO_TRANSFORM
@@ -24,6 +29,13 @@ from slam_observer_ros.units import to_ns
 
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports of one kind of drop."""
+
+SOURCES: dict[type[Event], str] = {
+    VelocityEvent: 'twist',
+    AngularVelocityEvent: 'imu',
+    ObservationEvent: 'landmarks',
+}
+"""Inputs by the events that come of them; each has stamps of a clock of its own."""
 
 MeasuredT = TypeVar('MeasuredT', VelocityEvent, ObservationEvent, ImuMessage, PoseMessage)
 
@@ -78,8 +90,7 @@ class Intake:
         self._processed = 0
         self.dropped: Counter[str] = Counter()
         self.clocks = {
-            name: ClockOffset(to_ns(settings.max_clock_offset))
-            for name in ('twist', 'imu', 'landmarks')
+            name: ClockOffset(to_ns(settings.max_clock_offset)) for name in SOURCES.values()
         }
         self.is_active = False
         self.is_paused = False
@@ -133,6 +144,12 @@ class Intake:
         for clock in self.clocks.values():
             clock.clear()
 
+    def clock_troubles(self) -> list[str]:
+        """Return which inputs have stamps of another clock that are not corrected."""
+        if self._settings.correct_clock_offset:
+            return []
+        return [clock.trouble(name) for name, clock in self.clocks.items() if clock.is_off]
+
     def take_mean_processing_ms(self) -> float:
         """Return the mean time that an event took since this was asked last, milliseconds."""
         mean_s = self._processing_s / max(self._processed, 1)
@@ -144,6 +161,10 @@ class Intake:
             self._use(event)
 
     def _use(self, event: Event) -> None:
+        if self._settings.correct_clock_offset:
+            # Not before: what places the sensor on /tf has, as a rule, stamps of the same clock.
+            correction_ns = self.clocks[SOURCES[type(event)]].correction_ns
+            event = replace(event, stamp_ns=event.stamp_ns + correction_ns)
         start_s = time.perf_counter()
         self._estimator.add(replace(event, receive_ns=time.monotonic_ns()))
         self._processing_s += time.perf_counter() - start_s
@@ -153,15 +174,13 @@ class Intake:
         self._drop(NO_TRANSFORM, f"no transform to '{self._settings.base_frame}': {error}")
 
     def _timed(self, measured: MeasuredT, source: str, receive_ns: int) -> MeasuredT | None:
-        """Return the measurement in this machine's time; None if it can't be used."""
+        """Return the measurement with a stamp; None if it can't be used."""
         stamp_ns = measured.stamp_ns or receive_ns  # 0: the publisher left it out
         if not self._is_usable(source, stamp_ns, receive_ns):
             return None
         if not measured.stamp_ns:
             text = f'stamps are zero on {source}: the time of reception is taken instead'
             self._warn(f'stamps of {source}', text)
-        if self._settings.correct_clock_offset:
-            stamp_ns += self.clocks[source].correction_ns
         return replace(measured, stamp_ns=stamp_ns)
 
     def _is_usable(self, source: str, stamp_ns: int, receive_ns: int) -> bool:
@@ -173,14 +192,23 @@ class Intake:
         if receive_ns == 0:
             self._drop('no_clock', 'use_sim_time is set and /clock has not begun')
             return False
-        clock = self.clocks[source]
-        clock.add(stamp_ns, receive_ns)
-        if self._settings.correct_clock_offset and clock.offset_ns is None:
+        self._look_at_clock(source, stamp_ns, receive_ns)
+        if self._settings.correct_clock_offset and self.clocks[source].offset_ns is None:
             self._drop('clock_unknown', f'the clock of {source} is not known yet')
             return False
-        if clock.is_off:
-            self._warn(source, clock.trouble(source))
         return True
+
+    def _look_at_clock(self, source: str, stamp_ns: int, receive_ns: int) -> None:
+        """Compare a stamp with this machine's clock, and tell if that is another one."""
+        clock = self.clocks[source]
+        before_ns = clock.correction_ns
+        clock.add(stamp_ns, receive_ns)
+        if not self._settings.correct_clock_offset:
+            if clock.is_off:
+                self._warn(source, clock.trouble(source))
+        elif clock.correction_ns != before_ns:
+            text = f'stamps of {source} are {clock}, and corrected from now on'
+            self._node.get_logger().info(text)
 
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
