@@ -17,6 +17,7 @@ import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from robots import own_topics, Robot, stamp_ns, TransformSender
+import ros_messages
 from sensor_msgs.msg import Imu, PointCloud2
 
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
@@ -29,6 +30,7 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
     vector_message,
 )
+from slam_observer_ros.nodes.input_topics import CloudDecoder
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
@@ -142,6 +144,35 @@ def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
     assert troubles[:20] == [''] * 20, 'it may only have been busy for a moment'
     assert troubles[30].startswith("the node does not keep up: messages on '/twist' wait 1.5 s")
     assert troubles[-1] == ''
+
+
+@pytest.mark.parametrize(
+    ('message_type', 'name', 'found'),
+    [
+        ('sensor_msgs/msg/PointCloud2', 'ID', 'fields x y z ID'),
+        ('sensor_msgs/msg/PointCloud', 'landmark_id', 'channels landmark_id'),
+        ('sensor_msgs/msg/PointCloud2', 'id', None),
+        ('sensor_msgs/msg/PointCloud', 'id', None),
+    ],
+)
+def test_points_whose_ids_are_named_otherwise_are_told_once(message_type, name, found):
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    if message_type.endswith('2'):
+        dtype = [('x', '<f4'), ('y', '<f4'), ('z', '<f4'), (name, '<u4')]
+        clouds = [ros_messages.point_cloud2(np.ones((1, count), dtype)) for count in (0, 2, 2)]
+    else:
+        clouds = [
+            ros_messages.point_cloud(np.ones((count, 3)), {name: np.ones(count)})
+            for count in (0, 2, 2)
+        ]
+    decode = CloudDecoder(node, message_type)
+    decoded = [decode(ros_messages.serialise(cloud), 0) for cloud in clouds]
+    assert [len(message.event.ids) for message in decoded] == [0, 2, 2]
+    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    start = f"points on '/robot/landmarks' come without ids; {found}: they are told apart"
+    assert [text.startswith(start) for text in told] == ([] if found is None else [True])
+    assert all(text.endswith("name these 'id'") for text in told)
 
 
 def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):

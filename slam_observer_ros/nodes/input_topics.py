@@ -9,10 +9,12 @@ from typing import Any, TypeVar
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.recording.cdr import Buffer
+from slam_observer_ros.recording.cloud_ids import missing_ids
 from slam_observer_ros.recording.detections import (
     decode_apriltags,
     decode_pose_array,
@@ -24,6 +26,7 @@ from slam_observer_ros.recording.message_types import (
     CLOUD_DECODERS,
     DETECTION_DECODERS,
     IMU,
+    ObservationDecoder,
     ODOMETRY,
     POSE_ARRAY,
     TRANSFORMS,
@@ -36,7 +39,8 @@ from slam_observer_ros.recording.messages import (
     ImuMessage,
     PoseMessage,
 )
-from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.recording.point_cloud_layout import ID_NAME
+from slam_observer_ros.recording.point_clouds import field_names, ObservationMessage
 
 ValueT = TypeVar('ValueT')
 
@@ -74,10 +78,52 @@ def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
         return Input(node, 'landmarks', {APRILTAGS: decode_apriltags}, intake.add_tags, qos)
     if settings.landmarks_type == AUTO:
         # Not detections: their package, which need not be installed, would be imported unasked.
-        decoders = CLOUD_DECODERS | {POSE_ARRAY: decode_pose_array}
+        decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
         return Input(node, 'landmarks', decoders, intake.add_observation, qos)
-    decoders = _chosen(CLOUD_DECODERS | DETECTION_DECODERS, settings.landmarks_type)
+    decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
     return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+
+
+class CloudDecoder:
+    """Decodes clouds, and says once if their points have no field or channel for ids.
+
+    They are told apart by where they are then, as is wanted, or as a name is misspelt.
+
+    Parameters
+    ----------
+    node : Node
+        Node that logs.
+    message_type : str
+        One of ``CLOUD_DECODERS``.
+
+    """
+
+    def __init__(self, node: Node, message_type: str) -> None:
+        self._node = node
+        self._message_type = message_type
+        self._is_looked_at = False
+
+    def __call__(self, raw: Buffer, receive_ns: int) -> ObservationMessage:
+        """Decode a cloud."""
+        message = CLOUD_DECODERS[self._message_type](raw, receive_ns)
+        ids = message.event.ids
+        if not self._is_looked_at and len(ids) and (ids == UNKNOWN_ID).all():
+            self._is_looked_at = True
+            self._look(raw)
+        return message
+
+    def _look(self, raw: Buffer) -> None:
+        missing = missing_ids(field_names(raw, self._message_type), self._message_type)
+        if missing:
+            topic = self._node.resolve_topic_name('landmarks')
+            self._node.get_logger().warning(
+                f"points on '{topic}' come {missing}: they are told apart by where they are; if "
+                f"they have ids, name these '{ID_NAME}'"
+            )
+
+
+def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:
+    return {message_type: CloudDecoder(node, message_type) for message_type in CLOUD_DECODERS}
 
 
 def _chosen(decoders: Mapping[str, ValueT], type_choice: str) -> dict[str, ValueT]:

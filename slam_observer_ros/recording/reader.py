@@ -16,6 +16,7 @@ import numpy as np
 
 from slam_observer_ros.errors import MessageError, RecordingError, TransformError
 from slam_observer_ros.events import Event
+from slam_observer_ros.recording.cloud_ids import missing_ids
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_landmarks,
@@ -200,9 +201,7 @@ class Recording:
             return 'without ids'
         if topic.message_type not in CLOUD_DECODERS:
             return ''
-        names = self._field_names(topic)
-        kind = 'fields' if topic.message_type.endswith('PointCloud2') else 'channels'
-        return '' if ID_NAME in names else f'without ids; {kind} {" ".join(names) or "none"}'
+        return missing_ids(self._field_names(topic), topic.message_type)
 
     def poses_move(self, topic: Topic) -> bool:
         """Tell whether a topic holds an odometry's poses, and they are not all the same."""
