@@ -13,10 +13,10 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_velocity, pose_from_rpy
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.detections import TagDetections
-from slam_observer_ros.recording.event_builder import EventBuilder, MAX_WAITING
+from slam_observer_ros.recording.event_builder import drop_reason, EventBuilder, MAX_WAITING
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.input_settings import InputSettings
-from slam_observer_ros.recording.messages import VelocityMessage
+from slam_observer_ros.recording.messages import PoseMessage, VelocityMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.transform_buffer import TransformBuffer
 
@@ -152,3 +152,17 @@ def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used()
 def test_without_an_odometry_frame_velocities_may_name_none():
     message = VelocityMessage('', VelocityEvent(0, V))
     assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(message)
+
+
+def test_a_jump_of_the_odometrys_pose_is_dropped_by_a_reason_of_its_own():
+    drops = []
+    builder = EventBuilder(BaseFrame(InputSettings(), TransformBuffer()), 0.1, 0.5, drops.append)
+    no_turn = np.array([0.0, 0.0, 0.0, 1.0])
+    events = []
+    for step, x in enumerate([5.0, 5.02, 0.0, 0.02]):
+        stamp_ns = step * 20 * MS
+        pose = PoseMessage(stamp_ns, 'odom', 'base_link', np.array([x, 0.0, 0.0]), no_turn)
+        events += builder.add(pose, stamp_ns)
+    assert [event.stamp_ns for event in events] == [0, 40 * MS]
+    assert_allclose([event.body_velocity[3] for event in events], [1.0, 1.0])
+    assert [drop_reason(error) for error in drops] == ['pose_jump']

@@ -269,6 +269,30 @@ class TestVelocities:
         again = slam_observer('replay', path, '--velocity-source', 'pose_differences')
         assert again.errors == ''
 
+    def test_an_odometry_that_is_reset_on_the_way(self, slam_observer, tmp_path):
+        path = tmp_path / 'reset.mcap'
+        restart_ns = ros.STAMP_NS + STEPS // 2 * STEP_NS
+        with RecordingWriter(path) as writer:
+            drive = Drive(writer)
+            drive.landmarks(ros.STAMP_NS)
+            for stamp_ns in stamps_ns():
+                pose = true_pose(stamp_ns)
+                if stamp_ns >= restart_ns:
+                    pose = se3.inverse(true_pose(restart_ns)) @ pose
+                message = ros.odometry(
+                    np.zeros(6), np.zeros((6, 6)), 2.0 * pose[:3, 3],
+                    so3.to_quaternion(pose[:3, :3]), stamp_ns=stamp_ns,
+                )  # fmt: skip
+                drive.write('/odom', message, stamp_ns)
+                truth = true_pose(stamp_ns).copy()
+                truth[:3, 3] *= 2.0
+                writer.write_pose(PoseTruth(stamp_ns, truth))
+        options = ('--json', '--velocity-source', 'pose_differences')
+        ended = slam_observer('replay', path, *options)
+        assert ended.json['dropped'] == {'pose_jump': 1}
+        assert ended.errors.count('Dropped a message (pose_jump)') == 1
+        assert ended.json['dead_reckoning_ate_rmse_m'] < 0.01
+
     def test_an_imu_with_the_stamps_of_the_odometry_turns_it_at_once(
         self, slam_observer, tmp_path
     ):

@@ -10,6 +10,7 @@ import pytest
 from strategies import poses
 
 from slam_observer_ros.clock_offset import ClockOffset, SAMPLES
+from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.event_queue import EventQueue
 from slam_observer_ros.events import (
@@ -44,6 +45,35 @@ def test_poses_far_apart_or_in_wrong_order_give_no_velocity():
     differences = PoseDifferences(SECOND)
     for stamp_ns in (SECOND, 3 * SECOND, 3 * SECOND, 2 * SECOND):
         assert differences.add(stamp_ns, np.eye(4)) is None
+
+
+@pytest.mark.parametrize('rate_hz', [10, 50, 1000])
+@pytest.mark.parametrize('jump', [[0.0, 0.0, 0.0, 7.0, 2.0, 0.0], [0.0, 0.0, 3.0, -6.0, 0.0, 0.0]])
+def test_an_odometry_that_was_reset_gives_no_velocity_from_before_to_after(rate_hz, jump):
+    period_ns = SECOND // rate_hz
+    differences = PoseDifferences(SECOND)
+    before = se3.exp(np.array(jump))
+    assert differences.add(START_NS, before) is None
+    with pytest.raises(InvalidEventError, match='has jumped') as raised:
+        differences.add(START_NS + period_ns, np.eye(4))
+    assert raised.value.reason == 'pose_jump'
+    moved = se3.exp(V / rate_hz)
+    event = differences.add(START_NS + 2 * period_ns, moved)
+    assert event.stamp_ns == START_NS + period_ns
+    assert_allclose(event.body_velocity, V, atol=1e-9)
+
+
+def test_what_a_robot_can_do_is_no_jump():
+    differences = PoseDifferences(SECOND)
+    fast = np.array([0.0, 0.0, 40.0, 40.0, 0.0, 0.0])
+    differences.add(START_NS, np.eye(4))
+    assert_allclose(
+        differences.add(START_NS + SECOND // 50, se3.exp(fast / 50)).body_velocity, fast, atol=1e-9
+    )
+    # Two stamps may be nearly the same: it has moved nevertheless.
+    differences = PoseDifferences(SECOND)
+    differences.add(START_NS, np.eye(4))
+    assert differences.add(START_NS + 1000, se3.exp(V / 50)) is not None
 
 
 def wheels(time_s, velocity, covariance=None):

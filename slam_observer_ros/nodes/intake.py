@@ -21,7 +21,12 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.recording.detections import TagDetections
-from slam_observer_ros.recording.event_builder import EventBuilder, Measured, NO_TRANSFORM
+from slam_observer_ros.recording.event_builder import (
+    drop_reason,
+    DropError,
+    EventBuilder,
+    Measured,
+)
 from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
@@ -83,7 +88,7 @@ class Intake:
             base_frame,
             settings.transform_timeout,
             estimator.settings.velocity_timeout,
-            self._drop_untransformed,
+            self._drop_measured,
         )
         self._quiet_until_s: dict[str, float] = {}
         self._processing_s = 0.0
@@ -170,8 +175,10 @@ class Intake:
         self._processing_s += time.perf_counter() - start_s
         self._processed += 1
 
-    def _drop_untransformed(self, error: TransformError) -> None:
-        self._drop(NO_TRANSFORM, f"no transform to '{self._settings.base_frame}': {error}")
+    def _drop_measured(self, error: DropError) -> None:
+        is_unplaced = isinstance(error, TransformError)
+        why = f"no transform to '{self._settings.base_frame}': " if is_unplaced else ''
+        self._drop(drop_reason(error), f'{why}{error}')
 
     def _timed(self, measured: MeasuredT, source: str, receive_ns: int) -> MeasuredT | None:
         """Return the measurement with a stamp; None if it can't be used."""

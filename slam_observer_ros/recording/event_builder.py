@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import logging
 from typing import TypeAlias
 
-from slam_observer_ros.errors import TransformError
+from slam_observer_ros.errors import InvalidEventError, TransformError
 from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityEvent
 from slam_observer_ros.recording.detections import TagDetections
 from slam_observer_ros.recording.frames import BaseFrame
@@ -25,6 +25,9 @@ NO_TRANSFORM = 'no_transform'
 
 _InFrame: TypeAlias = VelocityMessage | ImuMessage | ObservationMessage | TagDetections
 Measured: TypeAlias = _InFrame | PoseMessage
+
+DropError: TypeAlias = TransformError | InvalidEventError
+"""Why a measurement makes no event."""
 
 _logger = logging.getLogger(__name__)
 
@@ -53,6 +56,11 @@ def with_receive_time(measured: Measured, receive_stamp_ns: int) -> Measured:
     return replace(measured, event=replace(measured.event, stamp_ns=receive_stamp_ns))
 
 
+def drop_reason(error: DropError) -> str:
+    """Return the key under which what is dropped is counted."""
+    return error.reason if isinstance(error, InvalidEventError) else NO_TRANSFORM
+
+
 class EventBuilder:
     """Makes events in the base frame of measurements, in the order in which these come.
 
@@ -68,7 +76,7 @@ class EventBuilder:
     velocity_timeout_s : float
         How long a velocity holds, seconds: poses further apart give none.
     on_drop : callable
-        Called with why a measurement is dropped.
+        Called with why a measurement is dropped; :func:`drop_reason` tells the key to count it.
 
     """
 
@@ -77,7 +85,7 @@ class EventBuilder:
         base_frame: BaseFrame,
         transform_timeout_s: float,
         velocity_timeout_s: float,
-        on_drop: Callable[[TransformError], None],
+        on_drop: Callable[[DropError], None],
     ) -> None:
         self._base_frame = base_frame
         self._transform_timeout_ns = to_ns(transform_timeout_s)
@@ -99,7 +107,7 @@ class EventBuilder:
 
         """
         if isinstance(measured, PoseMessage):
-            velocity = self._poses.add(measured.stamp_ns, measured.pose)
+            velocity = self._difference(measured)
             if velocity is None:
                 return []
             measured = VelocityMessage(measured.child_frame_id, velocity)
@@ -118,6 +126,13 @@ class EventBuilder:
     def forget(self) -> None:
         """Drop what waits, as after a jump of the clock."""
         self._waiting.clear()
+
+    def _difference(self, message: PoseMessage) -> VelocityEvent | None:
+        try:
+            return self._poses.add(message.stamp_ns, message.pose)
+        except InvalidEventError as error:
+            self._on_drop(error)
+            return None
 
     def _attempt(self, item: _Waiting, now_ns: int) -> list[Event]:
         try:

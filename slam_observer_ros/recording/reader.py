@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from slam_observer_ros.errors import MessageError, RecordingError, TransformError
+from slam_observer_ros.errors import MessageError, RecordingError
 from slam_observer_ros.events import Event
 from slam_observer_ros.recording.cloud_ids import missing_ids
 from slam_observer_ros.recording.decoding import (
@@ -25,9 +25,10 @@ from slam_observer_ros.recording.decoding import (
     input_decoders,
 )
 from slam_observer_ros.recording.event_builder import (
+    drop_reason,
+    DropError,
     EventBuilder,
     Measured,
-    NO_TRANSFORM,
     with_receive_time,
 )
 from slam_observer_ros.recording.frames import BaseFrame, insert_transforms
@@ -286,10 +287,11 @@ class Recording:
         messages = self._decoded(raw, decode_transform_message)
         insert_transforms(transforms, messages or (), is_static=is_static)
 
-    def _drop(self, error: TransformError) -> None:
-        if not self.dropped[NO_TRANSFORM]:
-            _logger.warning('Dropped a message (%s): %s', NO_TRANSFORM, error)
-        self.dropped[NO_TRANSFORM] += 1
+    def _drop(self, error: DropError) -> None:
+        reason = drop_reason(error)
+        if not self.dropped[reason]:
+            _logger.warning('Dropped a message (%s): %s', reason, error)
+        self.dropped[reason] += 1
 
 
 def open_recording(path: Path | str) -> Recording:
