@@ -41,10 +41,10 @@ class Backlog:
         elif self._behind_since_s is None:
             self._behind_since_s = now_s
 
-    def trouble(self, topic: str) -> str:
-        """Say that messages have waited for long, up to the last one; empty if they have not."""
-        since_s = self._behind_since_s
-        if since_s is None or self._last_s - since_s < LASTING_S:
+    def trouble(self, topic: str, now_s: float) -> str:
+        """Say that messages have waited for long and still do; empty if not, or if none come."""
+        since_s, last_s = self._behind_since_s, self._last_s
+        if since_s is None or last_s - since_s < LASTING_S or now_s - last_s > LASTING_S:
             return ''
         return (
             f"the node does not keep up: messages on '{topic}' wait {self.wait_s:.1f} s to be "

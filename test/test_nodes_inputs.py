@@ -136,14 +136,21 @@ def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
     publisher = Mock(topic_type='geometry_msgs/msg/Twist', qos_profile=QOS)
     node.get_publishers_info_by_topic.return_value = [publisher]
     troubles = []
-    for step, wait_s in enumerate([0.0, *[1.5] * 30, 0.0]):
-        monkeypatch.setattr(time, 'monotonic', lambda step=step: steady_s + 0.1 * step)
-        receive(TWIST, {'received_timestamp': time.time_ns() - round(wait_s * SECOND)})
+
+    def at(step):
+        monkeypatch.setattr(time, 'monotonic', lambda: steady_s + 0.1 * step)
         source.look()
-        troubles.append(source.trouble)
+        return source.trouble
+
+    for step, wait_s in enumerate([0.0, *[1.5] * 30, 0.0, *[1.5] * 30]):
+        at(step)
+        receive(TWIST, {'received_timestamp': time.time_ns() - round(wait_s * SECOND)})
+        troubles.append(at(step))
     assert troubles[:20] == [''] * 20, 'it may only have been busy for a moment'
     assert troubles[30].startswith("the node does not keep up: messages on '/twist' wait 1.5 s")
-    assert troubles[-1] == ''
+    assert troubles[31] == ''
+    assert troubles[-1]
+    assert at(step + 30) == '', 'no message comes any more'
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,7 @@ class Input(Generic[MessageT]):
         age_s = self.age_s or 0.0
         if age_s > DISCOVERY_S:
             return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
-        return self.backlog.trouble(self.topic)
+        return self.backlog.trouble(self.topic, time.monotonic())
 
 
 def message_class(type_name: str) -> Any:
