@@ -287,12 +287,12 @@ def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatc
         return [call.args[0] for call in warning.call_args_list]
 
     for _ in range(20):
-        receive(b'')
+        receive(b'', {'received_timestamp': 0})
         assert not look_for(1)
     told = look_for(20)
     assert told[0] == "no message on '/twist' for 6 s, though it has a publisher"
     assert len(told) == 2, 'not throttled'
-    receive(b'')
+    receive(b'', {'received_timestamp': 0})
     assert len(look_for(4)) == 2
     assert not source.trouble
 
