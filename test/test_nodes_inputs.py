@@ -274,6 +274,7 @@ def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatc
     monkeypatch.setattr(inputs, 'time', SimpleNamespace(monotonic=lambda: clock.now_s))
     node, qos = Mock(), QoSProfile(depth=1)
     node.resolve_topic_name.return_value = '/twist'
+    node.get_clock.return_value.now.return_value.nanoseconds = 0
     publisher = SimpleNamespace(topic_type=IMU, qos_profile=qos, node_name='driver')
     node.get_publishers_info_by_topic.return_value = [publisher]
     source = inputs.Input(node, 'twist', {IMU: lambda raw, receive_ns: raw}, Mock(), qos)
