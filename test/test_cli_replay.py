@@ -48,14 +48,16 @@ def run_in_every_format(tmp_path_factory):
     return recordings.write_all_formats(tmp_path_factory.mktemp('formats'))
 
 
-def write_events(path, events):
-    """Write a recording without truth."""
+def write_events(path, events, true_poses=()):
+    """Write a recording without truth, or with some."""
     with RecordingWriter(path) as writer:
         for event in events:
             if isinstance(event, VelocityEvent):
                 writer.write_velocity(event)
             else:
                 writer.write_observation(event)
+        for truth in true_poses:
+            writer.write_pose(truth)
     return path
 
 
@@ -139,29 +141,17 @@ class TestReport:
     def test_the_share_of_the_trajectory_that_the_truth_covers_is_told(
         self, slam_observer, tmp_path
     ):
-        path = tmp_path / 'half.mcap'
-        with RecordingWriter(path) as writer:
-            for event in recordings.events():
-                if isinstance(event, VelocityEvent):
-                    writer.write_velocity(event)
-                else:
-                    writer.write_observation(event)
-            for truth in list(recordings.true_poses())[:50]:
-                writer.write_pose(truth)
+        half = recordings.true_poses()[:50]
+        path = write_events(tmp_path / 'half.mcap', recordings.events(), half)
         told = slam_observer('replay', path).output
         assert re.search(r'truth +│ covers (49|50)\.\d % of the trajectory', told)
 
     def test_truth_at_another_time_is_no_truth(self, slam_observer, tmp_path):
-        path = tmp_path / 'run.mcap'
-        with RecordingWriter(path) as writer:
-            for event in recordings.events():
-                if isinstance(event, VelocityEvent):
-                    writer.write_velocity(event)
-                else:
-                    writer.write_observation(event)
-            for index, truth in enumerate(recordings.true_poses()):
-                early = type(truth)(1_000_000_000 + index * recordings.STEP_NS, truth.pose)
-                writer.write_pose(early)
+        early = [
+            PoseTruth(1_000_000_000 + index * recordings.STEP_NS, truth.pose)
+            for index, truth in enumerate(recordings.true_poses())
+        ]
+        path = write_events(tmp_path / 'run.mcap', recordings.events(), early)
         ended = slam_observer('replay', path, '--json')
         assert ended.json['ate_rmse_m'] is None
         assert 'slam-observer: warning: The trajectory is not compared' in ended.errors
