@@ -107,9 +107,10 @@ def find_assignments(
     is_new_id = (ids != UNKNOWN_ID) & (landmarks.rows_of(ids) < 0)
     certain = nearly & ~is_new_id[at]
     unpaired_costs = np.where(is_new_id, unpaired_cost(RESOLUTION), unpaired_cost(gate))
-    lonely_cost = float(np.delete(unpaired_costs, at).sum())
+    # Beyond what is searched; a point of no landmark costs the same whatever it might have been.
+    fixed_cost = m * unpaired_cost(gate) - float(unpaired_costs[np.unique(at)].sum())
     margin = 0.0 if certain.all() else MARGIN
-    search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - lonely_cost)
+    search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
     J = np.linalg.inv(np.linalg.cholesky(noise[:, :k, :k])) @ axes.output_matrix(points)
     assignments: list[Assignment] = []
     moves: list[FloatArray] = []
@@ -118,7 +119,7 @@ def find_assignments(
         if all(_largest(move - other) > RESOLUTION for other in moves):
             found = np.full(m, -1)
             found[at[pairing.chosen]] = rows[pairing.chosen]
-            assignments.append(Assignment(found, pairing.cost + lonely_cost))
+            assignments.append(Assignment(found, pairing.cost + fixed_cost))
             moves.append(move)
     return assignments
 

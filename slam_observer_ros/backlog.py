@@ -35,10 +35,11 @@ class Backlog:
             Steady time, seconds.
 
         """
+        is_long_ago = now_s - self._last_s > LASTING_S
         self.wait_s, self._last_s = max(wait_s, 0.0), now_s
         if self.wait_s <= BEHIND_S:
             self._behind_since_s = None
-        elif self._behind_since_s is None:
+        elif self._behind_since_s is None or is_long_ago:
             self._behind_since_s = now_s
 
     def trouble(self, topic: str, now_s: float) -> str:

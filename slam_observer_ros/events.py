@@ -62,7 +62,7 @@ class AngularVelocityEvent:
     angular_velocity : FloatArray
         (3,) in the base frame, rad/s.
     covariance : FloatArray or None
-        (3, 3) its covariance, rad²/s²; None if unknown.
+        (3, 3) its covariance, rad²/s²; None, or all zero, if unknown.
     receive_ns : int or None
         When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
 

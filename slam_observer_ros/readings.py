@@ -93,12 +93,13 @@ def readings(
     if not isinstance(gains, RiccatiGains):
         return [Reading(event, 0.0)]
     sighting = slam.look(event)
-    suspects = _suspect_ids(slam, gains, sighting.residuals)
-    if (event.ids == UNKNOWN_ID).any() or may_name(slam, event):
-        return _named(slam, gains, event, new_ids, suspects, budget)
-    m, residuals = len(event.ids), sighting.residuals
-    if gains.are_all_rejected(residuals):
+    residuals, m = sighting.residuals, len(event.ids)
+    some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
+    if not some_are_unknown and gains.are_all_rejected(residuals):
         return _rejected_or_slipped(slam, sighting, event)
+    suspects = _suspect_ids(slam, gains, residuals)
+    if some_are_unknown or may_name(slam, event):
+        return _named(slam, gains, event, new_ids, suspects, budget)
     trusting = _cost(slam, gains, m, residuals)
     found = [Reading(event, trusting)]
     left_out = [suspects] if len(suspects) > 1 else []

@@ -8,6 +8,7 @@ from slam_observer_ros.errors import InvalidEventError, MapError, ParameterError
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
+    LARGEST_ID,
     ObservationEvent,
     UNKNOWN_ID,
     VelocityEvent,
@@ -96,6 +97,10 @@ def check_map(landmark_map: LandmarkMap) -> None:
             _check_definite('map covariances', landmark_map.covariances)
     except InvalidEventError as error:
         raise MapError(str(error)) from error
+    if ids.dtype.kind not in 'iu' or np.any((ids < 0) | (ids > LARGEST_ID)):
+        raise MapError(f'map ids: integers from 0 to {LARGEST_ID} are wanted')
+    if np.any(landmark_map.counts < 0):
+        raise MapError('map counts: one is negative')
     if len(np.unique(ids)) < n:
         raise MapError('an id is there more than once in the map')
 

@@ -246,7 +246,7 @@ class _Joined:
 
     def _write_angular(self, row: int, angular: AngularVelocityEvent) -> None:
         """Put the other sensor's angular velocity in place of the velocity's own."""
-        is_stated = angular.covariance is not None
+        is_stated = angular.covariance is not None and bool(angular.covariance.any())
         self.body_velocities[row, :3] = angular.angular_velocity
         self.covariances[row, :3] = self.covariances[row, :, :3] = 0.0
         self.covariances[row, :3, :3] = angular.covariance if is_stated else 0.0

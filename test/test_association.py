@@ -39,6 +39,7 @@ from slam_observer_ros.landmark_index import LandmarkIndex
 from slam_observer_ros.landmark_map import LandmarkMap
 from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
+from slam_observer_ros.readings import readings
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.settings import Settings
 
@@ -408,6 +409,23 @@ def test_a_landmark_first_seen_without_its_id_takes_it_when_it_is_told(settings,
     expected = named.world_points[np.argsort(named.landmark_ids)]
     assert_allclose(estimator.world_points[order], expected, atol=1e-6)
     assert_allclose(estimator.pose, named.pose, atol=1e-6)
+
+
+def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
+    """Else states with other maps could not be compared."""
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    costs = []
+    for some_have_no_id in (False, True):
+        estimator = Estimator(SPATIAL)
+        for step in range(10):
+            stand(estimator, 0.1 * step)
+            far = [[30.0, 30.0, 0.0]] if some_have_no_id else []
+            observe(estimator, 0.1 * step, [*points, *far], [1, 2, *[UNKNOWN_ID] * len(far)])
+        new = np.array([*points, [-2.0, 2.0, 0.0]])
+        event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
+        (reading,) = readings(estimator._slam, event, np.arange(3), np.inf)
+        costs.append(reading.cost)
+    assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
 
 def test_ids_name_the_landmarks_of_a_fixed_map_that_has_none():

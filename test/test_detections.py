@@ -88,9 +88,14 @@ def test_an_id_that_could_not_be_published_is_refused(number):
     for item in (detector.detection(number), detector.detection('', f'reflector_{number}')):
         with pytest.raises(MessageError, match=reason):
             detections(item)
-    for frame in (f'tag_{number}', f'tag36h11:{number}'):
-        with pytest.raises(MessageError, match=reason):
-            observed_tags([transform('camera', frame, 1.0)], 'tag_')
+    with pytest.raises(MessageError, match=reason):
+        observed_tags([transform('camera', f'tag_{number}', 1.0)], 'tag_')
+
+
+def test_a_frame_with_a_serial_number_is_no_fiducial():
+    frames = ('realsense:815412070846', 'tag36h11:3')
+    (seen,) = observed_tags([transform('camera', frame, 1.0) for frame in frames], 'tag_')
+    assert_array_equal(seen.event.ids, [3])
 
 
 def test_the_largest_id_is_taken():

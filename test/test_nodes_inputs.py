@@ -151,6 +151,10 @@ def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
     assert troubles[31] == ''
     assert troubles[-1]
     assert at(step + 30) == '', 'no message comes any more'
+    for step in (2000, 4000):
+        at(step)
+        receive(TWIST, {'received_timestamp': time.time_ns() - SECOND})
+        assert at(step) == '', 'single messages say nothing of the time between'
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,17 @@ def test_an_initial_pose_beyond_what_the_parameter_allows_is_refused(x):
     assert_allclose(given.estimator.pose, np.eye(4), atol=1e-9)
 
 
+def test_an_initial_pose_whose_covariance_is_none_is_refused():
+    given = GivenPose()
+    message = initial_pose(np.eye(4))
+    message.pose.covariance[1] = 0.1  # and its mirror image is zero
+    given.receive(serialize_message(message))
+    (reason,) = given.node.get_logger().error.call_args.args
+    assert reason.startswith('the pose given is not used: pose covariance: asymmetric')
+    given.see()
+    assert_allclose(given.estimator.pose, np.eye(4), atol=1e-9)
+
+
 @pytest.mark.parametrize('unknown', [1e9, 1e300, 1.7e308])
 def test_huge_variances_of_an_initial_pose_say_unknown(unknown):
     given = GivenPose()

@@ -116,6 +116,21 @@ def test_odometry_that_is_late_is_waited_for(monkeypatch, rate_factor, lag_s):
     assert (f'is {lag_s} s behind the estimate' in robot.broadcaster.trouble) == (lag_s > 0.5)
 
 
+def test_odometry_that_is_stamped_far_ahead_is_reported(robot):
+    robot.run(15.0, lag_s=-20.0)
+    assert not robot.take()
+    assert 'odometry on /tf is stamped far ahead of the estimate' in robot.broadcaster.trouble
+    assert robot.broadcaster.trouble in robot.logged
+
+
+def test_after_a_reset_the_search_for_odometry_begins_anew(robot):
+    robot.run(0.5)
+    robot.broadcaster.forget()
+    robot.wait(60.0)
+    robot.run(DISCOVERY_S - 0.5)
+    assert not robot.take()
+
+
 def test_odometry_that_ends_is_reported_until_it_is_back(robot):
     robot.run(1.0, lag_s=0.0)
     assert not robot.broadcaster.trouble

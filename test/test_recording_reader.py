@@ -16,8 +16,10 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
+from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.topics import TopicNames
+from slam_observer_ros.recording.truth import LandmarkTracks
 from slam_observer_ros.recording.writer import RecordingWriter
 
 FORMATS = [
@@ -429,23 +431,41 @@ def test_last_position_of_a_true_landmark_counts(tmp_path):
     assert landmarks.world_points[:, 0].tolist() == [1.0, 2.0]
 
 
-def test_true_landmarks_that_move_are_where_they_are_at_the_time(tmp_path):
-    path = tmp_path / 'moving.mcap'
-    with RecordingWriter(path) as writer:
-        writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
-        writer.write_observation(ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3))))
-        for second, ids in enumerate(([7], [7], [7, 8], [7, 8])):
-            points = np.full((len(ids), 3), float(max(second - 1, 0)))
-            stamp_ns = ros.STAMP_NS + second * 1_000_000_000
-            writer.write_landmarks(stamp_ns, LandmarkTruth(np.array(ids), points))
-    with open_recording(path) as recording:
-        tracks = recording.truth(recording.find_topics()).tracks
-    assert tracks.ids.tolist() == [7, 8]
-    at_rest_s, between_s, end_s, later_s = 0.0, 2.5, 3.0, 9.0
-    for time_s, x in ((at_rest_s, (0, 1)), (between_s, (1.5, 1.5)), (end_s, (2, 2)),
-                      (later_s, (2, 2))):  # fmt: skip
-        landmarks = tracks.at(ros.STAMP_NS + int(time_s * 1e9))
+def landmark_messages(*told):
+    """Messages of (second, ids, x of all of them)."""
+    return [
+        ObservationMessage(
+            'world',
+            ObservationEvent(s * 1_000_000_000, np.array(ids), np.full((len(ids), 3), float(x))),
+        )
+        for s, ids, x in told
+    ]
+
+
+@pytest.mark.parametrize(
+    ('told', 'expected'),
+    [
+        ([(0, [7], 0), (1, [7], 0), (2, [7, 8], 1), (3, [7, 8], 2)],
+         {0.0: (0, 1), 1.5: (0.5, 1), 2.5: (1.5, 1.5), 3.0: (2, 2), 9.0: (2, 2)}),
+        ([(s, [7], 0) for s in range(100)] + [(100, [7], 10), (101, [7], 10)],
+         {50.0: (0,), 99.0: (0,), 99.5: (5,), 100.0: (10,)}),
+        ([(s, [i], s) for s in range(3) for i in (7, 8)], {0.5: (0.5, 0.5), 1.5: (1.5, 1.5)}),
+        ([(1, [7], 1), (0, [7], 0)], {-1.0: (0,), 0.5: (0.5,), 1.0: (1,)}),
+        ([(0, [7], 0), (0, [7], 3)], {-1.0: (3,), 0.0: (3,), 1.0: (3,)}),
+        ([(0, [-1], 0), (5, [7], 3)], {0.0: (3,)}),
+    ],
+    ids=['moves', 'at rest, then put', 'one each message', 'unsorted', 'told anew', 'unknown'],
+)  # fmt: skip
+def test_true_landmarks_are_where_they_are_at_the_time(told, expected):
+    tracks = LandmarkTracks.from_messages(landmark_messages(*told))
+    for time_s, x in expected.items():
+        landmarks = tracks.at(int(time_s * 1e9))
         assert_allclose(landmarks.world_points[:, 0], x)
+
+
+def test_nothing_told_of_true_landmarks_is_no_truth():
+    for told in ((), ((0, [-1], 0),)):
+        assert LandmarkTracks.from_messages(landmark_messages(*told)) is None
 
 
 def test_bag_of_several_files_is_read_whole(tmp_path):

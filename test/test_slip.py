@@ -88,6 +88,27 @@ def test_a_robot_that_is_carried_is_found_again_at_once(settings, seed):
     assert np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]) < 0.3
 
 
+@seeds
+def test_a_landmark_without_id_keeps_no_robot_from_being_found_again(seed):
+    """Seen before it was carried, while a landmark with a new id is seen from then on."""
+    world, moved = carried(PLANAR, seed)
+
+    def with_others(_, event):
+        pose, is_before = world.true_pose(event.stamp_ns), seconds(event) < 20.0
+        body = pose if is_before else moved @ pose
+        point = np.array([[-2.0, 3.0, 0.0]] if is_before else [[2.0, 1.0, 0.0]])
+        return replace(
+            event,
+            ids=np.append(event.ids, UNKNOWN_ID if is_before else 500),
+            points=np.vstack([event.points, se3.transform(se3.inverse(body), point)]),
+        )
+
+    estimator, _ = run(world.with_observations(with_others), PLANAR)
+    pose = moved @ world.true_pose(world.events[-1].stamp_ns)
+    assert estimator.counts['slip'] == 1
+    assert np.linalg.norm(estimator.pose[:3, 3] - pose[:3, 3]) < 0.1
+
+
 def without_ids(_, event):
     return replace(event, ids=np.full(len(event.ids), UNKNOWN_ID))
 

@@ -111,6 +111,13 @@ def test_imu_replaces_the_angular_part_while_it_is_in_time():
     assert_array_equal(held.body_velocities[4], V, 'the IMU has timed out')
 
 
+def test_an_imu_whose_covariance_is_zero_does_not_know_it():
+    history = history_of([imu(0.0, [0.0, 0.0, 0.5], np.zeros((3, 3))), wheels(0.1, V)])
+    assert not held_for(history, 0.1, 0.2).is_stated.any()
+    history = history_of([imu(0.0, [0.0, 0.0, 0.5], np.eye(3)), wheels(0.1, V)])
+    assert held_for(history, 0.1, 0.2).is_stated.tolist() == [[True, False]]
+
+
 def test_an_imu_alone_is_no_velocity():
     history = VelocityHistory(SECOND)
     assert not history.append(imu(0.0, [0.0, 0.0, 1.0])), 'the wheels have not begun'

@@ -157,6 +157,8 @@ def _nees_of_anchor(estimate: Trajectory, covariances: FloatArray) -> float:
 
     It turns all other poses about the first one, and shifts them.
     """
+    if not covariances[0].any():  # as nearly always
+        return 0.0
     variances, directions = np.linalg.eigh(covariances[0])
     turns, shifts = np.split(
         directions.T * np.sqrt(np.maximum(variances, 0.0))[:, None], 2, axis=1

@@ -8,7 +8,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from rclpy.node import Node
 
-from slam_observer_ros.errors import MessageError
+from slam_observer_ros.errors import MessageError, ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.map_frame import GIVEN_POSE_STD
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
@@ -59,11 +59,11 @@ class InitialPose:
             message = decode_pose_with_covariance_stamped(raw)
             self._check(message)
             covariance = filled_in(message.covariance)
-        except MessageError as error:
+            self._estimator.release()  # what has come before belongs to where the robot was
+            self._estimator.set_pose(message.pose, covariance)
+        except (MessageError, ParameterError) as error:
             self._node.get_logger().error(f'the pose given is not used: {error}')
             return
-        self._estimator.release()  # what has come before belongs to where the robot was
-        self._estimator.set_pose(message.pose, covariance)
         self._on_move()
         x, y, z = message.position.tolist()
         self._node.get_logger().info(f'the robot is set to ({x:.2f}, {y:.2f}, {z:.2f}) m')

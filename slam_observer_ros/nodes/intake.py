@@ -214,8 +214,8 @@ class Intake:
             if clock.is_off:
                 self._warn(source, clock.trouble(source))
         elif clock.correction_ns != before_ns:
-            text = f'stamps of {source} are {clock}, and corrected from now on'
-            self._node.get_logger().info(text)
+            fate = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
+            self._node.get_logger().info(f'stamps of {source} are {clock}, and {fate}')
 
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1

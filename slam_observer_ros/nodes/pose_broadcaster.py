@@ -108,6 +108,7 @@ class PoseBroadcaster:
     def forget(self) -> None:
         """Begin anew, as after a reset or a jump of the clock."""
         self._waiting.clear()
+        self._begin_s = None
         self._correction = None
         self.trouble = ''
 
@@ -134,24 +135,31 @@ class PoseBroadcaster:
         behind_ns = self._waiting[-1][0] - known_ns
         if self._child != settings.odom_frame or behind_ns <= LATE_NS:
             return
-        self.trouble = (
+        self._report(
             f"'{settings.odom_frame}' to '{settings.base_frame}' on /tf is "
             f"{to_s(behind_ns):.1f} s behind the estimate: '{settings.map_frame}' to "
             f"'{settings.odom_frame}' waits for it; look at what publishes it"
         )
-        self._node.get_logger().warning(self.trouble, throttle_duration_sec=REPORT_PERIOD_S)
+
+    def _report(self, trouble: str) -> None:
+        self.trouble = trouble
+        self._node.get_logger().warning(trouble, throttle_duration_sec=REPORT_PERIOD_S)
 
     def _publish_correction(self, newest_ns: int | None) -> None:
         """Publish the newest correction that the odometry known by now gives."""
         settings, found = self._settings, None
-        while self._waiting and newest_ns is not None and self._waiting[0][0] <= newest_ns:
+        if newest_ns is None:
+            return
+        while self._waiting and self._waiting[0][0] <= newest_ns:
             found = self._waiting.popleft()
         if found is None:
             return
         stamp_ns, pose = found
         try:
             odometry = self._transforms.lookup(settings.odom_frame, settings.base_frame, stamp_ns)
-        except TransformError:  # it is of the time before the odometry began
+        except TransformError as error:
+            if stamp_ns < newest_ns - MAX_WAITING_NS:  # else it is of before the odometry began
+                self._report(f'odometry on /tf is stamped far ahead of the estimate: {error}')
             return
         self._correction = pose @ se3.inverse(odometry)
         self._publish(stamp_ns + self._held_back_ns + self._tolerance_ns, self._correction)

@@ -114,9 +114,10 @@ def observed_tags(
         If an id is beyond ``LARGEST_ID``.
 
     """
-    pattern = re.compile(rf'(?:{re.escape(tag_frame_prefix)}|\w+:)(\d+)')
+    # Other things have names with a colon, too, and longer numbers than a family has tags.
+    pattern = re.compile(rf'{re.escape(tag_frame_prefix)}(\d+)|\w+:(\d{{1,9}})')
     seen = [
-        (message, _landmark_id(match[1]))
+        (message, _landmark_id(match[1] or match[2]))
         for message in transforms
         if (match := pattern.fullmatch(message.child_frame_id)) and not message.trouble
     ]

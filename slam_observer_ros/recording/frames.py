@@ -29,10 +29,12 @@ def insert_transforms(
     buffer: TransformBuffer, transforms: Sequence[PoseMessage], *, is_static: bool
 ) -> None:
     """Put the transforms of a message on /tf or /tf_static into a buffer, without the bad ones."""
+    good = []
     for transform in transforms:
-        if transform.trouble:
-            buffer.refuse(transform.child_frame_id, transform.trouble)
-    good = [transform for transform in transforms if not transform.trouble]
+        if trouble := transform.trouble:
+            buffer.refuse(transform.child_frame_id, trouble)
+        else:
+            good.append(transform)
     for transform, pose in zip(good, pose_stack(good), strict=True):
         buffer.insert(
             transform.frame_id,

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 import logging
+from typing import TypeAlias
 
 import numpy as np
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.events import LandmarkTruth, UNKNOWN_ID
+from slam_observer_ros.events import LandmarkTruth, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.recording.frames import TransformSource
 from slam_observer_ros.recording.messages import pose_stack, PoseMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
@@ -17,15 +19,17 @@ from slam_observer_ros.types import FloatArray, IntArray
 
 _logger = logging.getLogger(__name__)
 
+_Positions: TypeAlias = dict[int, tuple[float, ...]]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTracks:
-    """Where landmarks truly were, at the times from when on they were told to be elsewhere.
+    """Where landmarks truly were, at the times between which they moved in a line or were at rest.
 
     Attributes
     ----------
     stamps_ns : IntArray
-        (j,) the times, nanoseconds; one where all are at rest.
+        (j,) the times, increasing, nanoseconds.
     ids : IntArray
         (n,) landmark ids.
     world_points : FloatArray
@@ -41,18 +45,19 @@ class LandmarkTracks:
     def from_messages(cls, messages: Iterable[ObservationMessage]) -> LandmarkTracks | None:
         """Gather positions of any order; None if no message has a landmark."""
         stamps_ns: list[int] = []
-        states: list[dict[int, tuple[float, ...]]] = [{}]
-        for event in sorted((message.event for message in messages), key=lambda e: e.stamp_ns):
-            told = dict(zip(event.ids.tolist(), map(tuple, event.points.tolist()), strict=True))
-            told.pop(UNKNOWN_ID, None)
-            if not told.items() <= states[-1].items():
-                stamps_ns.append(event.stamp_ns)
-                states.append(states[-1] | told)
-        ids = sorted(states[-1])
-        first: dict[int, tuple[float, ...]] = {}
+        states: list[_Positions] = []
+        for stamp_ns, told in _told_at(messages):
+            state = states[-1] | told if states else told
+            if states[-2:] == [state, state]:  # at rest: its beginning and its end are enough
+                stamps_ns[-1] = stamp_ns
+                continue
+            stamps_ns.append(stamp_ns)
+            states.append(state)
+        first: _Positions = {}
         for state in reversed(states):
             first |= state
-        points = [[state.get(i, first[i]) for i in ids] for state in states[1:]]
+        ids = sorted(first)
+        points = [[state.get(i, first[i]) for i in ids] for state in states]
         return cls(np.array(stamps_ns), np.array(ids), np.array(points)) if ids else None
 
     def at(self, stamp_ns: int) -> LandmarkTruth:
@@ -118,6 +123,22 @@ class Truth:
             return self
         height_m = float(np.median(self.poses[:, 2, 3])) if len(self.poses) else 0.0
         return replace(self, tracks=self.tracks.flattened(height_m))
+
+
+def _told_at(messages: Iterable[ObservationMessage]) -> Iterator[tuple[int, _Positions]]:
+    """Yield what all messages of a stamp tell together, in the order of the stamps."""
+    events = sorted((message.event for message in messages), key=_stamp_ns)
+    for stamp_ns, together in groupby(events, key=_stamp_ns):
+        told: _Positions = {}
+        for event in together:
+            points = map(tuple, event.points.tolist())
+            told |= zip(event.ids.tolist(), points, strict=True)
+        told.pop(UNKNOWN_ID, None)
+        yield stamp_ns, told
+
+
+def _stamp_ns(event: ObservationEvent) -> int:
+    return event.stamp_ns
 
 
 def base_in_frames(
