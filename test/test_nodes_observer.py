@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import re
 import time
 
@@ -29,6 +30,7 @@ from slam_observer_ros.nodes.conversions import (
     point_cloud2_message,
     pose_message,
 )
+from slam_observer_ros.nodes.pose_broadcaster import DISCOVERY_S
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 from slam_observer_ros.settings import Settings
@@ -212,7 +214,7 @@ def test_transform_is_the_pose(ros, observer):
     poses = ros.collect(PoseWithCovarianceStamped, 'pose')
     with Robot(ros) as robot:
         ros.wait_for_publisher('/tf', 'pose')
-        robot.run(RUN)
+        robot.run(replace(RUN, duration=DISCOVERY_S + 1.0))
         ros.spin_for(0.5)
     published = {stamp_ns(m): m.pose.pose for m in poses}
     assert len(transforms) > 10

@@ -123,14 +123,6 @@ def test_odometry_that_is_stamped_far_ahead_is_reported(robot):
     assert robot.broadcaster.trouble in robot.logged
 
 
-def test_after_a_reset_the_search_for_odometry_begins_anew(robot):
-    robot.run(0.5)
-    robot.broadcaster.forget()
-    robot.wait(60.0)
-    robot.run(DISCOVERY_S - 0.5)
-    assert not robot.take()
-
-
 def test_odometry_that_ends_is_reported_until_it_is_back(robot):
     robot.run(1.0, lag_s=0.0)
     assert not robot.broadcaster.trouble

@@ -108,7 +108,6 @@ class PoseBroadcaster:
     def forget(self) -> None:
         """Begin anew, as after a reset or a jump of the clock."""
         self._waiting.clear()
-        self._begin_s = None
         self._correction = None
         self.trouble = ''
 
