@@ -95,8 +95,10 @@ def find_assignments(
     """
     axes = axes_of(settings.two_d_mode)
     gate, m, k = settings.rejection_distance, len(points), axes.point
+    known_rows = landmarks.rows_of(ids)
+    is_new_id = (ids != UNKNOWN_ID) & (known_rows < 0)
     at, rows = _pairs_near(gate, observer, gains, index, points, noise)
-    allowed = _may_be(landmarks, ids, at, rows)
+    allowed = _may_be(known_rows, is_new_id, is_automatic(landmarks.ids), at, rows)
     at, rows = _pairs_within(gate, observer, gains, at[allowed], rows[allowed], points, noise)
     residuals = _as_residuals(observer, rows, points[at], noise[at])
     PC, CPC = gains.foretold(residuals)
@@ -104,7 +106,6 @@ def find_assignments(
     S = with_blocks(CPC, own_noise)
     pairs = Pairs(at, rows, residuals.r[:, :k], S, own_noise)
     nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
-    is_new_id = (ids != UNKNOWN_ID) & (landmarks.rows_of(ids) < 0)
     certain = nearly & ~is_new_id[at]
     unpaired_costs = np.where(is_new_id, unpaired_cost(RESOLUTION), unpaired_cost(gate))
     # Beyond what is searched; a point of no landmark costs the same whatever it might have been.
@@ -139,11 +140,18 @@ def _pairs_near(
     return index.near(observer.y_ref + observer.a, points, gate * spread_m)
 
 
-def _may_be(landmarks: LandmarkTable, ids: IntArray, at: IntArray, rows: IntArray) -> BoolArray:
-    """Return which pairs (q,) of a point and a landmark the ids (m,) of the points allow."""
-    known_rows = landmarks.rows_of(ids)
-    are_nameless = is_automatic(landmarks.ids)
-    others = ~np.isin(rows, known_rows) & ((ids[at] == UNKNOWN_ID) | are_nameless[rows])
+def _may_be(
+    known_rows: IntArray,
+    is_new_id: BoolArray,
+    is_nameless: BoolArray,
+    at: IntArray,
+    rows: IntArray,
+) -> BoolArray:
+    """Return which pairs (q,) of a point and a landmark the ids of the points (m,) allow.
+
+    ``is_nameless`` (n,) says which landmarks have no id of their own.
+    """
+    others = ~np.isin(rows, known_rows) & (~is_new_id[at] | is_nameless[rows])
     return np.asarray(np.where(known_rows[at] >= 0, rows == known_rows[at], others))
 
 

@@ -234,13 +234,9 @@ class _Joined:
         self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
         self.since_ns[rows] = [[velocity.stamp_ns] for velocity, _ in events]
         for row, (velocity, angular) in enumerate(events, first):
-            if velocity.covariance is not None:
-                angular_part, linear_part = (
-                    velocity.covariance[:3, :3],
-                    velocity.covariance[3:, 3:],
-                )
-                self.covariances[row] = velocity.covariance
-                self.is_stated[row] = angular_part.any(), linear_part.any()
+            if (stated := velocity.covariance) is not None:
+                self.covariances[row] = stated
+                self.is_stated[row] = stated[:3, :3].any(), stated[3:, 3:].any()
             if angular is not None:
                 self._write_angular(row, angular)
 

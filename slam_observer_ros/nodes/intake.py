@@ -166,12 +166,13 @@ class Intake:
             self._use(event)
 
     def _use(self, event: Event) -> None:
+        stamp_ns = event.stamp_ns
         if self._settings.correct_clock_offset:
             # Not before: what places the sensor on /tf has, as a rule, stamps of the same clock.
-            correction_ns = self.clocks[SOURCES[type(event)]].correction_ns
-            event = replace(event, stamp_ns=event.stamp_ns + correction_ns)
+            stamp_ns += self.clocks[SOURCES[type(event)]].correction_ns
+        event = replace(event, stamp_ns=stamp_ns, receive_ns=time.monotonic_ns())
         start_s = time.perf_counter()
-        self._estimator.add(replace(event, receive_ns=time.monotonic_ns()))
+        self._estimator.add(event)
         self._processing_s += time.perf_counter() - start_s
         self._processed += 1
 

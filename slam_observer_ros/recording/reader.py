@@ -39,9 +39,10 @@ from slam_observer_ros.recording.point_cloud_layout import ID_NAME
 from slam_observer_ros.recording.point_clouds import field_names
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
-from slam_observer_ros.recording.truth import base_in_frames, Truth
+from slam_observer_ros.recording.truth import base_in_frames, frames_beside, Truth
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.transform_buffer import TransformBuffer
+from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 
 _logger = logging.getLogger(__name__)
@@ -229,12 +230,12 @@ class Recording:
 
         """
         poses = list(self._all_decoded(selected.pose_truth, decode_pose))
-        frames = {message.child_frame_id for message in poses}
-        return Truth.from_messages(
-            poses,
-            base_in_frames(frames, base_frame, self._static_transforms(selected)),
-            self._all_decoded(selected.landmark_truth, decode_landmarks),
-        )
+        base_in: dict[str, FloatArray] = {}
+        if frames := frames_beside(base_frame, poses):
+            transforms = self._static_transforms(selected)
+            base_in = base_in_frames(frames, base_frame, transforms)
+        landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)
+        return Truth.from_messages(poses, base_in, landmarks)
 
     def _static_transforms(self, selected: SelectedTopics) -> TransformBuffer:
         transforms = TransformBuffer()

@@ -6,18 +6,21 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 import logging
+from operator import attrgetter
 from typing import TypeAlias
 
 import numpy as np
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.events import LandmarkTruth, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import LandmarkTruth, UNKNOWN_ID
 from slam_observer_ros.recording.frames import TransformSource
 from slam_observer_ros.recording.messages import pose_stack, PoseMessage
 from slam_observer_ros.recording.point_clouds import ObservationMessage
 from slam_observer_ros.types import FloatArray, IntArray
 
 _logger = logging.getLogger(__name__)
+
+_AT_BASE = np.eye(4)
 
 _Positions: TypeAlias = dict[int, tuple[float, ...]]
 
@@ -109,11 +112,12 @@ class Truth:
     ) -> Truth:
         """Gather poses and landmarks of any order.
 
-        ``base_in`` has the pose (4, 4) of the robot's base in each frame whose poses these are.
+        ``base_in`` has the pose (4, 4) of the robot's base in each other frame whose poses these
+        are.
         """
         stamps_ns = np.array([message.stamp_ns for message in poses], dtype=np.int64)
         stamps_ns, order = np.unique(stamps_ns, return_index=True)
-        bases = np.array([base_in[message.child_frame_id] for message in poses])
+        bases = np.array([base_in.get(message.child_frame_id, _AT_BASE) for message in poses])
         world_poses = pose_stack(poses) @ bases.reshape(-1, 4, 4)
         return cls(stamps_ns, world_poses[order], LandmarkTracks.from_messages(landmarks))
 
@@ -127,8 +131,9 @@ class Truth:
 
 def _told_at(messages: Iterable[ObservationMessage]) -> Iterator[tuple[int, _Positions]]:
     """Yield what all messages of a stamp tell together, in the order of the stamps."""
-    events = sorted((message.event for message in messages), key=_stamp_ns)
-    for stamp_ns, together in groupby(events, key=_stamp_ns):
+    by_stamp = attrgetter('stamp_ns')
+    events = sorted((message.event for message in messages), key=by_stamp)
+    for stamp_ns, together in groupby(events, key=by_stamp):
         told: _Positions = {}
         for event in together:
             points = map(tuple, event.points.tolist())
@@ -137,8 +142,11 @@ def _told_at(messages: Iterable[ObservationMessage]) -> Iterator[tuple[int, _Pos
         yield stamp_ns, told
 
 
-def _stamp_ns(event: ObservationEvent) -> int:
-    return event.stamp_ns
+def frames_beside(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
+    """Return the frames of poses that say whose they are, and are not those of the base."""
+    known = ('', base_frame.lstrip('/'))
+    frames = {message.child_frame_id for message in poses}
+    return {frame for frame in frames if base_frame and frame.lstrip('/') not in known}
 
 
 def base_in_frames(
@@ -146,12 +154,10 @@ def base_in_frames(
 ) -> dict[str, FloatArray]:
     """Return the pose (4, 4) of the base frame in each of ``frames``, by name.
 
-    Identity where a name is empty, and, with a warning, where ``transforms`` don't have both.
+    Identity, with a warning, where ``transforms`` don't have both.
     """
     base_in = dict.fromkeys(frames, np.eye(4))
     for frame in frames:
-        if frame.lstrip('/') in ('', base_frame.lstrip('/')) or not base_frame:
-            continue
         try:
             base_in[frame] = transforms.lookup(frame, base_frame, 0)
         except TransformError as error:
