@@ -14,11 +14,11 @@ from __future__ import annotations
 import numpy as np
 from odometry import Event, Odometry
 
-from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.gains.robust import block_diagonal, observation_weights
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -38,7 +38,7 @@ class EkfSlam:
     def __init__(self, settings: Settings, initial_pose: FloatArray | None = None) -> None:
         self._settings = settings
         self._odometry = Odometry(settings)
-        self._noise = NoiseModel(settings)
+        self._noise = ObservationNoise(settings)
         axes = PLANAR if settings.two_d_mode else SPATIAL
         self._pose_axes, self._k = axes.pose, axes.point
         self._pose = np.eye(4) if initial_pose is None else initial_pose
@@ -84,7 +84,7 @@ class EkfSlam:
             return
         self._predict(event.stamp_ns)
         known = np.array([landmark_id in self._rows for landmark_id in event.ids.tolist()])
-        covariances = self._noise.observation(event)
+        covariances = self._noise.covariances(event)
         if known.any():
             self._update(event.ids[known], event.points[known], covariances[known])
         if not known.all():

@@ -9,10 +9,10 @@ import numpy as np
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.motion.noise import MotionNoise
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.velocity_history import VelocityHistory
 
 Event: TypeAlias = VelocityEvent | ObservationEvent
 """What the worlds consist of: each velocity is one sensor's."""
@@ -30,7 +30,7 @@ class Odometry:
 
     def __init__(self, settings: Settings) -> None:
         self._velocities = VelocityHistory(round(settings.velocity_timeout * 1e9))
-        self._noise = NoiseModel(settings)
+        self._noise = MotionNoise(settings)
         self._stamp_ns: int | None = None
 
     def add(self, event: VelocityEvent) -> None:
@@ -55,7 +55,7 @@ class Odometry:
         steps = se3.exp(held.body_velocities * (held.dt_s)[:, None])
         path = np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
         Ad = se3.adjoint(se3.inverse(path[-1]) @ path[:-1])
-        covariances = Ad @ self._noise.motion(held) @ Ad.swapaxes(1, 2)
+        covariances = Ad @ self._noise.covariances(held) @ Ad.swapaxes(1, 2)
         self._velocities.forget_before(stamp_ns)
         self._stamp_ns = stamp_ns
         return path[-1], covariances.sum(axis=0)

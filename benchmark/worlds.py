@@ -15,7 +15,9 @@ from odometry import Event
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.motion.noise import MotionNoise
+from slam_observer_ros.motion.velocity_history import HeldVelocities
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
 from slam_observer_ros.recording.datasets.data_set import DataSet
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
@@ -23,7 +25,6 @@ from slam_observer_ros.recording.datasets.starry_night import load_starry_night
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.velocity_history import HeldVelocities
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIG_FOLDER = CHECKOUT / 'config'
@@ -254,7 +255,7 @@ def _measured_velocities(
         np.zeros(k),
         np.zeros((k, 2)),
     )
-    variances = np.diagonal(NoiseModel(settings).motion(held), axis1=1, axis2=2) / dt_s**2
+    variances = np.diagonal(MotionNoise(settings).covariances(held), axis1=1, axis2=2) / dt_s**2
     return velocities + np.sqrt(variances) * rng.standard_normal(velocities.shape)
 
 
@@ -277,7 +278,7 @@ def _look(
 def _measured(
     seen: ObservationEvent, settings: Settings, rng: np.random.Generator
 ) -> ObservationEvent:
-    covariances = NoiseModel(settings).observation(seen)
+    covariances = ObservationNoise(settings).covariances(seen)
     roots = np.linalg.cholesky(covariances)
     noise = (roots @ rng.standard_normal((len(seen.ids), 3, 1)))[:, :, 0]
     if settings.two_d_mode:

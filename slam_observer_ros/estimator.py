@@ -21,12 +21,12 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.map_frame import MapFrame
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.map_frame import MapFrame
 from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.parameters import checked, table
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam import Slam
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_ns, to_s

@@ -88,7 +88,7 @@ class Observer:
         """(n, 3) estimated landmarks p̂_i = p_i° + R_P° â_i = P° (y_i° + â_i), metres, world.
 
         As far as they have been moved: some gains put that off for landmarks out of view, see
-        :attr:`slam_observer_ros.slam.Slam.world_points`.
+        :attr:`slam_observer_ros.slam.slam.Slam.world_points`.
         """
         return se3.transform(self.reference_pose, self.y_ref + self.a)
 

@@ -18,13 +18,13 @@ from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import Event
-from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_s
-from slam_observer_ros.velocity_history import VelocityHistory
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,10 +6,10 @@ import numpy as np
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
-from slam_observer_ros.velocity_history import VelocityHistory
 
 SAMPLE_PERIOD_NS = 50_000_000
 """Least time between two poses of a sampled trajectory: 20 Hz at most."""

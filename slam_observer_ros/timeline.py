@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from slam_observer_ros.axes import SPATIAL
+from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.hypotheses import Hypotheses
-from slam_observer_ros.odometry import transition, transition_covariance
+from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.odometry import transition, transition_covariance
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
-from slam_observer_ros.slam import Slam
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_ns, to_s
-from slam_observer_ros.velocity_history import VelocityHistory
 
 OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
 """Called with velocities, and with the two stamps between which they lead, nanoseconds."""
@@ -131,11 +131,11 @@ class Timeline:
         if event.velocities is not None:
             points = points + event.velocities * to_s(state_ns - event.stamp_ns)
         Q = transition_covariance(
-            self.velocities, slam.gains.calibration, slam.noise, event.stamp_ns, state_ns
+            self.velocities, slam.gains.calibration, slam.motion_noise, event.stamp_ns, state_ns
         )
         C = SPATIAL.output_matrix(points)
         moved = len(points) * C @ Q @ so3.transpose(C)
-        covariances = slam.noise.observation(event) + moved
+        covariances = slam.observation_noise.covariances(event) + moved
         return replace(
             event,
             stamp_ns=state_ns,

@@ -13,7 +13,7 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.types import FloatArray, IntArray
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)

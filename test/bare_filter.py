@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 

@@ -9,10 +9,11 @@ import numpy as np
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.motion.noise import MotionNoise
+from slam_observer_ros.motion.velocity_history import HeldVelocities
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.velocity_history import HeldVelocities
 
 START_NS = 1_000_000_000
 STEP_NS = 50_000_000
@@ -86,8 +87,7 @@ def drive(
     points = rng.uniform([-6.0, -3.0, -2.0], [6.0, 9.0, 2.0], (landmarks, 3))
     if planar:
         points[:, 2] = 0.0
-    model = NoiseModel(settings)
-    measured = (V - bias) / scale + noise * _velocity_noise(model, V, rng)
+    measured = (V - bias) / scale + noise * _velocity_noise(MotionNoise(settings), V, rng)
     events: list[Event] = []
     for k in range(steps + 1):
         stamp_ns = START_NS + k * STEP_NS
@@ -97,7 +97,7 @@ def drive(
             y = se3.transform(se3.inverse(poses[k]), points)
             ids = np.sort(np.argsort(np.linalg.norm(y, axis=1))[:seen])
             event = ObservationEvent(stamp_ns, ids, y[ids])
-            events.append(_with_noise(model, event, noise, planar, rng))
+            events.append(_with_noise(ObservationNoise(settings), event, noise, planar, rng))
     events.sort(key=lambda event: event.stamp_ns)
     return World(events, poses, points)
 
@@ -125,22 +125,22 @@ def position_error_m(estimator: Estimator, world: World) -> float:
     return float(np.linalg.norm(estimator.pose[:3, 3] - truth[:3, 3]))
 
 
-def _velocity_noise(model: NoiseModel, V: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _velocity_noise(model: MotionNoise, V: FloatArray, rng: np.random.Generator) -> FloatArray:
     zero, dt_s = np.zeros(len(V)), np.full(len(V), STEP_S)
     unknown = np.zeros((len(V), 6, 6)), np.zeros((len(V), 2), dtype=bool)
     held = HeldVelocities(V, *unknown, dt_s, zero, np.zeros((len(V), 2)))
-    variances = np.diagonal(model.motion(held), axis1=1, axis2=2)
+    variances = np.diagonal(model.covariances(held), axis1=1, axis2=2)
     return np.sqrt(variances) / STEP_S * rng.standard_normal(V.shape)
 
 
 def _with_noise(
-    model: NoiseModel,
+    model: ObservationNoise,
     event: ObservationEvent,
     noise: float,
     planar: bool,
     rng: np.random.Generator,
 ) -> ObservationEvent:
-    roots = np.linalg.cholesky(model.observation(event))
+    roots = np.linalg.cholesky(model.covariances(event))
     errors = (roots @ rng.standard_normal((len(event.ids), 3, 1)))[:, :, 0]
     if planar:
         errors[:, 2] = 0.0

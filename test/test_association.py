@@ -13,8 +13,16 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-from slam_observer_ros import axes
-from slam_observer_ros.association import MARGIN
+from slam_observer_ros.association.assignments import MARGIN
+from slam_observer_ros.association.joint_compatibility import (
+    columns_of,
+    huber_loss,
+    joint_cost,
+    JointSearch,
+    MAX_PARTIAL,
+    Pairs,
+)
+from slam_observer_ros.association.readings import readings
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -25,23 +33,14 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.field_of_view import FieldOfView
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.joint_compatibility import (
-    columns_of,
-    huber_loss,
-    joint_cost,
-    JointSearch,
-    MAX_PARTIAL,
-    Pairs,
-)
-from slam_observer_ros.landmark_index import LandmarkIndex
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.landmark_table import LandmarkTable
+from slam_observer_ros.geometry import axes, se3
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
-from slam_observer_ros.readings import readings
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.field_of_view import FieldOfView
+from slam_observer_ros.slam.landmark_index import LandmarkIndex
+from slam_observer_ros.slam.landmark_table import LandmarkTable
 
 CONFIG = Path(__file__).resolve().parent.parent / 'config' / 'wheeled_bearing_range.yaml'
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)

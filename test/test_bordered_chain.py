@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam_observer_ros.bordered_chain import Equations, Factors, SMALL_BORDER
+from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, SMALL_BORDER
 
 D, C, K = 3, 2, 2
 SEEN = 4

@@ -18,7 +18,7 @@ from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 
 RUNS = 30
@@ -84,7 +84,7 @@ def under_a_ceiling(settings, seed):
         if step % 4 == 0:
             points = se3.transform(se3.inverse(true_pose @ camera), tags)
             seen = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < 1.7 * points[:, 2])
-            roots = np.linalg.cholesky(NoiseModel(settings).at(points[seen]))
+            roots = np.linalg.cholesky(ObservationNoise(settings).at(points[seen]))
             noisy = points[seen] + (roots @ rng.normal(size=(len(seen), 3, 1)))[:, :, 0]
             estimator.add(move_observation(ObservationEvent(stamp_ns, seen, noisy), camera))
     errors = pose_errors(estimator.pose, true_pose)

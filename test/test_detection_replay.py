@@ -18,7 +18,7 @@ from tum_files import read_tum
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, pose_from_rpy
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.map_file import read_map
+from slam_observer_ros.maps.map_file import read_map
 from slam_observer_ros.simulation import Scenario, Simulation
 
 CAMERA = pose_from_rpy((0.2, 0.0, 0.4, -np.pi / 2, 0.0, -np.pi / 2))

@@ -17,10 +17,10 @@ import setuptools  # noqa: F401 (provides distutils)
 import yaml
 
 from slam_observer_ros.cli import make_parser
-from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.map_file import read_map
 from slam_observer_ros.nodes.settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.parameters import table
-from slam_observer_ros.recording.map_file import read_map
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario
 

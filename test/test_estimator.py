@@ -12,6 +12,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 
+from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.errors import MapError, ParameterError
 from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator import Estimator
@@ -20,10 +21,9 @@ from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.event_queue import CONFIRMATIONS
 from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.hypotheses import Hypotheses
-from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam import Slam
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
 
 START_NS = 1_700_000_000_000_000_000

@@ -12,13 +12,13 @@ import pytest
 from scipy.stats import chi2
 from strategies import generators
 
-from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.gains.calibration import Calibration, LEAST_DELAY_S
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.motion.calibration import Calibration, LEAST_DELAY_S
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
 
 EVERYTHING = Settings(

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from strategies import generators, poses
 
-from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, slam_group
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Smoother
+from slam_observer_ros.smoothing.gauss_newton import Smoother
 
 
 def started(rng, settings=PLAIN, n=4):

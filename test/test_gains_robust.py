@@ -20,7 +20,7 @@ from slam_observer_ros.gains.robust import (
     mahalanobis,
     observation_weights,
 )
-from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.settings import Settings
 
 designs = pytest.mark.parametrize('gains', ['scheduled', 'riccati'])

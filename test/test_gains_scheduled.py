@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from strategies import generators
 
-from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains import DESIGNS
@@ -22,6 +21,7 @@ from slam_observer_ros.gains.leaves import Leaves
 from slam_observer_ros.gains.robust import block_diagonal
 from slam_observer_ros.gains.scheduled import ScheduledGains
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulated_run import run_simulation
 from slam_observer_ros.simulation import Scenario, Simulation

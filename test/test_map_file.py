@@ -15,8 +15,8 @@ import yaml
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError, SlamObserverError
 from slam_observer_ros.events import LARGEST_ID
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.recording.map_file import check_writable, read_map, write_map
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.map_file import check_writable, read_map, write_map
 from slam_observer_ros.settings import Settings
 
 SURVEYED = """\
@@ -109,7 +109,7 @@ def test_a_map_that_cannot_be_written_leaves_the_older_one_alone(tmp_path, monke
     def full_disk(*_):
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr('slam_observer_ros.recording.map_file.os.fsync', full_disk)
+    monkeypatch.setattr('slam_observer_ros.maps.map_file.os.fsync', full_disk)
     with pytest.raises(MapError, match=r"can't write map .*map\.yaml: No space left"):
         write_map(path, a_map(4), Settings())
     assert len(read_map(path).ids) == 3

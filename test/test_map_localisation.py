@@ -10,8 +10,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.stats import chi2
 
-from slam_observer_ros import map_frame
-from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -21,8 +19,10 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.map_alignment import find_transform
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.maps import map_frame
+from slam_observer_ros.maps.alignment import find_transform
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.settings import Settings
 
 POINT_NOISE_M = 0.05

@@ -12,8 +12,8 @@ from tum_files import read_tum
 
 from slam_observer_ros.events import ObservationEvent, PoseTruth, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.recording.map_file import read_map, write_map
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings import Settings
 

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 from strategies import generators
 
-from slam_observer_ros.axes import SPATIAL
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation, move_velocity
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.noise import NoiseModel
-from slam_observer_ros.odometry import transition, transition_covariance
+from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.noise import MotionNoise
+from slam_observer_ros.motion.odometry import transition, transition_covariance
+from slam_observer_ros.motion.velocity_history import HeldVelocities, VelocityHistory
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.velocity_history import HeldVelocities, VelocityHistory
 
 
 def held(velocities, dt_s, gap_s=None, covariances=None):
@@ -39,7 +40,7 @@ def held(velocities, dt_s, gap_s=None, covariances=None):
 def observed(points, **settings):
     points = np.array(points, dtype=float)
     event = ObservationEvent(0, np.arange(len(points)), points)
-    return NoiseModel(Settings(**settings)).observation(event)
+    return ObservationNoise(Settings(**settings)).covariances(event)
 
 
 def deviation(covariance, direction):
@@ -52,7 +53,7 @@ def test_densities_are_the_standard_deviation_after_one_second(pieces):
     settings = Settings(
         angular_velocity_noise=(0.1, 0.2, 0.3), linear_velocity_noise=(0.4, 0.5, 0.6)
     )
-    covariances = NoiseModel(settings).motion(
+    covariances = MotionNoise(settings).covariances(
         held(np.ones((pieces, 6)), np.full(pieces, 1.0 / pieces))
     )
     expected = np.diag(np.arange(1, 7) * 0.1) ** 2
@@ -66,7 +67,7 @@ def test_scale_noise_grows_with_speed_and_is_none_at_rest():
         angular_scale_noise=(0.0, 0.0, 0.1),
         linear_scale_noise=(0.2, 0.0, 0.0),
     )
-    moving, still = NoiseModel(settings).motion(
+    moving, still = MotionNoise(settings).covariances(
         held([[1.0, 1.0, -2.0, 3.0, 1.0, 1.0], np.zeros(6)], [1.0, 1.0])
     )
     np.testing.assert_allclose(np.sqrt(np.diag(moving)), [0.0, 0.0, 0.2, 0.6, 0.0, 0.0])
@@ -79,7 +80,9 @@ def test_noise_of_the_messages_does_not_pass_for_speed_however_many_there_are(rn
     duration_s, k = 30.0, 30 * rate_hz
     velocities = np.zeros((k, 6))
     velocities[:, 3] = 0.5 + 0.05 * np.sqrt(rate_hz) * rng.standard_normal(k)
-    total = NoiseModel(settings).motion(held(velocities, np.full(k, 1.0 / rate_hz))).sum(axis=0)
+    total = (
+        MotionNoise(settings).covariances(held(velocities, np.full(k, 1.0 / rate_hz))).sum(axis=0)
+    )
     np.testing.assert_allclose(np.sqrt(total[3, 3]), 0.1 * 0.5 * np.sqrt(duration_s), rtol=0.15)
 
 
@@ -87,7 +90,7 @@ def test_speed_that_changes_within_a_long_motion_counts_as_it_changes():
     settings = Settings(angular_velocity_noise=(0.0,) * 3, angular_scale_noise=(0.0, 0.0, 0.1))
     velocities = np.zeros((40, 6))
     velocities[:20, 2], velocities[20:, 2] = 1.0, -1.0  # turns, and turns back
-    total = NoiseModel(settings).motion(held(velocities, np.full(40, 0.5))).sum(axis=0)
+    total = MotionNoise(settings).covariances(held(velocities, np.full(40, 0.5))).sum(axis=0)
     np.testing.assert_allclose(np.sqrt(total[2, 2]), 0.1 * np.sqrt(20.0), rtol=0.03)
 
 
@@ -95,14 +98,14 @@ def test_a_velocity_held_for_longer_than_a_second_counts_alone():
     settings = Settings(linear_velocity_noise=(0.0,) * 3, linear_scale_noise=(0.1, 0.0, 0.0))
     velocities = np.zeros((3, 6))
     velocities[:, 3] = [1.0, -2.0, 3.0]
-    covariances = NoiseModel(settings).motion(held(velocities, [2.0, 3.0, 4.0]))
+    covariances = MotionNoise(settings).covariances(held(velocities, [2.0, 3.0, 4.0]))
     expected = 0.01 * np.array([1.0, 4.0, 9.0]) * [2.0, 3.0, 4.0]
     np.testing.assert_allclose(covariances[:, 3, 3], expected)
 
 
 def test_in_a_gap_the_robot_may_do_what_the_settings_allow():
     settings = Settings(unknown_angular_motion=0.3, unknown_linear_motion=0.7)
-    covariance = NoiseModel(settings).motion(held(np.zeros((1, 6)), [0.0], [4.0]))[0]
+    covariance = MotionNoise(settings).covariances(held(np.zeros((1, 6)), [0.0], [4.0]))[0]
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [0.6] * 3 + [1.4] * 3)
 
 
@@ -112,8 +115,8 @@ def test_a_messages_covariance_stands_for_the_settings_while_the_velocity_is_hel
 ):
     root = rng.normal(size=(6, 6))
     given_covariance = root @ root.T
-    model = NoiseModel(Settings())
-    stated, silent = model.motion(
+    model = MotionNoise(Settings())
+    stated, silent = model.covariances(
         held(rng.normal(size=(2, 6)), [dt_s, dt_s], [gap_s, 0.0], [given_covariance, None])
     )
     gap = np.diag([0.25] * 6) * gap_s
@@ -127,7 +130,7 @@ def test_an_error_that_lasts_adds_up_however_often_its_motion_is_cut(cuts):
     dt_s = np.full(cuts, 2.0 / cuts)
     whole = held(np.zeros((cuts, 6)), dt_s, covariances=[given] * cuts)
     whole = replace(whole, before_s=np.repeat((np.cumsum(dt_s) - dt_s)[:, None], 2, axis=1))
-    total = NoiseModel(Settings()).motion(whole).sum(axis=0)
+    total = MotionNoise(Settings()).covariances(whole).sum(axis=0)
     np.testing.assert_allclose(total, 4.0 * given, rtol=1e-9)
 
 
@@ -135,7 +138,7 @@ def test_a_velocity_of_which_nothing_is_known_is_one_that_a_robot_may_have():
     """Odometry often states 1e6 or 1e12 for z, roll and pitch."""
     given = np.diag([1e6, 1e12, 1e-4, 1e-4, 1e-4, 1e12])
     still = held(np.zeros((1, 6)), [0.05], covariances=[given])
-    (covariance,) = NoiseModel(Settings()).motion(still)
+    (covariance,) = MotionNoise(Settings()).covariances(still)
     expected = [2.5, 2.5, 5e-4, 5e-4, 5e-4, 50.0]
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), expected)
 
@@ -143,7 +146,7 @@ def test_a_velocity_of_which_nothing_is_known_is_one_that_a_robot_may_have():
 def test_a_variance_that_rounding_left_below_zero_is_taken_for_zero():
     given = np.diag([0.01, 0.01, 0.01, 0.01, 0.01, -1e-12])
     still = held(np.zeros((1, 6)), [1.0], covariances=[given])
-    (covariance,) = NoiseModel(Settings()).motion(still)
+    (covariance,) = MotionNoise(Settings()).covariances(still)
     np.testing.assert_allclose(covariance, given, atol=1e-11)
 
 
@@ -183,7 +186,7 @@ def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
     for piece in range(pieces):
         F = np.array([error(piece, 1e-6 * w) / 1e-6 for w in np.eye(6)]).T
         expected += F @ Q @ F.T
-    found = transition_covariance(*way(V), NoiseModel(settings), 0, pieces * dt_ns)
+    found = transition_covariance(*way(V), MotionNoise(settings), 0, pieces * dt_ns)
     # A rate's noise is taken to act at the piece's beginning, not throughout: hence 2 %.
     assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
@@ -196,8 +199,8 @@ def test_the_part_of_a_velocity_whose_covariance_is_zero_has_the_settings_noise(
     sensor = se3.pose(np.eye(3), np.array([0.3, 0.1, 0.0]))
     history = VelocityHistory(10**9)
     history.append(move_velocity(VelocityEvent(0, np.ones(6), stated), sensor))
-    (Q,) = NoiseModel(Settings()).motion(history.held(0, 10**8))
-    (expected,) = NoiseModel(Settings()).motion(held(np.ones((1, 6)), [0.1]))
+    (Q,) = MotionNoise(Settings()).covariances(history.held(0, 10**8))
+    (expected,) = MotionNoise(Settings()).covariances(held(np.ones((1, 6)), [0.1]))
     np.testing.assert_allclose(Q[unknown, unknown], expected[unknown, unknown])
     known = slice(3, 6) if unknown.start == 0 else slice(0, 3)
     np.testing.assert_allclose(Q[known, known], stated[known, known] * 0.1**2)
@@ -207,13 +210,13 @@ def test_a_point_whose_covariance_is_zero_has_the_settings_noise():
     points = np.array([[3.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
     covariances = np.array([np.zeros((3, 3)), np.diag([0.1, 0.2, 0.3])])
     event = ObservationEvent(0, np.arange(2), points, covariances)
-    found = NoiseModel(Settings()).observation(event)
+    found = ObservationNoise(Settings()).covariances(event)
     np.testing.assert_array_equal(found[0], observed(points)[0])
     np.testing.assert_allclose(found[1], covariances[1], rtol=1e-4, atol=1e-9)
 
 
 def test_no_motion_has_no_covariances():
-    assert NoiseModel(Settings()).motion(held(np.empty((0, 6)), [])).shape == (0, 6, 6)
+    assert MotionNoise(Settings()).covariances(held(np.empty((0, 6)), [])).shape == (0, 6, 6)
 
 
 @given(generators(), st.floats(-1.0, 2.0))
@@ -264,11 +267,14 @@ def test_a_point_at_the_sensor_is_known_as_well_as_its_range():
 @pytest.mark.parametrize('model', ['range_bearing', 'stereo', 'cartesian'])
 @given(rng=generators())
 def test_what_counts_is_the_way_from_the_sensor_wherever_that_sits(model, rng):
-    noise, sensor = NoiseModel(Settings(observation_model=model)), se3.exp(rng.normal(size=6))
+    noise, sensor = (
+        ObservationNoise(Settings(observation_model=model)),
+        se3.exp(rng.normal(size=6)),
+    )
     event = ObservationEvent(0, np.arange(4), rng.normal(scale=3.0, size=(4, 3)))
     moved, R = move_observation(event, sensor), sensor[:3, :3]
     np.testing.assert_allclose(
-        noise.observation(moved), R @ noise.observation(event) @ R.T, atol=1e-9
+        noise.covariances(moved), R @ noise.covariances(event) @ R.T, atol=1e-9
     )
     back = move_observation(moved, se3.inverse(sensor))
     np.testing.assert_allclose(back.sights, event.points, atol=1e-9)
@@ -278,11 +284,11 @@ def test_in_a_plane_a_landmark_overhead_is_as_far_away_as_it_is():
     event = ObservationEvent(0, np.arange(2), np.array([[0.1, 0.0, 3.0], [4.0, 0.0, 0.0]]))
     flat = flatten(event)
     np.testing.assert_array_equal(flat.points[:, 2], 0.0)
-    noise = NoiseModel(Settings(bearing_noise=0.02))
-    np.testing.assert_allclose(noise.observation(flat), noise.observation(event))
-    assert deviation(noise.observation(flat)[0], [0, 1, 0]) == pytest.approx(0.06, rel=0.01)
+    noise = ObservationNoise(Settings(bearing_noise=0.02))
+    np.testing.assert_allclose(noise.covariances(flat), noise.covariances(event))
+    assert deviation(noise.covariances(flat)[0], [0, 1, 0]) == pytest.approx(0.06, rel=0.01)
     one = flat.select(np.array([False, True]))
-    np.testing.assert_allclose(noise.observation(one)[0], noise.observation(flat)[1])
+    np.testing.assert_allclose(noise.covariances(one)[0], noise.covariances(flat)[1])
 
 
 def test_covariances_of_messages_are_used_as_they_are():
@@ -290,7 +296,7 @@ def test_covariances_of_messages_are_used_as_they_are():
     roots = rng.normal(size=(5, 3, 3))
     stated = roots @ roots.swapaxes(1, 2) + 0.1 * np.eye(3)
     event = ObservationEvent(0, np.arange(5), rng.normal(size=(5, 3)), stated)
-    np.testing.assert_allclose(NoiseModel(Settings()).observation(event), stated, rtol=1e-3)
+    np.testing.assert_allclose(ObservationNoise(Settings()).covariances(event), stated, rtol=1e-3)
 
 
 def spread_after(range_m, **settings):

@@ -17,25 +17,25 @@ from gain_worlds import (
 import numpy as np
 import pytest
 
-from slam_observer_ros.axes import PLANAR, SPATIAL
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.base import Seen
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.joint_covariance import JointCovariance
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.motion import Motion
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.observer import Observer
-from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Frames, Smoother, Solution
+from slam_observer_ros.smoothing.gauss_newton import Frames, Smoother, Solution
+from slam_observer_ros.smoothing.prior import Prior
 
 LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_distance=1e9)
 FRAMES, LANDMARKS = 5, 4
@@ -236,7 +236,7 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
         calibration = Calibration(settings, axes)
         count = d + calibration.count
         start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
-        history = History(axes, NoiseModel(settings), start, 'the start')
+        history = History(axes, ObservationNoise(settings), start, 'the start')
         for a, b in pairwise((0, *cuts, k)):
             no_gaps, at_ends = np.zeros(b - a), np.zeros((2, 6))
             part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], no_gaps, covariances[a:b], at_ends)
@@ -281,8 +281,8 @@ def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkey
     for step, seen in enumerate([points, points, points, turned]):
         estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
         estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))
-    there = NoiseModel(settings).observation(ObservationEvent(0, np.arange(3), turned))
-    taken = NoiseModel(settings).at(noted[-1].sights)
+    there = ObservationNoise(settings).covariances(ObservationEvent(0, np.arange(3), turned))
+    taken = ObservationNoise(settings).at(noted[-1].sights)
     np.testing.assert_allclose(taken, there, atol=0.1 * np.max(there))
 
 

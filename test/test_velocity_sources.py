@@ -20,9 +20,9 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.motion.noise import MotionNoise
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.velocity_history import VelocityHistory
 from slam_observer_ros.velocity_sources import PoseDifferences
 
 SECOND = 1_000_000_000
@@ -147,7 +147,7 @@ def test_the_error_of_each_sensor_lasts_as_long_as_its_own_message_is_held(imu_r
     of_wheels, of_imu = np.diag([9.0, 9.0, 9.0, 1.0, 2.0, 3.0]), np.diag([4.0, 5.0, 6.0])
     events: list[Event] = [wheels(n / 10, V, of_wheels) for n in range(10)]
     events += [imu(n / imu_rate_hz, [0.0, 0.0, 1.0], of_imu) for n in range(imu_rate_hz)]
-    covariances = NoiseModel(Settings()).motion(held_for(history_of(events), 0.0, 1.0))
+    covariances = MotionNoise(Settings()).covariances(held_for(history_of(events), 0.0, 1.0))
     expected = [4 / imu_rate_hz, 5 / imu_rate_hz, 6 / imu_rate_hz, 0.1, 0.2, 0.3]
     assert_allclose(covariances.sum(axis=0), np.diag(expected), atol=1e-12)
 
@@ -161,7 +161,7 @@ def test_each_sensor_brings_its_own_covariance_or_has_the_parameters_noise(imu_k
         imu(0.0, [0.0, 0.0, 1.0], 0.25 * np.eye(3) if imu_knows else None),
     ]
     held = held_for(history_of(events), 0.0, 0.5)
-    covariance = NoiseModel(settings).motion(held).sum(axis=0)
+    covariance = MotionNoise(settings).covariances(held).sum(axis=0)
     angular = 0.25 * 0.5**2 if imu_knows else 0.1**2 * 0.5
     linear = 1.0 * 0.5**2 if wheels_know else 0.2**2 * 0.5
     assert_allclose(covariance, np.diag([angular] * 3 + [linear] * 3), atol=1e-12)

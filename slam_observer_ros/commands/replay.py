@@ -42,8 +42,8 @@ from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.map_plot import plot_map
 from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.recording.map_file import read_map, write_map
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.topics import SelectedTopics

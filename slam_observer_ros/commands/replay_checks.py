@@ -13,7 +13,7 @@ import numpy as np
 from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
-from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.replay import Replay
 
 logger = logging.getLogger(__name__)

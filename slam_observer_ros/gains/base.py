@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam_observer_ros.gains.calibration import Calibration
-from slam_observer_ros.gains.motion import Motion
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray

@@ -17,10 +17,10 @@ from functools import partial
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes, axes_of, SPATIAL
 from slam_observer_ros.gains.base import GainDesign, Residuals
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.axes import Axes, axes_of, SPATIAL
+from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.observer import Correction, lyapunov, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray

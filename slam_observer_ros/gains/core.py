@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.leaves import Leaves
 from slam_observer_ros.gains.linear import symmetric
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.types import FloatArray, IntArray
 
 CAPACITY = 8

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.types import FloatArray, IntArray
 

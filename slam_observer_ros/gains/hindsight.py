@@ -17,18 +17,18 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes
 from slam_observer_ros.errors import SmoothingError
 from slam_observer_ros.gains.base import Seen
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.observer import Correction, Observer
-from slam_observer_ros.prior import Prior
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Smoother, Solution, Step
+from slam_observer_ros.smoothing.gauss_newton import Smoother, Solution, Step
+from slam_observer_ros.smoothing.prior import Prior
 from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -84,7 +84,7 @@ class Hindsight:
     ) -> None:
         self.settings = settings
         self._axes, self._calibration, self._joint = axes, calibration, joint
-        self._noise = NoiseModel(settings)
+        self._noise = ObservationNoise(settings)
         self._warning = _Warning()
         self._seen = 0
         at_start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), joint.P.copy())

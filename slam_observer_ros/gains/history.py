@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes
 from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.noise import NoiseModel
-from slam_observer_ros.prior import Prior
-from slam_observer_ros.smoothing import Frames, joined, no_frames
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.observation_noise import ObservationNoise
+from slam_observer_ros.smoothing.gauss_newton import Frames, joined, no_frames
+from slam_observer_ros.smoothing.prior import Prior
 from slam_observer_ros.types import FloatArray, IntArray
 
 
@@ -47,7 +47,7 @@ class History:
     ----------
     axes : Axes
         Which axes are estimated.
-    noise : NoiseModel
+    noise : ObservationNoise
         Noise of the observations.
     prior : Prior
         What was known before the first frame.
@@ -69,7 +69,7 @@ class History:
 
     """
 
-    def __init__(self, axes: Axes, noise: NoiseModel, prior: Prior, since: str) -> None:
+    def __init__(self, axes: Axes, noise: ObservationNoise, prior: Prior, since: str) -> None:
         self._axes, self._observation_noise = axes, noise
         self.prior = self.summary = prior
         self.summarised = 0

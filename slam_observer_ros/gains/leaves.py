@@ -22,8 +22,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.types import FloatArray, IntArray
 
 CORE = 0

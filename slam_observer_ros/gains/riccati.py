@@ -23,15 +23,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.axes import axes_of
 from slam_observer_ros.gains.base import GainDesign, Residuals, Seen
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.linear import solve
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.robust import (
     are_far,
@@ -42,9 +39,12 @@ from slam_observer_ros.gains.robust import (
     with_blocks,
 )
 from slam_observer_ros.geometry import slam_group, so3
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.smoothing import Solution
+from slam_observer_ros.smoothing.gauss_newton import Solution
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 

@@ -32,13 +32,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.axes import axes_of
 from slam_observer_ros.gains.base import GainDesign, Residuals
-from slam_observer_ros.gains.calibration import Calibration
 from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.linear import symmetric
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.robust import (
     block_diagonal,
     huber_weights,
@@ -46,6 +43,9 @@ from slam_observer_ros.gains.robust import (
     REWEIGHTINGS,
 )
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray

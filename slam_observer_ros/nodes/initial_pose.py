@@ -10,9 +10,9 @@ from rclpy.node import Node
 
 from slam_observer_ros.errors import MessageError, ParameterError
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.map_frame import GIVEN_POSE_STD
+from slam_observer_ros.maps.map_frame import GIVEN_POSE_STD
+from slam_observer_ros.motion.noise import limited
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
-from slam_observer_ros.noise import limited
 from slam_observer_ros.parameters import table
 from slam_observer_ros.recording.messages import decode_pose_with_covariance_stamped, PoseMessage
 from slam_observer_ros.settings import Settings

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from slam_observer_ros.events import is_automatic, ObservationEvent
-from slam_observer_ros.field_of_view import FieldOfView
-from slam_observer_ros.landmark_table import LandmarkTable
 from slam_observer_ros.observer import Observer
+from slam_observer_ros.slam.field_of_view import FieldOfView
+from slam_observer_ros.slam.landmark_table import LandmarkTable
 from slam_observer_ros.types import BoolArray
 
 IMPROBABLE = 20.0

@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.types import FloatArray, IntArray
 
 ANYWHERE_M = 1e3

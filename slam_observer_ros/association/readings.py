@@ -16,17 +16,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slam_observer_ros.association import Assignment, find_assignments
-from slam_observer_ros.axes import axes_of
+from slam_observer_ros.association.assignments import Assignment, find_assignments
+from slam_observer_ros.association.joint_compatibility import joint_cost, RESOLUTION, unpaired_cost
+from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.joint_compatibility import joint_cost, RESOLUTION, unpaired_cost
-from slam_observer_ros.sighting import Sighting
-from slam_observer_ros.slam import Slam
-from slam_observer_ros.slip import slip
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.slam.sighting import Sighting
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import IntArray
 
 SLIP_COST = 20.0
@@ -172,7 +172,7 @@ def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:
     """Return whether two states have the robot at one place, as far as the points seen tell."""
     here, there = slam.observer.pose, other.observer.pose
     shifts = se3.transform(here, event.points) - se3.transform(there, event.points)
-    noise = here[:3, :3] @ slam.noise.observation(event) @ here[:3, :3].T
+    noise = here[:3, :3] @ slam.observation_noise.covariances(event) @ here[:3, :3].T
     return len(shifts) > 0 and bool(np.max(mahalanobis(shifts, noise)) <= RESOLUTION)
 
 
@@ -196,7 +196,7 @@ def _named(
         slam.index,
         event.ids,
         se3.transform(slam.observer.A, event.points),
-        slam.observer.turned(slam.noise.observation(event)),
+        slam.observer.turned(slam.observation_noise.covariances(event)),
         slam.settings,
         budget,
     )

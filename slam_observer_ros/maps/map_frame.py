@@ -7,11 +7,11 @@ import logging
 
 import numpy as np
 
+from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.extrinsics import pose_from_rpy
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.hypotheses import Hypotheses
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.localisation import (
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.localisation import (
     enter_map,
     is_lost,
     PoseTrial,
@@ -19,8 +19,8 @@ from slam_observer_ros.localisation import (
     start_in_map,
 )
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.sighting import Outcome
-from slam_observer_ros.slam import Slam
+from slam_observer_ros.slam.sighting import Outcome
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)

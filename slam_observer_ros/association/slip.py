@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.axes import axes_of
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.motion.motion import Motion
+from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.sighting import Sighting
-from slam_observer_ros.slam import Slam
+from slam_observer_ros.slam.sighting import Sighting
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.velocity_history import HeldVelocities
 
 LONGEST_S = 4.0
 """Time, seconds, for which odometry is taken to have told nothing, at most."""
@@ -44,7 +44,7 @@ def slip(slam: Slam, sighting: Sighting) -> None:
         measured_velocities=stray.body_velocities,
         dt_s=stray.dt_s,
         gap_s=np.zeros(2),
-        covariances=slam.noise.motion(stray),
+        covariances=slam.motion_noise.covariances(stray),
         at_ends=None,
     )
     slam.gains.predict(observer, moved)

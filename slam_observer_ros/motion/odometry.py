@@ -7,13 +7,13 @@ from itertools import accumulate
 
 import numpy as np
 
-from slam_observer_ros.gains.calibration import Calibration
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.motion import Motion
+from slam_observer_ros.motion.noise import MotionNoise
+from slam_observer_ros.motion.velocity_history import HeldVelocities, VelocityHistory
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.velocity_history import HeldVelocities, VelocityHistory
 
 
 def transition(
@@ -28,7 +28,7 @@ def transition(
 def transition_covariance(
     velocities: VelocityHistory,
     calibration: Calibration,
-    noise: NoiseModel,
+    noise: MotionNoise,
     start_ns: int,
     end_ns: int,
 ) -> FloatArray:
@@ -37,14 +37,14 @@ def transition_covariance(
     motions = se3.exp(calibration.apply(held.body_velocities) * held.dt_s[:, None])
     starts = list(accumulate(motions[:-1], np.matmul, initial=np.eye(4)))
     Ad = se3.adjoint(np.array(starts))
-    covariance: FloatArray = (Ad @ noise.motion(held) @ so3.transpose(Ad)).sum(axis=0)
+    covariance: FloatArray = (Ad @ noise.covariances(held) @ so3.transpose(Ad)).sum(axis=0)
     return covariance
 
 
 def motion(
     velocities: VelocityHistory,
     calibration: Calibration,
-    noise: NoiseModel,
+    noise: MotionNoise,
     observer: Observer,
     start_ns: int,
     end_ns: int,
@@ -64,7 +64,7 @@ def motion(
         measured_velocities=held.body_velocities,
         dt_s=held.dt_s,
         gap_s=held.gap_s,
-        covariances=noise.motion(held),
+        covariances=noise.covariances(held),
         at_ends=np.array([at_start, _around(velocities, calibration, end_ns)]),
     )
 

@@ -6,25 +6,26 @@ from collections import Counter
 
 import numpy as np
 
-from slam_observer_ros.axes import axes_of
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.motion import Motion
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.landmark_index import LandmarkIndex
-from slam_observer_ros.landmark_table import LandmarkTable
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.motion.motion import Motion
+from slam_observer_ros.motion.noise import MotionNoise
+from slam_observer_ros.motion.odometry import motion
+from slam_observer_ros.motion.velocity_history import VelocityHistory
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.observer import Observer
-from slam_observer_ros.odometry import motion
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.sighting import Outcome, Outlook, Sighting
-from slam_observer_ros.surroundings import Surroundings
+from slam_observer_ros.slam.landmark_index import LandmarkIndex
+from slam_observer_ros.slam.landmark_table import LandmarkTable
+from slam_observer_ros.slam.sighting import Outcome, Outlook, Sighting
+from slam_observer_ros.slam.surroundings import Surroundings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.velocity_history import VelocityHistory
 
 SAME_PLACE = 4.0
 """Rejections within this many standard deviations of each other are at one place."""
@@ -50,8 +51,10 @@ class Slam:
         Ids and counts of the n known landmarks.
     is_mapping : bool
         Whether landmarks are added, and taken to have moved if they are rejected too often.
-    noise : NoiseModel
-        Noise of velocities and observations.
+    motion_noise : MotionNoise
+        Noise of velocities.
+    observation_noise : ObservationNoise
+        Noise of observed points.
     index : LandmarkIndex
         For landmarks near a point.
     counts : Counter
@@ -69,8 +72,9 @@ class Slam:
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
         self.rejected_in_a_row = 0
-        self.noise = NoiseModel(settings)
-        self._outlook = Outlook(self.observer, self.landmarks, self.noise, settings)
+        self.motion_noise = MotionNoise(settings)
+        self.observation_noise = ObservationNoise(settings)
+        self._outlook = Outlook(self.observer, self.landmarks, self.observation_noise, settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
@@ -164,7 +168,7 @@ class Slam:
         return motion(
             velocities,
             self.gains.calibration,
-            self.noise,
+            self.motion_noise,
             self.observer,
             start_ns,
             end_ns,
@@ -334,7 +338,7 @@ class Slam:
 
         Return the ids of those that were seen often enough to say that they have moved.
         """
-        residuals = self._outlook.residuals(event, rows, self.noise.observation(event))
+        residuals = self._outlook.residuals(event, rows, self.observation_noise.covariances(event))
         far = self.gains.distances(residuals) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         self.counts['moved_landmark'] += int(np.sum(moved))

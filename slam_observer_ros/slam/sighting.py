@@ -8,10 +8,10 @@ import numpy as np
 
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.gains.base import Residuals, Seen
-from slam_observer_ros.landmark_table import LandmarkTable
-from slam_observer_ros.noise import NoiseModel
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.landmark_table import LandmarkTable
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_s
 
@@ -74,7 +74,7 @@ class Outlook:
     ----------
     observer, landmarks : Observer, LandmarkTable
         The state.
-    noise : NoiseModel
+    noise : ObservationNoise
         Noise of observations.
     settings : Settings
         ``confirmations`` and ``max_rejections``.
@@ -82,7 +82,11 @@ class Outlook:
     """
 
     def __init__(
-        self, observer: Observer, landmarks: LandmarkTable, noise: NoiseModel, settings: Settings
+        self,
+        observer: Observer,
+        landmarks: LandmarkTable,
+        noise: ObservationNoise,
+        settings: Settings,
     ) -> None:
         self._observer, self._landmarks, self._noise = observer, landmarks, noise
         self._settings = settings
@@ -112,7 +116,7 @@ class Outlook:
     def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:
         """Return what there is to look back at later."""
         sights = self._sights(event, rows)
-        stated = None if event.covariances is None else self._noise.observation(event, sights)
+        stated = None if event.covariances is None else self._noise.covariances(event, sights)
         return Seen(event.stamp_ns, rows, event.points, sights, stated)
 
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
@@ -122,7 +126,7 @@ class Outlook:
         measured too near would be believed more than one measured too far, and all would be
         drawn towards the robot.
         """
-        return self._noise.observation(event, self._sights(event, rows))
+        return self._noise.covariances(event, self._sights(event, rows))
 
     def _sights(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return where points should be (m, 3), from the sensor, metres, body frame.

@@ -29,7 +29,7 @@ import yaml
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError
 from slam_observer_ros.events import LARGEST_ID
-from slam_observer_ros.landmark_map import LandmarkMap
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray

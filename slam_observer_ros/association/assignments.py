@@ -3,7 +3,7 @@
 An *assignment* takes each such point for a landmark, or for a new one. What matters about it is
 where it puts the robot: among those that agree on that, within what the sensor can tell, the most
 likely one is taken. Those that don't agree are all returned, for later observations to decide
-(:mod:`slam_observer_ros.hypotheses`).
+(:mod:`slam_observer_ros.association.hypotheses`).
 
 A point whose id is new may be of a landmark that had none so far. Only where the state foretells
 that landmark as well as the sensor can tell: an id that is new speaks for one that is.
@@ -15,12 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.axes import axes_of, SPATIAL
-from slam_observer_ros.events import is_automatic, UNKNOWN_ID
-from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import mahalanobis, with_blocks
-from slam_observer_ros.joint_compatibility import (
+from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     JointSearch,
     MARGIN,
@@ -28,10 +23,15 @@ from slam_observer_ros.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.landmark_index import LandmarkIndex
-from slam_observer_ros.landmark_table import LandmarkTable
+from slam_observer_ros.events import is_automatic, UNKNOWN_ID
+from slam_observer_ros.gains.base import Residuals
+from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.robust import mahalanobis, with_blocks
+from slam_observer_ros.geometry.axes import axes_of, SPATIAL
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.landmark_index import LandmarkIndex
+from slam_observer_ros.slam.landmark_table import LandmarkTable
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 MAX_CANDIDATES = 10

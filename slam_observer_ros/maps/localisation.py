@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.axes import axes_of
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.gains import held
 from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.landmark_map import LandmarkMap
-from slam_observer_ros.map_alignment import find_transform
-from slam_observer_ros.sighting import Outcome
-from slam_observer_ros.slam import Slam
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.maps.alignment import find_transform
+from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.slam.sighting import Outcome
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 ROUNDING = 1e-14

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.axes import Axes
 from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.gains.motion import Motion
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_ns

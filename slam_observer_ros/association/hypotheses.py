@@ -1,4 +1,4 @@
-"""What may be: states that read what was seen differently (:mod:`slam_observer_ros.readings`).
+"""What may be: states that take what was seen for different things (:mod:`.readings`).
 
 Where two readings of an observation put the robot at different places, both are followed, each
 with a state of its own, until later observations have made one much more likely than the other
@@ -16,19 +16,25 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.association.joint_compatibility import MARGIN
+from slam_observer_ros.association.readings import (
+    are_one,
+    is_ambiguous,
+    may_name,
+    Reading,
+    readings,
+)
+from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
     ObservationEvent,
     UNKNOWN_ID,
 )
-from slam_observer_ros.joint_compatibility import MARGIN
-from slam_observer_ros.readings import are_one, is_ambiguous, may_name, Reading, readings
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.sighting import Outcome
-from slam_observer_ros.slam import Slam
-from slam_observer_ros.slip import slip
-from slam_observer_ros.velocity_history import VelocityHistory
+from slam_observer_ros.slam.sighting import Outcome
+from slam_observer_ros.slam.slam import Slam
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,1 @@
+"""Maps as they are saved and loaded, and where the robot is in one."""

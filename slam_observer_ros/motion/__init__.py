@@ -1,0 +1,1 @@
+"""How the robot moves: velocities, how they are calibrated, and their noise."""

@@ -1,0 +1,79 @@
+"""Noise of velocities, from the settings or from the messages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.motion.velocity_history import HeldVelocities
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray, Immutable
+
+LARGEST_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
+"""Standard deviations of a velocity (Ω, v), rad/s and m/s, beyond which a message only says
+'unknown': no robot turns or moves as fast.
+"""
+
+SPEED_WINDOW_S = 1.0
+"""Time over which a velocity is averaged to tell how large an error in proportion to it is."""
+
+_IDENTITY_6 = np.eye(6)
+
+
+class MotionNoise(Immutable):
+    """How far motions may be off.
+
+    Parameters
+    ----------
+    settings : Settings
+        Noise densities of the velocity, its error in proportion to speed, and how the robot may
+        move where no velocity is known.
+
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        s = settings
+        density = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
+        unknown = np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3)
+        self._density_squared, self._unknown_squared = density**2, unknown**2
+        self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
+        self._has_scale = bool(self._scale.any())
+
+    def covariances(self, held: HeldVelocities) -> FloatArray:
+        """Return the covariances (k, 6, 6) of k motions, body frame, rad² and m².
+
+        *A velocity in force* has white noise: of the stated density, and proportional to speed.
+        The speed is the mean over :data:`SPEED_WINDOW_S`, or over all of ``held`` if that is
+        shorter; in a single message it is noisy itself, and its square too large.
+
+        *A velocity with a covariance of its own* has one error for as long as it is held, and
+        another in the next message: held for t it has moved the robot by t times the error,
+        however many motions that was cut into. Its angular and its linear part may be of two
+        messages, one of them without a covariance.
+
+        *In a gap* the robot may do anything that ``unknown_*_motion`` allows.
+        """
+        rates = self._density_squared
+        if self._has_scale:
+            rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
+        dt_s = held.dt_s[:, None]
+        white = rates * dt_s * np.repeat(~held.is_stated, 3, axis=1)
+        in_gaps = self._unknown_squared * held.gap_s[:, None]
+        covariances: FloatArray = (white + in_gaps)[:, :, None] * _IDENTITY_6
+        if held.is_stated.any():
+            squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
+            grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
+            stated = limited(held.covariances, LARGEST_SPEED_ERRORS)
+            covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
+        return covariances
+
+
+def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
+    """Return covariances (..., d, d) without variances that would drown all others in rounding.
+
+    Standard deviations are at most ``largest`` (d,); the correlations stay.
+    """
+    # Rounding may have left a variance a hair below zero.
+    deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
+    scales = largest / np.maximum(deviations, largest)
+    scaled: FloatArray = covariances * scales[..., :, None] * scales[..., None, :]
+    return scaled

@@ -1,0 +1,1 @@
+"""One state that moves on: observer, gains, and which landmarks there are."""
