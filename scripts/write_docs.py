@@ -22,11 +22,11 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 
+from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.nodes.observer_node import ObserverNode
 from slam_observer_ros.nodes.settings import AUTO, ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.nodes.simulator_node import SimulatorNode
 from slam_observer_ros.parameters import Parameter, table
-from slam_observer_ros.recording.input_settings import InputSettings
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario
 

@@ -11,6 +11,8 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.event_queue import CONFIRMATIONS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
+from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
@@ -19,8 +21,6 @@ from slam_observer_ros.nodes.conversions import (
 )
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
-from slam_observer_ros.recording.messages import pose_matrices
-from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.simulation import Simulation
 
 

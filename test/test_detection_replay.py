@@ -16,12 +16,12 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from tum_files import read_tum
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation, pose_from_rpy
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.inputs.extrinsics import move_observation
 from slam_observer_ros.maps.map_file import read_map
 from slam_observer_ros.simulation import Scenario, Simulation
 
-CAMERA = pose_from_rpy((0.2, 0.0, 0.4, -np.pi / 2, 0.0, -np.pi / 2))
+CAMERA = se3.from_rpy((0.2, 0.0, 0.4, -np.pi / 2, 0.0, -np.pi / 2))
 CAMERA_FRAME = 'camera_optical_frame'
 SCENARIO = Scenario(
     velocity_rate=20.0, observation_rate=10.0, duration=4.0, point_noise=0.02, landmark_count=8,

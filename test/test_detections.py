@@ -10,14 +10,14 @@ import ros_messages as ros
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import LARGEST_ID
-from slam_observer_ros.recording.detections import (
+from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_detections,
     decode_pose_array,
     observed_tags,
 )
-from slam_observer_ros.recording.messages import PoseMessage
-from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
+from slam_observer_ros.messages.point_cloud_layout import point_cloud2_layout
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 
 
 def test_poses_are_landmarks_without_ids():

@@ -10,19 +10,19 @@ import pytest
 
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_velocity, pose_from_rpy
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.detections import TagDetections
-from slam_observer_ros.recording.event_builder import drop_reason, EventBuilder, MAX_WAITING
-from slam_observer_ros.recording.frames import BaseFrame
-from slam_observer_ros.recording.input_settings import InputSettings
-from slam_observer_ros.recording.messages import PoseMessage, VelocityMessage
-from slam_observer_ros.recording.point_clouds import ObservationMessage
-from slam_observer_ros.transform_buffer import TransformBuffer
+from slam_observer_ros.inputs.event_builder import drop_reason, EventBuilder, MAX_WAITING
+from slam_observer_ros.inputs.extrinsics import move_velocity
+from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.inputs.settings import InputSettings
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.detections import TagDetections
+from slam_observer_ros.messages.point_clouds import ObservationMessage
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage, VelocityMessage
 
 MS = 1_000_000
 V = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])
-WHEEL = pose_from_rpy((0.3, 0.1, 0.0, 0.0, 0.0, np.pi))
+WHEEL = se3.from_rpy((0.3, 0.1, 0.0, 0.0, 0.0, np.pi))
 
 
 class Wheel:

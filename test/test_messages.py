@@ -11,13 +11,14 @@ import pytest
 import ros_messages as ros
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.recording import messages, point_clouds
-from slam_observer_ros.recording.message_types import (
+from slam_observer_ros.messages import point_clouds
+from slam_observer_ros.messages import poses_and_velocities as messages
+from slam_observer_ros.messages.message_types import (
     CLOUD_DECODERS,
     POSE_DECODERS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.recording.point_cloud_layout import (
+from slam_observer_ros.messages.point_cloud_layout import (
     encode_point_cloud,
     point_cloud2_layout,
 )

@@ -21,15 +21,15 @@ from tf2_msgs.msg import TFMessage
 
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
+from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
+from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes import frames
 from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.recording.messages import pose_matrices
-from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 from slam_observer_ros.simulation import Scenario, Simulation
-from slam_observer_ros.transform_buffer import ALWAYS_NS
 
 pytestmark = pytest.mark.ros
 
@@ -37,8 +37,8 @@ SECOND = 1_000_000_000
 TOLERANCE_NS = 200_000_000
 WINDOW_NS = 50_000_000
 SENSOR = (0.3, 0.1, 0.5, -1.5, 0.2, -1.6)
-SENSOR_POSE = pose_from_rpy(SENSOR)
-WHEEL_POSE = pose_from_rpy((-0.4, 0.3, 0.0, 0.0, 0.0, 0.7))
+SENSOR_POSE = se3.from_rpy(SENSOR)
+WHEEL_POSE = se3.from_rpy((-0.4, 0.3, 0.0, 0.0, 0.0, 0.7))
 SCENARIO = Scenario(
     velocity_rate=40.0, observation_rate=20.0, duration=2.0, initial_bias=0.0, landmark_count=6
 )
@@ -85,7 +85,7 @@ def test_sensors_on_tf_and_odometry_of_others_give_map_to_odom(ros, tmp_path):
     poses = ros.collect(PoseWithCovarianceStamped, '/wheeled/pose')
     maps = ros.collect(PointCloud2, '/wheeled/map', LATCHED_QOS)
     sender = TransformSender(ros, '/wheeled')
-    drift = pose_from_rpy((5.0, -3.0, 0.0, 0.0, 0.0, 1.0))
+    drift = se3.from_rpy((5.0, -3.0, 0.0, 0.0, 0.0, 1.0))
 
     def publish_odometry(stamp_ns, pose):
         sender.send(('odom', 'base_footprint', drift @ pose), stamp_ns=stamp_ns)
@@ -187,7 +187,7 @@ def test_observations_wait_for_their_transform_and_are_dropped_without(ros, tmp_
         robot.send(ObservationEvent(now_ns, np.array([1]), point))  # waits
         robot.send(ObservationEvent(now_ns + 3 * SECOND, np.array([2]), point))  # in vain
         ros.spin_for(0.5)
-        turret = pose_from_rpy((1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2))
+        turret = se3.from_rpy((1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2))
         sender.send(('base_link', 'turret', turret), stamp_ns=now_ns - 10_000_000)
         sender.send(('base_link', 'turret', turret), stamp_ns=now_ns + 10_000_000)
         ros.spin_for(0.2)

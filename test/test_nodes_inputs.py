@@ -22,6 +22,9 @@ from sensor_msgs.msg import Imu, PointCloud2
 
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.messages.message_types import IMU
+from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.messages.poses_and_velocities import decode_twist
 from slam_observer_ros.nodes import inputs
 from slam_observer_ros.nodes.conversions import (
     header_message,
@@ -34,9 +37,6 @@ from slam_observer_ros.nodes.input_topics import CloudDecoder
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
-from slam_observer_ros.recording.message_types import IMU
-from slam_observer_ros.recording.messages import decode_twist
-from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 
 pytestmark = pytest.mark.ros
 

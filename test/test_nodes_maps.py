@@ -25,6 +25,7 @@ from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.maps.map_file import read_map
+from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
@@ -33,7 +34,6 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
 )
 from slam_observer_ros.nodes.initial_pose import InitialPose
-from slam_observer_ros.recording.messages import pose_matrices
 from slam_observer_ros.settings import Settings
 
 pytestmark = pytest.mark.ros

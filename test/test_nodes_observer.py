@@ -25,6 +25,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
@@ -32,7 +33,6 @@ from slam_observer_ros.nodes.conversions import (
 )
 from slam_observer_ros.nodes.pose_broadcaster import DISCOVERY_S
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario
 

@@ -21,10 +21,10 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
-from slam_observer_ros.recording.point_clouds import decode_point_cloud2
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros

@@ -22,18 +22,18 @@ from sensor_msgs.msg import PointCloud2
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.detections import TagDetections
+from slam_observer_ros.messages.point_clouds import decode_point_cloud2, ObservationMessage
+from slam_observer_ros.messages.poses_and_velocities import VelocityMessage
 from slam_observer_ros.nodes.conversions import time_message
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.nodes.transforms import TFMessage
-from slam_observer_ros.recording.detections import TagDetections
-from slam_observer_ros.recording.frames import BaseFrame
-from slam_observer_ros.recording.messages import VelocityMessage
-from slam_observer_ros.recording.point_clouds import decode_point_cloud2, ObservationMessage
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
-from slam_observer_ros.transform_buffer import TransformBuffer
 from slam_observer_ros.units import to_s
 
 pytestmark = pytest.mark.ros

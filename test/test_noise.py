@@ -12,9 +12,9 @@ from strategies import generators
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation, move_velocity
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.odometry import transition, transition_covariance

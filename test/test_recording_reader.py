@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
-from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.messages.point_clouds import ObservationMessage
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.truth import LandmarkTracks

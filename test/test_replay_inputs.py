@@ -10,9 +10,8 @@ import ros_messages as ros
 from tum_files import read_tum
 
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
-from slam_observer_ros.extrinsics import pose_from_rpy
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.input_settings import InputSettings
+from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.recording.reader import open_recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter
@@ -25,8 +24,8 @@ WRONG_TURN = np.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0])
 LANDMARKS = np.random.default_rng(0).uniform([-4, -4, -1], [8, 8, 2], (12, 3))
 IDS = np.arange(12)
 PAN_RATE = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
-CAMERA = pose_from_rpy((0.1, 0.0, 0.2, -np.pi / 2, 0.0, -np.pi / 2))
-IMU_MOUNT = pose_from_rpy((0.1, 0.2, 0.3, 0.0, np.pi / 2, 0.0))
+CAMERA = se3.from_rpy((0.1, 0.0, 0.2, -np.pi / 2, 0.0, -np.pi / 2))
+IMU_MOUNT = se3.from_rpy((0.1, 0.2, 0.3, 0.0, np.pi / 2, 0.0))
 
 
 @pytest.fixture
@@ -40,7 +39,7 @@ def true_pose(stamp_ns):
 
 def turret(stamp_ns):
     """The pan head, which turns on the robot."""
-    return pose_from_rpy((0.3, 0.0, 0.5, 0.0, 0.0, 0.0)) @ se3.exp(
+    return se3.from_rpy((0.3, 0.0, 0.5, 0.0, 0.0, 0.0)) @ se3.exp(
         PAN_RATE * (stamp_ns - ros.STAMP_NS) / 1e9
     )
 
@@ -409,7 +408,7 @@ def test_truth_of_a_type_that_is_not_read_is_told(slam_observer, tmp_path, has_p
 
 @pytest.mark.parametrize('is_placed', [True, False])
 def test_true_poses_of_another_frame_are_moved_to_the_base(slam_observer, tmp_path, is_placed):
-    path, marker = tmp_path / 'run.mcap', pose_from_rpy((0.5, 0.2, 0.3, 0.0, 0.0, 2.0))
+    path, marker = tmp_path / 'run.mcap', se3.from_rpy((0.5, 0.2, 0.3, 0.0, 0.0, 2.0))
     with RecordingWriter(path) as writer:
         drive = Drive(writer)
         if is_placed:
@@ -430,7 +429,7 @@ def test_true_poses_of_another_frame_are_moved_to_the_base(slam_observer, tmp_pa
 
 def test_the_base_frame_of_the_nodes_file_counts(slam_observer, tmp_path):
     path, config = tmp_path / 'run.mcap', tmp_path / 'robot.yaml'
-    base_in_wheels = pose_from_rpy((0.5, 0.0, 0.0, 0.0, 0.0, 0.0))
+    base_in_wheels = se3.from_rpy((0.5, 0.0, 0.0, 0.0, 0.0, 0.0))
     with RecordingWriter(path) as writer:
         mount = ('wheels', 'base_link', base_in_wheels, ros.STAMP_NS)
         Drive(writer).transforms('/tf_static', ros.STAMP_NS, mount)

@@ -12,11 +12,11 @@ from strategies import poses
 
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.recording.frames import insert_transforms
-from slam_observer_ros.recording.messages import decode_transforms
-from slam_observer_ros.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
+from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
+from slam_observer_ros.inputs.frames import insert_transforms
+from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
+from slam_observer_ros.messages.poses_and_velocities import decode_transforms
 
 NO_TURN = [0.0, 0.0, 0.0, 1.0]
 SECOND = 1_000_000_000
@@ -141,7 +141,7 @@ def test_after_a_jump_of_the_clock_only_static_transforms_are_left():
 
 
 def test_roll_pitch_and_yaw_turn_about_fixed_axes():
-    pose = pose_from_rpy((1.0, 2.0, 3.0, -np.pi / 2, 0.0, -np.pi / 2))  # a camera's optical axes
+    pose = se3.from_rpy((1.0, 2.0, 3.0, -np.pi / 2, 0.0, -np.pi / 2))  # a camera's optical axes
     assert_allclose(se3.transform(pose, np.array([[0.0, 0.0, 5.0]])), [[6.0, 2.0, 3.0]])
 
 

@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from strategies import poses
 
-from slam_observer_ros.clock_offset import ClockOffset, SAMPLES
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.event_queue import EventQueue
@@ -20,10 +19,11 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.velocity_sources import PoseDifferences
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import VelocityHistory
+from slam_observer_ros.nodes.clock_offset import ClockOffset, SAMPLES
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.velocity_sources import PoseDifferences
 
 SECOND = 1_000_000_000
 START_NS = 100 * SECOND

@@ -44,6 +44,24 @@ def pose(R: FloatArray, x: FloatArray) -> FloatArray:
     return T
 
 
+def from_rpy(values: tuple[float, ...]) -> FloatArray:
+    """Pose of a position and angles about fixed axes, as URDF has it.
+
+    Parameters
+    ----------
+    values : tuple of float
+        x y z in metres, then roll pitch yaw in radians.
+
+    Returns
+    -------
+    FloatArray, shape (4, 4)
+        Pose.
+
+    """
+    roll, pitch, yaw = np.diag(values[3:])
+    return pose(so3.exp(yaw) @ so3.exp(pitch) @ so3.exp(roll), np.array(values[:3]))
+
+
 def inverse(T: FloatArray) -> FloatArray:
     """Inverse pose [[Rᵀ, −Rᵀ x], [0, 1]].
 

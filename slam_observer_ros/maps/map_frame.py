@@ -8,7 +8,6 @@ import logging
 import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
-from slam_observer_ros.extrinsics import pose_from_rpy
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.localisation import (
@@ -100,7 +99,7 @@ class MapFrame:
         """Start a run at ``pose`` (4, 4), exactly; by default where the settings have it start."""
         settings, covariance = self.settings, None
         if pose is None and settings.set_initial_pose:
-            pose = pose_from_rpy((*settings.initial_position, 0.0, 0.0, settings.initial_yaw))
+            pose = se3.from_rpy((*settings.initial_position, 0.0, 0.0, settings.initial_yaw))
             covariance = np.diag(GIVEN_POSE_STD**2)
         self.start(pose, covariance)
 

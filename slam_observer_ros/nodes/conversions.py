@@ -11,7 +11,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
+from slam_observer_ros.messages.point_cloud_layout import point_cloud2_layout
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 

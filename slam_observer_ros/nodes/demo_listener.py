@@ -17,14 +17,14 @@ from std_msgs.msg import Float64
 from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.transforms import TFMessage
-from slam_observer_ros.recording.cdr import CdrReader
-from slam_observer_ros.recording.messages import (
+from slam_observer_ros.messages.cdr import CdrReader
+from slam_observer_ros.messages.point_clouds import decode_point_cloud, decode_point_cloud2
+from slam_observer_ros.messages.poses_and_velocities import (
     decode_pose_stamped,
     decode_pose_with_covariance_stamped,
 )
-from slam_observer_ros.recording.point_clouds import decode_point_cloud, decode_point_cloud2
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.transforms import TFMessage
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s

@@ -10,10 +10,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 
 from slam_observer_ros.errors import MessageError, TransformError
+from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
+from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
+from slam_observer_ros.messages.poses_and_velocities import decode_transforms, pose_matrices
 from slam_observer_ros.nodes.transforms import TFMessage
-from slam_observer_ros.recording.frames import insert_transforms, TransformSource
-from slam_observer_ros.recording.messages import decode_transforms, pose_matrices
-from slam_observer_ros.transform_buffer import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.types import FloatArray
 
 try:

@@ -11,10 +11,13 @@ from rclpy.node import Node
 from slam_observer_ros.errors import MessageError, ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.maps.map_frame import GIVEN_POSE_STD
+from slam_observer_ros.messages.poses_and_velocities import (
+    decode_pose_with_covariance_stamped,
+    PoseMessage,
+)
 from slam_observer_ros.motion.noise import limited
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
 from slam_observer_ros.parameters import table
-from slam_observer_ros.recording.messages import decode_pose_with_covariance_stamped, PoseMessage
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 

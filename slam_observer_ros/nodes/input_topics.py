@@ -10,18 +10,15 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.events import UNKNOWN_ID
-from slam_observer_ros.nodes.inputs import Input
-from slam_observer_ros.nodes.intake import Intake
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.recording.cdr import Buffer
-from slam_observer_ros.recording.cloud_ids import missing_ids
-from slam_observer_ros.recording.detections import (
+from slam_observer_ros.inputs.settings import AUTO, ON_TF
+from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.messages.cloud_ids import missing_ids
+from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_pose_array,
     observed_tags,
 )
-from slam_observer_ros.recording.input_settings import AUTO, ON_TF
-from slam_observer_ros.recording.message_types import (
+from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
     DETECTION_DECODERS,
@@ -32,15 +29,18 @@ from slam_observer_ros.recording.message_types import (
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.recording.messages import (
+from slam_observer_ros.messages.point_cloud_layout import ID_NAME
+from slam_observer_ros.messages.point_clouds import field_names, ObservationMessage
+from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
     decode_transforms,
     ImuMessage,
     PoseMessage,
 )
-from slam_observer_ros.recording.point_cloud_layout import ID_NAME
-from slam_observer_ros.recording.point_clouds import field_names, ObservationMessage
+from slam_observer_ros.nodes.inputs import Input
+from slam_observer_ros.nodes.intake import Intake
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
 
 ValueT = TypeVar('ValueT')
 

@@ -12,9 +12,9 @@ from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from slam_observer_ros.backlog import Backlog
 from slam_observer_ros.errors import MessageError, ParameterError
-from slam_observer_ros.recording.cdr import Buffer
+from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.nodes.backlog import Backlog
 from slam_observer_ros.units import to_s
 
 REPORT_PERIOD_S = 10.0

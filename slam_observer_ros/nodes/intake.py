@@ -10,7 +10,6 @@ from typing import TypeVar
 
 from rclpy.node import Node
 
-from slam_observer_ros.clock_offset import ClockOffset
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import (
@@ -19,17 +18,22 @@ from slam_observer_ros.events import (
     ObservationEvent,
     VelocityEvent,
 )
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.recording.detections import TagDetections
-from slam_observer_ros.recording.event_builder import (
+from slam_observer_ros.inputs.event_builder import (
     drop_reason,
     DropError,
     EventBuilder,
     Measured,
 )
-from slam_observer_ros.recording.frames import BaseFrame
-from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
-from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
+from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.messages.detections import TagDetections
+from slam_observer_ros.messages.point_clouds import ObservationMessage, scan_trouble
+from slam_observer_ros.messages.poses_and_velocities import (
+    ImuMessage,
+    PoseMessage,
+    VelocityMessage,
+)
+from slam_observer_ros.nodes.clock_offset import ClockOffset
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.units import to_ns
 
 REPORT_PERIOD_S = 10.0

@@ -9,6 +9,7 @@ from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
 from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.nodes.controls import Controls
 from slam_observer_ros.nodes.diagnostics import Diagnostics
 from slam_observer_ros.nodes.entities import Entities
@@ -20,7 +21,6 @@ from slam_observer_ros.nodes.maps import Maps
 from slam_observer_ros.nodes.outputs import Outputs
 from slam_observer_ros.nodes.parameters import read_settings
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.recording.frames import BaseFrame
 from slam_observer_ros.settings import Settings
 
 OVERVIEW_PERIOD_S = 0.5

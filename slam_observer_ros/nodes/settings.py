@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.inputs.settings import AUTO, InputSettings
 from slam_observer_ros.parameters import parameter
-from slam_observer_ros.recording.input_settings import AUTO, InputSettings
 
 
 @dataclass(frozen=True)

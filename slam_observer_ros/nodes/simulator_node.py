@@ -15,6 +15,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
@@ -27,7 +28,6 @@ from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.runner import run
 from slam_observer_ros.nodes.settings import SimulatorNodeSettings
 from slam_observer_ros.nodes.transforms import TransformPublisher
-from slam_observer_ros.recording.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
 from slam_observer_ros.units import to_ns
 

@@ -1,1 +1,1 @@
-"""Recordings and data sets: ROS messages to events and back, without a ROS installation."""
+"""Recordings and public data sets, read and written without a ROS installation."""

@@ -8,10 +8,10 @@ from functools import partial
 from typing import TypeAlias
 
 from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.recording.detections import decode_apriltags, observed_tags, TagDetections
-from slam_observer_ros.recording.event_builder import Measured
-from slam_observer_ros.recording.input_settings import InputSettings, POSE_DIFFERENCES
-from slam_observer_ros.recording.message_types import (
+from slam_observer_ros.inputs.event_builder import Measured
+from slam_observer_ros.inputs.settings import InputSettings, POSE_DIFFERENCES
+from slam_observer_ros.messages.detections import decode_apriltags, observed_tags, TagDetections
+from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
     DETECTION_DECODERS,
@@ -19,7 +19,8 @@ from slam_observer_ros.recording.message_types import (
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.recording.messages import (
+from slam_observer_ros.messages.point_clouds import ObservationMessage, scan_trouble
+from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
     decode_transforms,
@@ -27,7 +28,6 @@ from slam_observer_ros.recording.messages import (
     PoseMessage,
     VelocityMessage,
 )
-from slam_observer_ros.recording.point_clouds import ObservationMessage, scan_trouble
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
 

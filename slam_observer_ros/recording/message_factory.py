@@ -8,7 +8,7 @@ import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.recording.point_cloud_layout import PointCloud2Layout
+from slam_observer_ros.messages.point_cloud_layout import PointCloud2Layout
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 

@@ -16,7 +16,20 @@ import numpy as np
 
 from slam_observer_ros.errors import MessageError, RecordingError
 from slam_observer_ros.events import Event
-from slam_observer_ros.recording.cloud_ids import missing_ids
+from slam_observer_ros.inputs.event_builder import (
+    drop_reason,
+    DropError,
+    EventBuilder,
+    Measured,
+    with_receive_time,
+)
+from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
+from slam_observer_ros.inputs.settings import InputSettings
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.cloud_ids import missing_ids
+from slam_observer_ros.messages.message_types import CLOUD_DECODERS, ODOMETRY, POSE_ARRAY
+from slam_observer_ros.messages.point_cloud_layout import ID_NAME
+from slam_observer_ros.messages.point_clouds import field_names
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_landmarks,
@@ -24,24 +37,11 @@ from slam_observer_ros.recording.decoding import (
     decode_transform_message,
     input_decoders,
 )
-from slam_observer_ros.recording.event_builder import (
-    drop_reason,
-    DropError,
-    EventBuilder,
-    Measured,
-    with_receive_time,
-)
-from slam_observer_ros.recording.frames import BaseFrame, insert_transforms
-from slam_observer_ros.recording.input_settings import InputSettings
-from slam_observer_ros.recording.message_types import CLOUD_DECODERS, ODOMETRY, POSE_ARRAY
 from slam_observer_ros.recording.opening import open_source
-from slam_observer_ros.recording.point_cloud_layout import ID_NAME
-from slam_observer_ros.recording.point_clouds import field_names
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.recording.truth import base_in_frames, frames_beside, Truth
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.transform_buffer import TransformBuffer
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 

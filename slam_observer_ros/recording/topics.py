@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import logging
 
 from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.recording.input_settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
-from slam_observer_ros.recording.message_types import (
+from slam_observer_ros.inputs.settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
+from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
     DETECTIONS,

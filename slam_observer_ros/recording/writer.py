@@ -26,10 +26,10 @@ from rosbags.rosbag2 import (
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.messages.point_cloud_layout import point_cloud2_layout
 from slam_observer_ros.output_files import destination
-from slam_observer_ros.recording.cdr import Buffer
 from slam_observer_ros.recording.message_factory import MessageFactory
-from slam_observer_ros.recording.point_cloud_layout import point_cloud2_layout
 
 VELOCITY_TOPIC = '/twist'
 LANDMARKS_TOPIC = '/landmarks'

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.recording.cdr import Buffer, CdrReader
-from slam_observer_ros.recording.point_cloud_layout import (
+from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.point_cloud_layout import (
     CloudField,
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,

@@ -10,12 +10,16 @@ from typing import TypeAlias
 
 from slam_observer_ros.errors import InvalidEventError, TransformError
 from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityEvent
-from slam_observer_ros.recording.detections import TagDetections
-from slam_observer_ros.recording.frames import BaseFrame
-from slam_observer_ros.recording.messages import ImuMessage, PoseMessage, VelocityMessage
-from slam_observer_ros.recording.point_clouds import ObservationMessage
+from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.inputs.velocity_sources import PoseDifferences
+from slam_observer_ros.messages.detections import TagDetections
+from slam_observer_ros.messages.point_clouds import ObservationMessage
+from slam_observer_ros.messages.poses_and_velocities import (
+    ImuMessage,
+    PoseMessage,
+    VelocityMessage,
+)
 from slam_observer_ros.units import to_ns
-from slam_observer_ros.velocity_sources import PoseDifferences
 
 MAX_WAITING = 1000
 """Most measurements that wait for a transform; the oldest go first."""

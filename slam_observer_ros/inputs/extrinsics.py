@@ -7,15 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray
-
-
-def pose_from_rpy(values: tuple[float, ...]) -> FloatArray:
-    """Return the pose (4, 4) of x y z in metres and roll pitch yaw in radians about fixed axes."""
-    roll, pitch, yaw = np.diag(values[3:])
-    R = so3.exp(yaw) @ so3.exp(pitch) @ so3.exp(roll)
-    return se3.pose(R, np.array(values[:3]))
 
 
 def move_observation(event: ObservationEvent, pose: FloatArray) -> ObservationEvent:

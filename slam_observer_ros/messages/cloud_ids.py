@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from slam_observer_ros.recording.point_cloud_layout import ID_NAME
+from slam_observer_ros.messages.point_cloud_layout import ID_NAME
 
 
 def missing_ids(names: Sequence[str], message_type: str) -> str:
@@ -13,7 +13,7 @@ def missing_ids(names: Sequence[str], message_type: str) -> str:
     Parameters
     ----------
     names : sequence of str
-        From :func:`slam_observer_ros.recording.point_clouds.field_names`.
+        From :func:`slam_observer_ros.messages.point_clouds.field_names`.
     message_type : str
         ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
 

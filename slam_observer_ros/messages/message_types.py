@@ -8,9 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-from slam_observer_ros.recording.cdr import Buffer
-from slam_observer_ros.recording.detections import decode_detections, decode_pose_array
-from slam_observer_ros.recording.messages import (
+from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.messages.detections import decode_detections, decode_pose_array
+from slam_observer_ros.messages.point_clouds import (
+    decode_point_cloud,
+    decode_point_cloud2,
+    ObservationMessage,
+)
+from slam_observer_ros.messages.poses_and_velocities import (
     decode_odometry_pose,
     decode_odometry_twist,
     decode_pose_stamped,
@@ -21,11 +26,6 @@ from slam_observer_ros.recording.messages import (
     decode_twist_with_covariance_stamped,
     PoseMessage,
     VelocityMessage,
-)
-from slam_observer_ros.recording.point_clouds import (
-    decode_point_cloud,
-    decode_point_cloud2,
-    ObservationMessage,
 )
 
 ODOMETRY = 'nav_msgs/msg/Odometry'

@@ -1,9 +1,7 @@
-"""The one boundary between ROS messages and numpy, for live topics and recordings alike.
+"""Velocities, poses and transforms of ROS messages.
 
-Decoders take a message as serialised bytes, which rclpy's raw subscriptions and rosbags' raw data
-give alike; a malformed message raises :class:`MessageError` with the reason. ROS puts linear
-before angular components; the paper's (9), and all arrays that leave this module, put angular
-first.
+ROS puts linear before angular components; the paper's (9), and all arrays that leave this module,
+put angular first.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import numpy as np
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.types import FloatArray
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])

@@ -9,17 +9,18 @@ import numpy as np
 
 from slam_observer_ros.errors import ParameterError, TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation, move_velocity, pose_from_rpy
-from slam_observer_ros.recording.detections import TagDetections
-from slam_observer_ros.recording.input_settings import InputSettings
-from slam_observer_ros.recording.messages import (
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
+from slam_observer_ros.inputs.settings import InputSettings
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.detections import TagDetections
+from slam_observer_ros.messages.point_clouds import ObservationMessage
+from slam_observer_ros.messages.poses_and_velocities import (
     ImuMessage,
     pose_stack,
     PoseMessage,
     VelocityMessage,
 )
-from slam_observer_ros.recording.point_clouds import ObservationMessage
-from slam_observer_ros.transform_buffer import TransformBuffer
 from slam_observer_ros.types import FloatArray
 
 MeasuredT = TypeVar('MeasuredT', ObservationEvent, VelocityEvent, ImuMessage)
@@ -104,7 +105,7 @@ class BaseFrame:
                     "parameter 'sensor_pose': roll, pitch and yaw are radians, which "
                     f'{angles_rad} are not'
                 )
-            self._sensor_pose = pose_from_rpy(settings.sensor_pose)
+            self._sensor_pose = se3.from_rpy(settings.sensor_pose)
 
     def observation(self, message: ObservationMessage) -> ObservationEvent:
         """Return landmarks in the base frame.

@@ -1,7 +1,6 @@
 """Landmark observations from messages of detectors: poses, boxes and fiducials.
 
-As in :mod:`slam_observer_ros.recording.messages`, messages are read from their bytes, so that
-none of the packages that define them is needed here.
+Messages are read from their bytes, so that none of the packages that define them is needed here.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import numpy as np
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import LARGEST_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.recording.cdr import Buffer, CdrReader
-from slam_observer_ros.recording.messages import PoseMessage
-from slam_observer_ros.recording.point_clouds import measured, ObservationMessage
+from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.point_clouds import measured, ObservationMessage
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.types import FloatArray
 
 _POSE = 7

@@ -1,0 +1,1 @@
+"""Measurements to events: moved into the base frame, and velocities made of poses."""
