@@ -90,7 +90,12 @@ class Observer:
         As far as they have been moved: some gains put that off for landmarks out of view, see
         :attr:`slam_observer_ros.slam.slam.Slam.world_points`.
         """
-        return se3.transform(self.reference_pose, self.y_ref + self.a)
+        return se3.transform(self.reference_pose, self.points)
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 3) the same in the reference frame, y_i° + â_i, metres."""
+        return self.y_ref + self.a
 
     def body_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen, Â⁻¹ (y_i° + â_i) (m, 3), metres, body frame."""

@@ -52,7 +52,7 @@ class Filter:
 
     def expected(self, rows):
         """Where the landmarks should be seen, (m, 3)."""
-        points = self.observer.y_ref[rows] + self.observer.a[rows]
+        points = self.observer.points[rows]
         return se3.transform(se3.inverse(self.observer.A), points)
 
     def step(self, rng, motion_variance, point_variance):
@@ -73,7 +73,7 @@ class Filter:
     @property
     def points(self):
         """Landmarks (n, 3), reference frame."""
-        return self.observer.y_ref + self.observer.a + self.gains.postponed_shifts()
+        return self.observer.points + self.gains.postponed_shifts()
 
     def _turned(self, covariances):
         R = self.observer.A[:3, :3]

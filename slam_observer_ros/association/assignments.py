@@ -23,15 +23,14 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
-from slam_observer_ros.events import is_automatic, UNKNOWN_ID
+from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import mahalanobis, with_blocks
-from slam_observer_ros.geometry.axes import axes_of, SPATIAL
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.observer import Observer
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.landmark_index import LandmarkIndex
-from slam_observer_ros.slam.landmark_table import LandmarkTable
+from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 MAX_CANDIDATES = 10
@@ -56,34 +55,18 @@ class Assignment:
 
 
 def find_assignments(
-    observer: Observer,
-    gains: RiccatiGains,
-    landmarks: LandmarkTable,
-    index: LandmarkIndex,
-    ids: IntArray,
-    points: FloatArray,
-    noise: FloatArray,
-    settings: Settings,
-    budget: float,
+    slam: Slam, gains: RiccatiGains, event: ObservationEvent, budget: float
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different places.
 
     Parameters
     ----------
-    observer, gains : Observer, RiccatiGains
-        State and its covariance.
-    landmarks : LandmarkTable
-        Their ids.
-    index : LandmarkIndex
-        Index over the observer's landmarks.
-    ids : IntArray
-        (m,) what the sensor says the points are, ``UNKNOWN_ID`` where it doesn't.
-    points : FloatArray
-        (m, 3) Â y_i, metres, reference frame.
-    noise : FloatArray
-        (m, 3, 3) their covariances, m².
-    settings : Settings
-        ``rejection_distance`` is how far a point may be from its landmark, in σ.
+    slam : Slam
+        The state at the observation's instant.
+    gains : RiccatiGains
+        Its gains.
+    event : ObservationEvent
+        The observation, of m points.
     budget : float
         What an assignment may cost at most.
 
@@ -93,30 +76,26 @@ def find_assignments(
         The most likely first.
 
     """
-    axes = axes_of(settings.two_d_mode)
-    gate, m, k = settings.rejection_distance, len(points), axes.point
-    known_rows = landmarks.rows_of(ids)
-    is_new_id = (ids != UNKNOWN_ID) & (known_rows < 0)
-    at, rows = _pairs_near(gate, observer, gains, index, points, noise)
-    allowed = _may_be(known_rows, is_new_id, is_automatic(landmarks.ids), at, rows)
-    at, rows = _pairs_within(gate, observer, gains, at[allowed], rows[allowed], points, noise)
-    residuals = _as_residuals(observer, rows, points[at], noise[at])
+    axes, m = slam.axes, len(event.ids)
+    seen = _Seen(slam, event)
+    at, rows = _candidates(slam, gains, seen)
+    residuals = _as_residuals(slam.observer, seen, at, rows)
     PC, CPC = gains.foretold(residuals)
-    own_noise = residuals.covariances[:, :k, :k]
-    S = with_blocks(CPC, own_noise)
-    pairs = Pairs(at, rows, residuals.r[:, :k], S, own_noise)
-    nearly = mahalanobis(pairs.residuals, pairs.noise) <= RESOLUTION
-    certain = nearly & ~is_new_id[at]
-    unpaired_costs = np.where(is_new_id, unpaired_cost(RESOLUTION), unpaired_cost(gate))
+    r, noise = residuals.r[:, : axes.point], residuals.covariances[:, : axes.point, : axes.point]
+    pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
+    certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
+    gate_cost = unpaired_cost(slam.settings.rejection_distance)
+    unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), gate_cost)
     # Beyond what is searched; a point of no landmark costs the same whatever it might have been.
-    fixed_cost = m * unpaired_cost(gate) - float(unpaired_costs[np.unique(at)].sum())
+    fixed_cost = m * gate_cost - float(unpaired_costs[np.unique(at)].sum())
     margin = 0.0 if certain.all() else MARGIN
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
-    J = np.linalg.inv(np.linalg.cholesky(noise[:, :k, :k])) @ axes.output_matrix(points)
+    scale = np.linalg.inv(np.linalg.cholesky(seen.noise[:, : axes.point, : axes.point]))
+    J = scale @ axes.output_matrix(seen.points)  # how a pose error moves the points, in σ
     assignments: list[Assignment] = []
     moves: list[FloatArray] = []
     for pairing in search.pairings():
-        move = J @ PC[:, columns_of(pairing.chosen, k)] @ (pairing.L.T @ pairing.z)  # in σ
+        move = J @ PC[:, columns_of(pairing.chosen, axes.point)] @ (pairing.L.T @ pairing.z)
         if all(_largest(move - other) > RESOLUTION for other in moves):
             found = np.full(m, -1)
             found[at[pairing.chosen]] = rows[pairing.chosen]
@@ -125,60 +104,67 @@ def find_assignments(
     return assignments
 
 
-def _pairs_near(
-    gate: float,
-    observer: Observer,
-    gains: RiccatiGains,
-    index: LandmarkIndex,
-    points: FloatArray,
-    noise: FloatArray,
-) -> tuple[IntArray, IntArray]:
-    """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
-    C = SPATIAL.output_matrix(points)
-    seen = C @ gains.pose_covariance @ C.swapaxes(1, 2) + noise
-    spread_m = _spread_m(seen) + np.max(_spread_m(gains.landmark_covariances), initial=0.0)
-    return index.near(observer.y_ref + observer.a, points, gate * spread_m)
+class _Seen:
+    """The points of an observation in the reference frame, and what their ids say.
 
+    Attributes
+    ----------
+    points : FloatArray
+        (m, 3) Â y_i, metres.
+    noise : FloatArray
+        (m, 3, 3) their covariances, m².
+    known_rows : IntArray
+        (m,) rows of the landmarks whose ids they have, −1 for none.
+    is_new_id : BoolArray
+        (m,) whether a point has an id that no landmark has.
 
-def _may_be(
-    known_rows: IntArray,
-    is_new_id: BoolArray,
-    is_nameless: BoolArray,
-    at: IntArray,
-    rows: IntArray,
-) -> BoolArray:
-    """Return which pairs (q,) of a point and a landmark the ids of the points (m,) allow.
-
-    ``is_nameless`` (n,) says which landmarks have no id of their own.
     """
-    others = ~np.isin(rows, known_rows) & (~is_new_id[at] | is_nameless[rows])
-    return np.asarray(np.where(known_rows[at] >= 0, rows == known_rows[at], others))
+
+    def __init__(self, slam: Slam, event: ObservationEvent) -> None:
+        self.points = se3.transform(slam.observer.A, event.points)
+        self.noise = slam.observer.turned(slam.observation_noise.covariances(event))
+        self.known_rows = slam.landmarks.rows_of(event.ids)
+        self.is_new_id = (event.ids != UNKNOWN_ID) & (self.known_rows < 0)
 
 
-def _pairs_within(
-    gate: float,
-    observer: Observer,
-    gains: RiccatiGains,
-    at: IntArray,
-    rows: IntArray,
-    points: FloatArray,
-    noise: FloatArray,
-) -> tuple[IntArray, IntArray]:
-    """Return which of the pairs (q,), (q,) of a point and a landmark pass the gate alone."""
-    distances = gains.distances(_as_residuals(observer, rows, points[at], noise[at]))
+def _candidates(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray, IntArray]:
+    """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate.
+
+    Each passes it alone: those of one point are the :data:`MAX_CANDIDATES` nearest at most.
+    """
+    at, rows = _pairs_near(slam, gains, seen)
+    allowed = _may_be(slam, seen, at, rows)
+    at, rows = at[allowed], rows[allowed]
+    distances = gains.distances(_as_residuals(slam.observer, seen, at, rows))
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
-    near = order[(rank < MAX_CANDIDATES) & (distances[order] <= gate)]
+    passes = distances[order] <= slam.settings.rejection_distance
+    near = order[(rank < MAX_CANDIDATES) & passes]
     return at[near], rows[near]
 
 
-def _as_residuals(
-    observer: Observer, rows: IntArray, points: FloatArray, noise: FloatArray
-) -> Residuals:
-    """Return what it would be to see the landmarks ``rows`` (q,) at ``points`` (q, 3)."""
+def _pairs_near(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray, IntArray]:
+    """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
+    C = SPATIAL.output_matrix(seen.points)
+    covariances = C @ gains.pose_covariance @ C.swapaxes(1, 2) + seen.noise
+    spread_m = _spread_m(covariances) + np.max(_spread_m(gains.landmark_covariances), initial=0.0)
+    reach_m = slam.settings.rejection_distance * spread_m
+    return slam.index.near(slam.observer.points, seen.points, reach_m)
+
+
+def _may_be(slam: Slam, seen: _Seen, at: IntArray, rows: IntArray) -> BoolArray:
+    """Return which pairs (q,) of a point and a landmark the ids of the points allow."""
+    is_automatic_id = is_automatic(slam.landmarks.ids)
+    others = ~np.isin(rows, seen.known_rows) & (~seen.is_new_id[at] | is_automatic_id[rows])
+    known_rows = seen.known_rows[at]
+    return np.asarray(np.where(known_rows >= 0, rows == known_rows, others))
+
+
+def _as_residuals(observer: Observer, seen: _Seen, at: IntArray, rows: IntArray) -> Residuals:
+    """Return what it would be if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
     a = observer.a[rows]
-    e = points - a
-    return Residuals(rows, e, e - observer.y_ref[rows], a, noise, np.zeros(len(rows)))
+    e = seen.points[at] - a
+    return Residuals(rows, e, e - observer.y_ref[rows], a, seen.noise[at], np.zeros(len(rows)))
 
 
 def _largest(vectors: FloatArray) -> float:

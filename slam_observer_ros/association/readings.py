@@ -24,7 +24,6 @@ from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.slam.sighting import Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import IntArray
@@ -189,17 +188,7 @@ def _named(
     An id is believed here, too, until something contradicts it: without a suspect a reading
     costs no less than with all of them.
     """
-    found = find_assignments(
-        slam.observer,
-        gains,
-        slam.landmarks,
-        slam.index,
-        event.ids,
-        se3.transform(slam.observer.A, event.points),
-        slam.observer.turned(slam.observation_noise.covariances(event)),
-        slam.settings,
-        budget,
-    )
+    found = find_assignments(slam, gains, event, budget)
     outliers = [np.isin(event.ids, suspects) & (one.rows < 0) for one in found]
     pairs = list(zip(found, outliers, strict=True))
     trusting = min((one.cost for one, some in pairs if not some.any()), default=0.0)
@@ -229,7 +218,7 @@ def _with_ids(
 
 def _cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:
     """Return what it costs to take some of m points for the landmarks whose ids they have."""
-    gate, k = slam.settings.rejection_distance, axes_of(slam.settings.two_d_mode).point
+    gate, k = slam.settings.rejection_distance, slam.axes.point
     r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
     passed, own = gated(r, gains.foretold(residuals)[1], noise, slam.settings)
     paired_cost = joint_cost(r[passed], with_blocks(own, noise[passed]), noise[passed])

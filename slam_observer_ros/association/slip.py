@@ -8,10 +8,8 @@ import numpy as np
 
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
-from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.velocity_history import HeldVelocities
-from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.sighting import Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
@@ -36,7 +34,7 @@ def slip(slam: Slam, sighting: Sighting) -> None:
     it sees is yet to be used.
     """
     observer, start = slam.observer, slam.observer.A
-    needed_s = _duration_s(slam.settings, sighting)
+    needed_s = _duration_s(slam, sighting)
     observer.propagate(np.array([start, _pose_after(slam, sighting)]))
     stray = HeldVelocities.unknown(np.array([0.0, min(needed_s, LONGEST_S)]))
     moved = Motion(
@@ -51,9 +49,9 @@ def slip(slam: Slam, sighting: Sighting) -> None:
     slam.counts['slip'] += 1
 
 
-def _duration_s(settings: Settings, sighting: Sighting) -> float:
+def _duration_s(slam: Slam, sighting: Sighting) -> float:
     """Return after how long without odometry a robot might see what it does, seconds."""
-    k, residuals = axes_of(settings.two_d_mode).point, sighting.residuals
+    settings, k, residuals = slam.settings, slam.axes.point, sighting.residuals
     points = sighting.event.points[sighting.known]
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
@@ -67,8 +65,8 @@ def _pose_after(slam: Slam, sighting: Sighting) -> FloatArray:
     If it is not, or can't be told, the correction that follows finds it better.
     """
     A, residuals = slam.observer.A, sighting.residuals
-    k, rows = axes_of(slam.settings.two_d_mode).point, residuals.rows
-    landmarks = slam.observer.y_ref[rows] + slam.observer.a[rows]
+    k, rows = slam.axes.point, residuals.rows
+    landmarks = slam.observer.points[rows]
     weights = 1.0 / np.trace(residuals.covariances, axis1=1, axis2=2)
     offsets = landmarks - np.average(landmarks, axis=0, weights=weights)
     spreads = np.linalg.svd(np.sqrt(weights)[:, None] * offsets, compute_uv=False)

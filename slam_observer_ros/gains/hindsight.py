@@ -208,12 +208,12 @@ class Hindsight:
     def _solution_from(self, first: int, observer: Observer) -> Solution:
         """Return the present estimates, of poses those from before frame ``first`` on."""
         poses = np.array(self.history.poses[first:])
-        return Solution(poses, self._calibration.values, observer.y_ref + observer.a)
+        return Solution(poses, self._calibration.values, observer.points)
 
     def _known(self, observer: Observer) -> Prior:
         """Return what is known now."""
         covariance = self._joint.with_pose_error_by(se3.inverse(observer.A))
-        points = observer.y_ref + observer.a
+        points = observer.points
         return Prior(observer.A, self._calibration.values, points, covariance)
 
 

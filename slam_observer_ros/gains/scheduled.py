@@ -128,7 +128,7 @@ class ScheduledGains(GainDesign):
         everything, p = np.arange(len(self._leaves)), len(self._axes.pose)
         m, k, q = len(r), self._axes.point, len(self._core.P)
         F, N, _ = self._leaves.now(everything)
-        J = self._axes.output_matrix(observer.y_ref + observer.a)
+        J = self._axes.output_matrix(observer.points)
         z, known, gamma = np.split(np.arange(q + m * k + p), [q, q + m * k])
         P, G = np.zeros((gamma[-1] + 1,) * 2), np.zeros((gamma[-1] + 1, p))
         P[: gamma[0], : gamma[0]] = self._with_landmarks(F[rows], N[rows])

@@ -15,7 +15,6 @@ from slam_observer_ros.gains import held
 from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.maps.alignment import find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.slam.sighting import Outcome
@@ -85,7 +84,7 @@ def is_lost(slam: Slam) -> bool:
     """
     often = slam.settings.max_rejections
     moved = np.sum(slam.landmarks.rejections >= often)
-    needed = axes_of(slam.settings.two_d_mode).point
+    needed = slam.axes.point
     return bool(not slam.is_mapping and slam.rejected_in_a_row >= often and moved >= needed)
 
 
@@ -126,7 +125,7 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.gains.gauge`. None
     where the gains know no covariances.
     """
-    n, axes, observer = len(slam.landmarks), axes_of(slam.settings.two_d_mode), slam.observer
+    n, axes, observer = len(slam.landmarks), slam.axes, slam.observer
     k, R = axes.point, observer.reference_pose[:3, :3]
     if not isinstance(slam.gains, RiccatiGains) or n == 0:
         return slam.landmark_covariances
@@ -147,14 +146,14 @@ def _find_frame(
     slam: Slam, rows: IntArray, known: LandmarkMap
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
-    axes = axes_of(slam.settings.two_d_mode)
+    axes = slam.axes
     covariance = slam.gains.joint_covariance(rows)
     if covariance is None:
         variance = slam.settings.point_noise**2
         pose = np.zeros(len(axes.pose))
         covariance = np.diag(np.append(pose, np.full(axes.point * len(rows), variance)))
     covariances = known.covariances_or(slam.settings.map_noise)
-    points = slam.observer.y_ref[rows] + slam.observer.a[rows]
+    points = slam.observer.points[rows]
     return find_transform(points, covariance, known.world_points, covariances, axes)
 
 
@@ -169,7 +168,7 @@ def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
     """Correct the estimate by what a map knows of the landmarks at ``rows``."""
     observer = slam.observer
     targets, covariances = _in_reference_frame(slam, known)
-    r = (observer.y_ref + observer.a)[rows] - targets
+    r = observer.points[rows] - targets
     observer.correct(slam.gains.anchor(observer, rows, r, covariances))
     slam.gains.settle(observer)
     # A surveyed landmark needs no observation to be believed.
@@ -190,7 +189,7 @@ def _complete(slam: Slam, known: LandmarkMap) -> None:
     new = known.select(slam.landmarks.rows_of(known.ids) < 0)
     y_ref, covariances = _in_reference_frame(slam, new)
     observer.add_reference_landmarks(y_ref)
-    observer.rebase(observer.A, observer.y_ref + observer.a)
+    observer.rebase(observer.A, observer.points)
     # A surveyed landmark needs no observation to be believed.
     slam.landmarks.add_known(new.ids, np.maximum(new.counts, settings.confirmations))
     slam.is_mapping = settings.localization_mode == 'off'

@@ -45,6 +45,8 @@ class Slam:
     ----------
     observer : Observer
         State X̂ and reference ξ°.
+    axes : Axes
+        What of the pose and of points is estimated.
     gains : GainDesign
         What turns residuals into corrections.
     landmarks : LandmarkTable
@@ -67,6 +69,7 @@ class Slam:
     def __init__(self, settings: Settings, initial_pose: FloatArray) -> None:
         self.settings = settings
         self.observer = Observer(initial_pose)
+        self.axes = axes_of(settings.two_d_mode)
         self.gains = make_gains(settings)
         self.landmarks = LandmarkTable()
         self.is_mapping = True
@@ -78,8 +81,7 @@ class Slam:
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
-        k = axes_of(settings.two_d_mode).point
-        self._surroundings = Surroundings(self.observer, self.landmarks, k)
+        self._surroundings = Surroundings(self.observer, self.landmarks, self.axes.point)
 
     @property
     def confirmed(self) -> IntArray:
