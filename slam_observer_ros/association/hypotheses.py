@@ -111,7 +111,7 @@ class Hypotheses:
             sighting = self.best.look(event)
             is_clear = self._limit == 1 or not is_ambiguous(self.best, sighting)
             if is_clear and not may_name(self.best, event):
-                return self.best.observe(event, sighting)
+                return self.best.observe(sighting)
         possible = self._possible(event)
         uses = Counter(number for number, _ in possible)
         followed: list[_Followed] = []
@@ -121,7 +121,7 @@ class Hypotheses:
             slam.landmarks.renumber(reading.named_rows, reading.names)
             if reading.has_slipped:
                 slip(slam, slam.look(reading.event))
-            outcome = slam.observe(reading.event)
+            outcome = slam.observe(slam.look(reading.event))
             if some_are_unknown:
                 slam.note_surroundings(reading.event, self._some_have_ids)
             slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)

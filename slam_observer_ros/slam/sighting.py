@@ -32,6 +32,9 @@ class Sighting:
         (m, 3, 3) their covariances, body frame, m².
     residuals : Residuals
         Of those that are not new.
+    left_out : dict
+        How many points of the observation are not in ``event``, by the reason: ``'unknown_id'``,
+        ``'unmapped_landmark'``.
 
     """
 
@@ -40,6 +43,7 @@ class Sighting:
     known: BoolArray
     covariances: FloatArray
     residuals: Residuals
+    left_out: dict[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +95,13 @@ class Outlook:
         self._observer, self._landmarks, self._noise = observer, landmarks, noise
         self._settings = settings
 
-    def sighting(self, event: ObservationEvent, rows: IntArray, known: BoolArray) -> Sighting:
+    def sighting(
+        self, event: ObservationEvent, rows: IntArray, known: BoolArray, left_out: dict[str, int]
+    ) -> Sighting:
         """Return what the points of ``event`` tell, which are the ``known`` of ``rows`` (m,)."""
         covariances = self._covariances(event, rows)
         residuals = self.residuals(event.select(known), rows[known], covariances[known])
-        return Sighting(event, rows, known, covariances, residuals)
+        return Sighting(event, rows, known, covariances, residuals, left_out)
 
     def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray

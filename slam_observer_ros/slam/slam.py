@@ -182,35 +182,19 @@ class Slam:
 
         It moves landmarks whose gains had put that off.
         """
-        event = event.select(event.ids != UNKNOWN_ID)
+        m, event = len(event.ids), event.select(event.ids != UNKNOWN_ID)
+        left_out = {'unknown_id': m - len(event.ids)}
         rows = self.landmarks.rows_of(event.ids)
         known = rows >= 0
         if not self.is_mapping:
+            left_out['unmapped_landmark'] = int(np.sum(~known))
             event, rows, known = event.select(known), rows[known], known[known]
         self.gains.recall(self.observer, rows[known])
-        return self._outlook.sighting(event, rows, known)
+        return self._outlook.sighting(event, rows, known, left_out)
 
-    def observe(self, event: ObservationEvent, sighting: Sighting | None = None) -> Outcome:
-        """Use an observation made at the state's instant.
-
-        Parameters
-        ----------
-        event : ObservationEvent
-            The observation.
-        sighting : Sighting, optional
-            What :meth:`look` has returned for it, if it was asked before.
-
-        Returns
-        -------
-        Outcome
-            What the state made of it.
-
-        """
-        sighting = self.look(event) if sighting is None else sighting
-        if sighting.event is not event:
-            unknown = int(np.sum(event.ids == UNKNOWN_ID))
-            self.counts['unknown_id'] += unknown
-            self.counts['unmapped_landmark'] += len(event.ids) - unknown - len(sighting.rows)
+    def observe(self, sighting: Sighting) -> Outcome:
+        """Use what :meth:`look` has returned for an observation; return what was made of it."""
+        self.counts.update(sighting.left_out)
         event, rows, known = sighting.event, sighting.rows, sighting.known
         forgotten = self._in_the_way(sighting)
         if len(forgotten):
