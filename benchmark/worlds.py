@@ -18,7 +18,8 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.observation_noise import ObservationNoise
-from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
+from slam_observer_ros.parameter_file import read_parameter_file
+from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.datasets.data_set import DataSet
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import load_starry_night

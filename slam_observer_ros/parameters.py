@@ -6,24 +6,18 @@ parameter descriptors, the check of YAML files, the command-line options and the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 import dataclasses
 from dataclasses import dataclass
 import difflib
 import math
 from numbers import Integral, Real
-from pathlib import Path
-import re
 from typing import Any, cast, ClassVar, Protocol, TypeAlias, TypeVar
-
-import yaml
 
 from slam_observer_ros.errors import ParameterError
 
 Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
-
-OBSERVER_NODE = 'observer_node'
 
 
 class Dataclass(Protocol):
@@ -205,100 +199,3 @@ def suggestion(name: str, names: Collection[str]) -> str:
     """
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     return f"; did you mean '{near[0]}'?" if near else ''
-
-
-def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
-    """Return the names that are not ours: a parameter file may be shared with other nodes.
-
-    Raises
-    ------
-    ParameterError
-        If one is one of ours with a single mistake. With more of them it may well be another
-        node's: ``base_frame_id`` comes near, too.
-
-    """
-    others = [name for name in written if name not in ours]
-    for name in others:
-        if near := suggestion(name, [our for our in ours if _is_misspelt(name, our)]):
-            raise ParameterError(f"unknown parameter '{name}'{near}")
-    return others
-
-
-def read_parameter_file(path: Path) -> dict[str, object]:
-    """Return the name → value mapping of a ROS 2 parameter file.
-
-    The file has the usual form ``<node or /**>: ros__parameters: {name: value}``, the node maybe
-    below its namespace; nested mappings become dotted names. Sections of other nodes are left out.
-
-    Raises
-    ------
-    ParameterError
-        If the file can't be read, is not YAML, or holds no parameters for this package, or those
-        of several robots.
-
-    """
-    try:
-        content = yaml.load(path.read_bytes(), _RosLoader)
-    except OSError as error:
-        raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        reason = str(error).splitlines()[0]
-        raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
-    values: dict[str, object] = {}
-    found: list[str] = []
-    for section, body in _sections(content if isinstance(content, dict) else {}):
-        if section == '/**' or section.rsplit('/', 1)[-1] == OBSERVER_NODE:
-            found.append(section)
-            values.update(_flatten(body))
-    robots = [section for section in found if '*' not in section]
-    if len({section.strip('/') for section in robots}) > 1:
-        raise ParameterError(
-            f'parameter file {path} is of several robots: it has sections {" and ".join(robots)}; '
-            'leave one'
-        )
-    if not found:
-        raise ParameterError(
-            f"parameter file {path} has no '/**: ros__parameters:' or "
-            f"'{OBSERVER_NODE}: ros__parameters:' section"
-        )
-    return values
-
-
-def _is_misspelt(name: str, ours: str) -> bool:
-    """Return whether a letter of ``ours`` is wrong, missing, too many or behind the next one."""
-    same = [one == other for one, other in zip(name, ours, strict=False)]
-    start = [*same, False].index(False)
-    rest, right = name[start:], ours[start:]
-    swapped = right[1:2] + right[:1] + right[2:]
-    return rest in (right[1:], swapped) or rest[1:] in (right, right[1:])
-
-
-class _RosLoader(yaml.SafeLoader):
-    """Reads numbers as ROS does: 1e-3 is one, though YAML 1.1 wants 1.0e-3."""
-
-
-_RosLoader.add_implicit_resolver(
-    'tag:yaml.org,2002:float', re.compile(r'^[-+]?\d+[eE][-+]?\d+$'), list('-+0123456789')
-)
-
-
-def _sections(tree: Mapping[object, object]) -> Iterator[tuple[str, dict[str, object]]]:
-    """Yield the nodes of a parameter file by their full names, and their parameters."""
-    nodes = {name: body for name, body in tree.items() if isinstance(body, dict)}
-    for name, body in list(nodes.items()):
-        if 'ros__parameters' not in body:  # the name is a namespace
-            nodes |= {f'{name}/{below}': node for below, node in body.items()}
-    for name, body in nodes.items():
-        parameters = body.get('ros__parameters') if isinstance(body, dict) else None
-        if isinstance(parameters, dict):
-            yield str(name), parameters
-
-
-def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:
-    flat: dict[str, object] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            flat.update(_flatten(value, f'{prefix}{name}.'))
-        else:
-            flat[f'{prefix}{name}'] = value
-    return flat

@@ -35,7 +35,8 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import axes, se3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
-from slam_observer_ros.parameters import from_parameters, read_parameter_file, table
+from slam_observer_ros.parameter_file import read_parameter_file
+from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.field_of_view import FieldOfView

@@ -15,14 +15,8 @@ from types import MappingProxyType
 from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.parameters import (
-    from_parameters,
-    names_of_others,
-    Parameter,
-    read_parameter_file,
-    table,
-    Value,
-)
+from slam_observer_ros.parameter_file import names_of_others, read_parameter_file
+from slam_observer_ros.parameters import from_parameters, Parameter, table, Value
 from slam_observer_ros.settings import Settings
 
 logger = logging.getLogger(__name__)

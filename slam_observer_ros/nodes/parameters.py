@@ -14,14 +14,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.parameters import (
-    Dataclass,
-    from_parameters,
-    names_of_others,
-    Parameter,
-    SettingsT,
-    table,
-)
+from slam_observer_ros.parameter_file import names_of_others
+from slam_observer_ros.parameters import Dataclass, from_parameters, Parameter, SettingsT, table
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
