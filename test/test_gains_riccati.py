@@ -14,7 +14,7 @@ import pytest
 from strategies import generators, poses
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.full_map import FullMapGains
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer import Correction, Observer
@@ -24,7 +24,7 @@ from slam_observer_ros.smoothing.gauss_newton import Smoother
 
 def started(rng, settings=PLAIN, n=4):
     """A filter that has seen n landmarks, then moved and seen some of them again."""
-    slam = Filter(RiccatiGains(settings))
+    slam = Filter(FullMapGains(settings))
     slam.add(rng.normal(scale=4.0, size=(n, 3)), 0.01 * random_covariances(rng, n, 3))
     for _ in range(5):
         slam.step(rng, 1e-4, 1e-2)
@@ -70,7 +70,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     pieces, dt_s = 20, 0.01
     V = rng.normal(size=(pieces, 6))
     Q = random_covariances(rng, pieces, 6)
-    slam = Filter(RiccatiGains(PLAIN))
+    slam = Filter(FullMapGains(PLAIN))
     slam.observer.A = start = se3.exp(rng.normal(size=6))
     slam.move(V, np.full(pieces, dt_s), Q)
 
@@ -97,25 +97,25 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
     start = np.array([[3.0, 1.0, 0.0]])
     dt_s, V, Q = np.full(2, 0.5), np.zeros((2, 6)), np.tile(1e-3 * np.eye(6), (2, 1, 1))
 
-    def foretold(point, velocity):
+    def predicted(point, velocity):
         """The covariance of the residual after two blind motions of a second each."""
         settings = replace(PLAIN, two_d_mode=two_d_mode, landmark_velocity_error=1e-9)
-        slam = Filter(RiccatiGains(settings))
+        slam = Filter(FullMapGains(settings))
         slam.add(point, np.zeros((1, 3, 3)))
         slam.observer.set_landmark_velocities(np.array([0]), velocity)
         slam.move(V, dt_s, Q)
         slam.move(V, dt_s, Q)
         rows = np.array([0])
         residuals = slam.residuals(rows, slam.expected(rows), np.zeros((1, 3, 3)))
-        return slam.gains.foretold(residuals)[1]
+        return slam.gains.predicted(residuals)[1]
 
-    at_rest = foretold(start + 2.0 * velocity, np.zeros((1, 3)))
-    np.testing.assert_allclose(foretold(start, velocity), at_rest, atol=1e-12)
+    at_rest = predicted(start + 2.0 * velocity, np.zeros((1, 3)))
+    np.testing.assert_allclose(predicted(start, velocity), at_rest, atol=1e-12)
 
 
 def test_prediction_costs_the_same_however_large_the_map():
     def peak_bytes(landmarks):
-        slam, rng = Filter(RiccatiGains(PLAIN)), np.random.default_rng(0)
+        slam, rng = Filter(FullMapGains(PLAIN)), np.random.default_rng(0)
         slam.add(rng.normal(size=(landmarks, 3)), random_covariances(rng, landmarks, 3))
         V, Q = rng.normal(size=(3, 6)), random_covariances(rng, 3, 6)
         tracemalloc.start()
@@ -139,7 +139,7 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     Q[axes.pose, axes.pose] = 1e-4
     R = np.diag([1e-3, 2e-3, 3e-3])
     point = np.array([[2.0, -1.0, 0.0 if two_d_mode else 0.5]])
-    slam = Filter(RiccatiGains(replace(PLAIN, two_d_mode=two_d_mode)))
+    slam = Filter(FullMapGains(replace(PLAIN, two_d_mode=two_d_mode)))
     slam.add(point, R[None])
     slam.move(V, np.full(pieces, 0.1), np.tile(Q, (pieces, 1, 1)))
     seen = se3.transform(se3.inverse(slam.observer.A), point)
@@ -167,7 +167,7 @@ def test_observations_never_tell_where_the_worlds_frame_is(rng):
 
     def run(frame_covariance):
         random = np.random.default_rng(seed)
-        slam = Filter(RiccatiGains(PLAIN))
+        slam = Filter(FullMapGains(PLAIN))
         slam.gains.set_pose_covariance(frame_covariance)
         slam.add(random.normal(scale=4.0, size=(4, 3)), 0.01 * random_covariances(random, 4, 3))
         for _ in range(20):
@@ -187,7 +187,7 @@ def test_covariance_stays_symmetric_and_positive_over_hours_of_any_noise(
     point_variance_exponents,
 ):
     rng = np.random.default_rng(4)
-    slam = Filter(RiccatiGains(PLAIN))
+    slam = Filter(FullMapGains(PLAIN))
     slam.add(rng.normal(scale=4.0, size=(3, 3)), np.tile(1e-2 * np.eye(3), (3, 1, 1)))
     steps, dt_s = 8_000, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
@@ -328,7 +328,7 @@ def test_the_order_of_landmarks_in_a_message_does_not_matter():
 
 
 def test_a_robot_that_turned_further_than_it_knows_does_not_reject_what_it_sees():
-    slam = Filter(RiccatiGains(PLAIN))
+    slam = Filter(FullMapGains(PLAIN))
     slam.add(np.array([[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]), np.tile(1e-4 * np.eye(3), (2, 1, 1)))
     # It takes itself to be at rest, but may have turned by 0.3 rad; it has turned by 0.6.
     Q = np.diag([1e-8, 1e-8, 0.3**2, 1e-4, 1e-4, 1e-4])

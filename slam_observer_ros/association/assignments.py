@@ -80,7 +80,7 @@ def find_assignments(
     seen = _Seen(slam, event)
     at, rows = _candidates(slam, gains, seen)
     residuals = _as_residuals(slam.observer, seen, at, rows)
-    PC, CPC = gains.foretold(residuals)
+    PC, CPC = gains.predicted(residuals)
     r, noise = residuals.r[:, : axes.point], residuals.covariances[:, : axes.point, : axes.point]
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]

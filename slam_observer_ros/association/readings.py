@@ -22,11 +22,17 @@ from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import gated, mahalanobis, with_blocks
+from slam_observer_ros.gains.robust import (
+    are_far,
+    far_from_the_others,
+    gated,
+    mahalanobis,
+    with_blocks,
+)
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.slam.sighting import Sighting
 from slam_observer_ros.slam.slam import Slam
-from slam_observer_ros.types import IntArray
+from slam_observer_ros.types import BoolArray, IntArray
 
 SLIP_COST = 20.0
 """What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
@@ -94,9 +100,9 @@ def readings(
     sighting = slam.look(event)
     residuals, m = sighting.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
-    if not some_are_unknown and gains.are_all_rejected(residuals):
+    if not some_are_unknown and _are_all_rejected(slam, residuals):
         return _rejected_or_slipped(slam, sighting, event)
-    suspects = _suspect_ids(slam, gains, residuals)
+    suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals)]]
     if some_are_unknown or may_name(slam, event):
         return _named(slam, gains, event, new_ids, suspects, budget)
     trusting = _cost(slam, gains, m, residuals)
@@ -112,9 +118,9 @@ def readings(
 def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
     gains, residuals = slam.gains, sighting.residuals
-    if not isinstance(gains, RiccatiGains) or gains.are_all_near(residuals):
+    if not isinstance(gains, RiccatiGains) or _are_all_near(slam, residuals):
         return False
-    return bool(gains.suspects(residuals).any()) or gains.are_all_rejected(residuals)
+    return bool(_suspects(slam, gains, residuals).any()) or _are_all_rejected(slam, residuals)
 
 
 def may_name(slam: Slam, event: ObservationEvent) -> bool:
@@ -162,9 +168,30 @@ def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list
     return [Reading(event, cost, has_slipped=True)]
 
 
-def _suspect_ids(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> IntArray:
-    """Return the ids of points that pass the gate only since the state is so uncertain."""
-    return slam.landmarks.ids[residuals.rows[gains.suspects(residuals)]]
+def _are_all_near(slam: Slam, residuals: Residuals) -> bool:
+    """Return whether all points pass the gate even by the sensor's noise alone.
+
+    This is quickly told, and by all of S they are no further off.
+    """
+    k = slam.axes.point
+    own = mahalanobis(residuals.r[:, :k], residuals.covariances[:, :k, :k])
+    return bool((own <= slam.settings.rejection_distance).all())
+
+
+def _are_all_rejected(slam: Slam, residuals: Residuals) -> bool:
+    """Return whether there are points seen, and the gate rejects them all."""
+    gate = slam.settings.rejection_distance
+    return len(residuals.r) > 0 and bool((slam.gains.distances(residuals) > gate).all())
+
+
+def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> BoolArray:
+    """Return which points (m,) only pass the gate since the state is so uncertain."""
+    k = slam.axes.point
+    r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
+    far = are_far(r, noise, slam.settings)
+    if far.any():
+        far &= far_from_the_others(r, gains.predicted(residuals)[1], noise, slam.settings)
+    return far
 
 
 def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:
@@ -220,6 +247,6 @@ def _cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> floa
     """Return what it costs to take some of m points for the landmarks whose ids they have."""
     gate, k = slam.settings.rejection_distance, slam.axes.point
     r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
-    passed, own = gated(r, gains.foretold(residuals)[1], noise, slam.settings)
+    passed, own = gated(r, gains.predicted(residuals)[1], noise, slam.settings)
     paired_cost = joint_cost(r[passed], with_blocks(own, noise[passed]), noise[passed])
     return paired_cost + (m - int(np.sum(passed))) * unpaired_cost(gate)

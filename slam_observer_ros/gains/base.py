@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
@@ -83,6 +84,29 @@ class Seen:
     covariances: FloatArray | None
 
 
+@dataclass(frozen=True, slots=True)
+class InHindsight:
+    """Estimates from all that was seen before and after.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (s,) stamps of the observations, nanoseconds.
+    poses : FloatArray
+        (s, 4, 4) Â at these stamps.
+    points : FloatArray
+        (n, 3) y_i° + â_i, metres, reference frame.
+    since : str
+        What has happened before the first of them, in words.
+
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+    points: FloatArray
+    since: str
+
+
 class GainDesign:
     """Strategy that turns residuals into a correction: the innovation over a step of time.
 
@@ -139,11 +163,13 @@ class GainDesign:
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Account for landmarks from a map with ``covariances`` (m, 3, 3), reference frame, m²."""
 
-    def hold_landmarks(self, count: int) -> None:
-        """Take all landmarks, ``count`` with new ones, for exact and never move them again.
+    def held(self, landmark_covariances: FloatArray) -> GainDesign:
+        """Return gains that know what these do, and never move a landmark again.
 
-        See :func:`slam_observer_ros.gains.held`.
+        ``landmark_covariances`` (n, 3, 3), reference frame, m², are what a map says of all
+        landmarks, new ones among them. These gains are not used any more.
         """
+        raise NotImplementedError
 
     def remove_landmarks(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``; those behind move up."""
@@ -175,6 +201,19 @@ class GainDesign:
 
         ``in_doubt`` asks it to look back now, as a landmark seems to have moved.
         """
+
+    def smooth(self, observer: Observer) -> InHindsight:
+        """Return the estimates in hindsight.
+
+        Raises
+        ------
+        ParameterError
+            If the design keeps no history.
+        SmoothingError
+            If the observations don't determine the whole trajectory.
+
+        """
+        raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
 
     def restart(self, observer: Observer, since: str) -> None:
         """Forget the past: what is known now is all that is known when looking back.

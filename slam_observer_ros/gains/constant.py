@@ -119,10 +119,11 @@ class ConstantGains(GainDesign):
         """Return the correction that puts the known landmarks where they are known to be."""
         return Correction(np.eye(4), rows, -r)
 
-    def hold_landmarks(self, count: int) -> None:
-        """Let l be zero."""
+    def held(self, landmark_covariances: FloatArray) -> ConstantGains:
+        """Return these gains with l = 0."""
         self._is_held = True
         self.gain_l = 0.0
+        return self
 
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return the correction; all points seen take part."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from slam_observer_ros.gains.prediction import initial_covariance
@@ -81,6 +83,12 @@ class JointCovariance:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks together."""
         columns = np.append(np.arange(self._p), self.columns(rows))
         return self.P[np.ix_(columns, columns)]
+
+    def without_landmarks(self) -> JointCovariance:
+        """Return the covariance of ε and c alone."""
+        alone = copy(self)
+        alone.P = self.P[: self.first, : self.first].copy()
+        return alone
 
     def set_pose(self, covariance: FloatArray) -> None:
         """Take over the covariance (p, p) of ε, independent of all else."""

@@ -151,11 +151,12 @@ class ScheduledGains(GainDesign):
         self._leaves.update(everything, F, N)
         return self._as_correction(everything, -x[z], shifts, observer.a)
 
-    def hold_landmarks(self, count: int) -> None:
-        """Take all landmarks, ``count`` with new ones, for exact."""
-        k = self._axes.point
+    def held(self, landmark_covariances: FloatArray) -> ScheduledGains:
+        """Return these gains with all landmarks taken for exact."""
+        count, k = len(landmark_covariances), self._axes.point
         self._core.remove(np.arange(len(self._leaves)))
         self._leaves.add(np.zeros((count, k, len(self._core.P))), np.zeros((count, k, k)))
+        return self
 
     def recall(self, observer: Observer, rows: IntArray) -> None:
         """Move landmarks that are about to be used to where they should have been moved by now."""

@@ -11,9 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.events import is_automatic
-from slam_observer_ros.gains import held
+from slam_observer_ros.gains.full_map import FullMapGains
 from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
-from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.maps.alignment import find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
@@ -127,7 +126,7 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     """
     n, axes, observer = len(slam.landmarks), slam.axes, slam.observer
     k, R = axes.point, observer.reference_pose[:3, :3]
-    if not isinstance(slam.gains, RiccatiGains) or n == 0:
+    if not isinstance(slam.gains, FullMapGains) or n == 0:
         return slam.landmark_covariances
     joint = slam.gains.joint_covariance(np.arange(n))
     P = joint[len(axes.pose) :, len(axes.pose) :]
@@ -206,7 +205,7 @@ def _hold(slam: Slam, known: LandmarkMap) -> None:
     rows = order[np.searchsorted(known.ids, slam.landmarks.ids, sorter=order)]
     y_ref, covariances = _in_reference_frame(slam, known.select(rows))
     slam.observer.rebase(slam.observer.A, y_ref)
-    slam.gains = held(slam.gains, covariances)
+    slam.gains = slam.gains.held(covariances)
 
 
 def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:

@@ -6,12 +6,10 @@ from collections import Counter
 
 import numpy as np
 
-from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.motion.motion import Motion
@@ -230,29 +228,14 @@ class Slam:
             If the observations don't determine the whole trajectory.
 
         """
-        if not isinstance(self.gains, RiccatiGains) or self.settings.hindsight_interval == 0:
-            raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
-        if self.settings.localization_mode == 'fixed' and not self.is_mapping:
-            raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
-        if self.settings.landmark_velocity_error > 0.0:
-            raise ParameterError(
-                "smoothing takes landmarks to rest: 'landmark_velocity_error' must be 0"
-            )
-        if self.gains.calibration.drifts:
-            raise ParameterError(
-                "smoothing takes the calibration to stay: 'calibration_drift' must be 0"
-            )
-        if self.observer.have_moved:
-            raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
-        solution = self.gains.smooth(self.observer)
+        found, rows = self.gains.smooth(self.observer), self.confirmed
         P = self.observer.reference_pose
-        history, rows = self.gains.history, self.confirmed
         return Smoothed(
-            stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
-            poses=P @ solution.poses[1:],
-            world_points=se3.transform(P, solution.points[rows]),
+            stamps_ns=found.stamps_ns,
+            poses=P @ found.poses,
+            world_points=se3.transform(P, found.points[rows]),
             ids=self.landmarks.ids[rows],
-            since=history.since,
+            since=found.since,
         )
 
     def remove(self, rows: IntArray) -> None:
