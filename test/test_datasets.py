@@ -11,14 +11,13 @@ import scipy.io
 from slam_observer_ros.errors import DataSetError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.datasets.data_set import DataSet
-from slam_observer_ros.recording.datasets.mrclam import convert_mrclam, load_mrclam
+from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import (
-    convert_starry_night,
     EPOCH_NS,
     load_starry_night,
 )
-from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.reader import Recording
 
 SECOND_NS = 1_000_000_000
 
@@ -106,8 +105,9 @@ class TestMrclam:
 
     def test_recording_holds_the_data_set_in_stamp_order(self, tmp_path):
         out = tmp_path / 'out.mcap'
-        data_set = convert_mrclam(write_mrclam(tmp_path / 'run'), 2, out)
-        with open_recording(out) as recording:
+        data_set = load_mrclam(write_mrclam(tmp_path / 'run'), 2)
+        write_data_set(data_set, out)
+        with Recording(out) as recording:
             selected = recording.find_topics()
             events = list(recording.events(selected))
             truth = recording.truth(selected)
@@ -219,8 +219,9 @@ class TestStarryNight:
 
     def test_real_recording_holds_every_event(self, data_dir, tmp_path):
         out = tmp_path / 'starry.mcap'
-        data_set = convert_starry_night(data_dir / 'starry_night' / 'dataset3.mat', out)
-        with open_recording(out) as recording:
+        data_set = load_starry_night(data_dir / 'starry_night' / 'dataset3.mat')
+        write_data_set(data_set, out)
+        with Recording(out) as recording:
             selected = recording.find_topics()
             events = list(recording.events(selected))
             truth = recording.truth(selected)

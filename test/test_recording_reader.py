@@ -17,7 +17,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import ObservationMessage
-from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.truth import LandmarkTracks
 from slam_observer_ros.recording.writer import RecordingWriter
@@ -66,7 +66,7 @@ def open_files(directory: Path) -> list[Path]:
 class TestFormats:
     @pytest.mark.parametrize('name', FORMATS)
     def test_every_format_gives_the_same_events(self, paths, name):
-        with open_recording(paths[name]) as recording:
+        with Recording(paths[name]) as recording:
             selected = recording.find_topics()
             assert recording.warning is None
             assert recording.event_count(selected) == 150
@@ -76,28 +76,28 @@ class TestFormats:
 
     @pytest.mark.parametrize('name', FORMATS)
     def test_every_format_gives_the_landmark_truth(self, paths, name):
-        with open_recording(paths[name]) as recording:
+        with Recording(paths[name]) as recording:
             landmarks = recording.truth(recording.find_topics()).landmarks
         np.testing.assert_array_equal(landmarks.ids, recordings.LANDMARKS.ids)
         np.testing.assert_array_equal(landmarks.world_points, recordings.LANDMARKS.world_points)
 
     def test_pose_truth(self, paths):
-        with open_recording(paths['own mcap']) as recording:
+        with Recording(paths['own mcap']) as recording:
             truth = recording.truth(recording.find_topics())
         np.testing.assert_array_equal(truth.stamps_ns, list(recordings.stamps_ns()))
         expected = [true_pose.pose for true_pose in recordings.true_poses()]
         np.testing.assert_allclose(truth.poses, expected, atol=1e-12)
 
     def test_without_pose_truth_there_are_no_poses(self, paths):
-        with open_recording(paths['mcap file']) as recording:
+        with Recording(paths['mcap file']) as recording:
             truth = recording.truth(recording.find_topics())
         assert truth.stamps_ns.shape == (0,)
         assert truth.poses.shape == (0, 4, 4)
 
     def test_frames_are_those_of_the_messages(self, paths):
-        with open_recording(paths['own mcap']) as recording:
+        with Recording(paths['own mcap']) as recording:
             assert recording.frames(recording.find_topics()) == ('base_link', 'base_link')
-        with open_recording(paths['mcap file']) as recording:  # Its Twists have no frame.
+        with Recording(paths['mcap file']) as recording:  # Its Twists have no frame.
             assert recording.frames(recording.find_topics()) == ('', 'base_link')
 
     def test_events_come_as_received_with_the_stamps_of_their_headers(self, tmp_path):
@@ -105,7 +105,7 @@ class TestFormats:
         with RecordingWriter(tmp_path / 'late.mcap') as writer:
             writer.write_observation(late, receive_stamp_ns=ros.STAMP_NS + 50)
             writer.write_velocity(VelocityEvent(ros.STAMP_NS + 20, np.zeros(6)))
-        with open_recording(tmp_path / 'late.mcap') as recording:
+        with Recording(tmp_path / 'late.mcap') as recording:
             events = list(recording.events(recording.find_topics()))
         assert [event.stamp_ns for event in events] == [ros.STAMP_NS + 20, ros.STAMP_NS]
 
@@ -113,10 +113,10 @@ class TestFormats:
 class TestDamage:
     def test_truncated_mcap_is_read_up_to_the_damage(self, tmp_path):
         path = write_big_mcap(tmp_path / 'big.mcap')
-        with open_recording(path) as recording:
+        with Recording(path) as recording:
             whole = list(recording.events(recording.find_topics()))
         path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-        with open_recording(path) as recording:
+        with Recording(path) as recording:
             selected = recording.find_topics()
             events = list(recording.events(selected))
             assert f'only the {len(events)} messages before that' in recording.warning
@@ -131,19 +131,19 @@ class TestDamage:
         directory.mkdir()
         data = (tmp_path / 'killed_0.mcap').read_bytes()
         (directory / 'killed_0.mcap').write_bytes(data[: len(data) // 2])
-        with open_recording(directory) as recording:
+        with Recording(directory) as recording:
             assert 'cut off or damaged' in recording.warning
         shutil.copy(paths['sqlite3 file'], tmp_path / 'whole.db3')
         (directory / 'killed_0.mcap').unlink()
         (tmp_path / 'whole.db3').rename(directory / 'killed_0.db3')
-        with open_recording(directory) as recording:
+        with Recording(directory) as recording:
             assert recording.warning is None
 
     def test_several_files_without_metadata_can_not_be_put_together(self, tmp_path, paths):
         for index in range(2):
             shutil.copy(paths['mcap file'], tmp_path / f'run_{index}.mcap')
         with pytest.raises(RecordingError, match='ros2 bag reindex'):
-            open_recording(tmp_path)
+            Recording(tmp_path)
 
     @pytest.fixture
     def split(self, tmp_path):
@@ -157,14 +157,14 @@ class TestDamage:
         (directory / 'metadata.yaml').write_text(
             'rosbag2_bagfile_information: {relative_file_paths: [0.mcap, 1.mcap]}'
         )
-        with open_recording(directory / '0.mcap') as recording:
+        with Recording(directory / '0.mcap') as recording:
             return directory, recording.message_count
 
     def test_of_a_split_recording_the_whole_files_are_read_and_the_truncated_one_up_to_the_damage(
         self, split
     ):
         directory, count = split
-        with open_recording(directory) as recording:
+        with Recording(directory) as recording:
             assert f'{directory / "1.mcap"}: cut off or damaged' in recording.warning
             assert '0.mcap' not in recording.warning
             events = list(recording.events(recording.find_topics()))
@@ -175,19 +175,19 @@ class TestDamage:
     def test_of_a_split_recording_a_file_without_any_whole_message_is_left_out(self, split, size):
         directory, count = split
         os.truncate(directory / '1.mcap', size)
-        with open_recording(directory) as recording:
+        with Recording(directory) as recording:
             assert f'{directory / "1.mcap"}: can not be read' in recording.warning
             assert recording.message_count == count
             assert len(list(recording.events(recording.find_topics()))) == count
         os.truncate(directory / '0.mcap', size)
         with pytest.raises(RecordingError, match=f'{directory / "0.mcap"}: .* no whole message'):
-            open_recording(directory)
+            Recording(directory)
 
     def test_of_a_split_recording_a_file_that_is_missing_is_named(self, split):
         directory, _ = split
         (directory / '1.mcap').unlink()
         with pytest.raises(RecordingError, match=r'incomplete; metadata\.yaml lists 1\.mcap'):
-            open_recording(directory)
+            Recording(directory)
 
     @pytest.mark.parametrize('name', ['mcap file', 'sqlite3 file', 'ROS 1 bag', 'own mcap'])
     def test_damaged_file_is_read_or_refused_in_one_line(self, tmp_path, paths, name):
@@ -203,7 +203,7 @@ class TestDamage:
             path = tmp_path / f'{trial}{paths[name].suffix}'
             path.write_bytes(damaged)
             try:
-                with open_recording(path) as recording:
+                with Recording(path) as recording:
                     list(recording.events(recording.find_topics()))
             except RecordingError as error:
                 assert '\n' not in str(error)
@@ -213,7 +213,7 @@ class TestDamage:
         whole = path.read_bytes()
         path.write_bytes(whole[:2000] + bytes(50) + whole[2050:])
         with pytest.raises(RecordingError, match='can not be read') as caught:
-            open_recording(path)
+            Recording(path)
         assert str(path) in str(caught.value)
         assert open_files(tmp_path) == []
 
@@ -227,7 +227,7 @@ class TestDamage:
             writer.write_observation(
                 ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3)))
             )
-        with open_recording(path) as recording:
+        with Recording(path) as recording:
             assert len(list(recording.events(recording.find_topics()))) == 2
             assert recording.malformed == {'/twist': 2}
         assert 'too short' in caplog.text
@@ -240,7 +240,7 @@ def test_a_lidars_scan_is_not_taken_for_landmarks(tmp_path, count):
     with RecordingWriter(path) as writer:
         for topic, message in (('/twist', ros.twist([1.0] * 6)), ('/landmarks', cloud)):
             writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
-    with open_recording(path) as recording:
+    with Recording(path) as recording:
         events = recording.events(recording.find_topics())
         if count == 500:
             assert len(list(events)) == 2
@@ -252,42 +252,42 @@ def test_a_lidars_scan_is_not_taken_for_landmarks(tmp_path, count):
 class TestNothingToRead:
     def test_missing_file(self, tmp_path):
         with pytest.raises(RecordingError, match='no such file'):
-            open_recording(tmp_path / 'nothing.mcap')
+            Recording(tmp_path / 'nothing.mcap')
 
     def test_wrong_extension(self, tmp_path):
         (tmp_path / 'run.csv').touch()
         with pytest.raises(RecordingError, match=r'not a recording; give a \.mcap, \.db3, \.bag'):
-            open_recording(tmp_path / 'run.csv')
+            Recording(tmp_path / 'run.csv')
 
     def test_bytes_that_are_no_bag(self, tmp_path):
         path = tmp_path / 'x.bag'
         path.write_bytes(bytes([250] * 200))
         with pytest.raises(RecordingError, match=r'it is damaged, or no \.bag file'):
-            open_recording(path)
+            Recording(path)
 
     @pytest.mark.parametrize('suffix', ['.mcap', '.db3', '.bag'])
     def test_empty_file(self, tmp_path, suffix):
         path = tmp_path / f'empty{suffix}'
         path.touch()
         with pytest.raises(RecordingError, match=r'can not be read|empty'):
-            open_recording(path)
+            Recording(path)
 
     def test_directory_that_is_no_recording(self, tmp_path):
         with pytest.raises(RecordingError, match='no rosbag2 directory'):
-            open_recording(tmp_path)
+            Recording(tmp_path)
 
     def test_recording_without_messages(self, tmp_path):
         with RecordingWriter(tmp_path / 'empty.mcap'):
             pass
         with pytest.raises(RecordingError, match='the recording is empty'):
-            open_recording(tmp_path / 'empty.mcap')
+            Recording(tmp_path / 'empty.mcap')
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 class TestCompression:
     @pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
     def test_with_metadata_it_is_read(self, tmp_path, storage, mode):
-        with open_recording(recordings.write_rosbag2(tmp_path / 'run', storage, mode)) as run:
+        with Recording(recordings.write_rosbag2(tmp_path / 'run', storage, mode)) as run:
             assert len(list(run.events(run.find_topics()))) == 150
 
     def test_without_metadata_a_compressed_file_is_refused_with_what_to_do(
@@ -298,7 +298,7 @@ class TestCompression:
         (file,) = directory.iterdir()
         for path in (directory, file):
             with pytest.raises(RecordingError, match=f"{file}: compressed; run 'zstd -d'"):
-                open_recording(path)
+                Recording(path)
 
     def test_without_metadata_compressed_messages_are_refused_with_what_to_do(
         self, tmp_path, storage
@@ -306,7 +306,7 @@ class TestCompression:
         directory = recordings.write_rosbag2(tmp_path / 'run', storage, CompressionMode.MESSAGE)
         (directory / 'metadata.yaml').unlink()
         with pytest.raises(RecordingError, match='its messages are compressed, which'):
-            open_recording(directory)
+            Recording(directory)
 
 
 class TestTopics:
@@ -324,7 +324,7 @@ class TestTopics:
         with RecordingWriter(path / 'topics.mcap') as writer:
             for topic, message in messages.items():
                 writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
-        with open_recording(path / 'topics.mcap') as recording:
+        with Recording(path / 'topics.mcap') as recording:
             selected = recording.find_topics(TopicNames(**names))
         return {
             role: topic.name if topic else None
@@ -425,7 +425,7 @@ def test_last_position_of_a_true_landmark_counts(tmp_path):
         for ids, x in (([7, 8], 1.0), ([8, -1], 2.0)):
             truth = LandmarkTruth(np.array(ids), np.full((2, 3), x))
             writer.write_landmarks(ros.STAMP_NS, truth)
-    with open_recording(path) as recording:
+    with Recording(path) as recording:
         landmarks = recording.truth(recording.find_topics()).landmarks
     assert landmarks.ids.tolist() == [7, 8]
     assert landmarks.world_points[:, 0].tolist() == [1.0, 2.0]
@@ -475,5 +475,5 @@ def test_bag_of_several_files_is_read_whole(tmp_path):
     metadata.write_text(
         metadata.read_text().replace('  - split.mcap', '  - split.mcap\n  - split_1.mcap', 1)
     )
-    with open_recording(directory) as recording:
+    with Recording(directory) as recording:
         assert len(list(recording.events(recording.find_topics()))) == 300

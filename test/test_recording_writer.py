@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.writer import RecordingWriter
 
 
@@ -32,7 +32,7 @@ def test_observations_keep_covariances_and_velocities(tmp_path):
     with RecordingWriter(path) as writer:
         writer.write_observation(written)
         writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
-    with open_recording(path) as recording:
+    with Recording(path) as recording:
         read = next(recording.events(recording.find_topics()))
     np.testing.assert_array_equal(read.ids, written.ids)
     np.testing.assert_array_equal(read.points, written.points)
@@ -96,7 +96,7 @@ def test_existing_file_is_overwritten_only_when_told(tmp_path):
     assert path.read_bytes() == before
     with RecordingWriter(path, overwrite=True) as writer:
         writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
-    with open_recording(path) as recording:
+    with Recording(path) as recording:
         assert recording.message_count == 1
 
 
@@ -105,7 +105,7 @@ def test_a_link_stays_and_a_pipe_is_not_overwritten(tmp_path):
     (tmp_path / 'link.mcap').symlink_to(tmp_path / 'elsewhere' / 'run.mcap')
     recordings.write_mcap(tmp_path / 'link.mcap')
     assert (tmp_path / 'link.mcap').is_symlink()
-    with open_recording(tmp_path / 'elsewhere' / 'run.mcap') as recording:
+    with Recording(tmp_path / 'elsewhere' / 'run.mcap') as recording:
         assert recording.message_count > 0
     os.mkfifo(tmp_path / 'pipe.mcap')
     with pytest.raises(RecordingError, match='no regular file'):

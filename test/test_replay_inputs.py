@@ -12,7 +12,7 @@ from tum_files import read_tum
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.inputs.settings import InputSettings
-from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter
 
@@ -111,7 +111,7 @@ def panning(tmp_path):
 class TestMovingMounts:
     @pytest.mark.parametrize('topic', [None, '/tf'])
     def test_a_camera_that_turns_on_the_robot_is_placed_by_tf(self, panning, topic):
-        with open_recording(panning) as recording:
+        with Recording(panning) as recording:
             events = list(recording.events(recording.find_topics(TopicNames(landmarks=topic))))
         observations = [event for event in events if isinstance(event, ObservationEvent)]
         assert [event.stamp_ns for event in observations] == list(stamps_ns())
@@ -173,7 +173,7 @@ class TestMovingMounts:
                 writer.write_velocity(VelocityEvent(ros.STAMP_NS, V), topic=velocity)
                 event = ObservationEvent(ros.STAMP_NS, np.array([3]), np.zeros((1, 3)))
                 writer.write_observation(event, topic=landmarks, frame_id='camera')
-            with open_recording(tmp_path / 'trees.mcap') as recording:
+            with Recording(tmp_path / 'trees.mcap') as recording:
                 selected = recording.find_topics(TopicNames(velocity, landmarks))
                 events = list(recording.events(selected))
             return [event.points[0, 0] for event in events if isinstance(event, ObservationEvent)]
@@ -469,7 +469,7 @@ def test_velocities_of_the_odometrys_own_frame_do_not_make_it_the_base(tmp_path)
     with RecordingWriter(path) as writer:
         writer.write_velocity(VelocityEvent(ros.STAMP_NS, V), frame_id='odom')
         Drive(writer).landmarks(ros.STAMP_NS)
-    with open_recording(path) as recording:
+    with Recording(path) as recording:
         inputs = InputSettings(transform_timeout=0.0)
         events = list(recording.events(recording.find_topics(), inputs))
     assert [type(event) for event in events] == [VelocityEvent, ObservationEvent]

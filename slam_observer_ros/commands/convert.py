@@ -7,9 +7,9 @@ from pathlib import Path
 
 from slam_observer_ros.commands.console import print_table
 from slam_observer_ros.commands.outputs import add_force_option, check_outputs, recording_path
-from slam_observer_ros.recording.datasets.data_set import DataSet
-from slam_observer_ros.recording.datasets.mrclam import convert_mrclam
-from slam_observer_ros.recording.datasets.starry_night import convert_starry_night
+from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.recording.datasets.starry_night import load_starry_night
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,7 +25,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         'starry-night', help='stereo camera and IMU moved by hand: dataset3.mat'
     )
     starry_night.add_argument('file', type=Path, metavar='FILE', help='dataset3.mat')
-    starry_night.set_defaults(run=_run_starry_night)
+    starry_night.set_defaults(run=_run, load=lambda args: load_starry_night(args.file))
     mrclam = data_sets.add_parser(
         'mrclam', help='wheeled robots among coded landmarks: MRCLAM_Dataset1 to 9'
     )
@@ -33,7 +33,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     mrclam.add_argument(
         '--robot', type=int, required=True, metavar='N', help='which robot, from 1 to 5'
     )
-    mrclam.set_defaults(run=_run_mrclam)
+    mrclam.set_defaults(run=_run, load=lambda args: load_mrclam(args.folder, args.robot))
     for data_set in (starry_night, mrclam):
         data_set.add_argument(
             'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
@@ -41,18 +41,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         add_force_option(data_set)
 
 
-def _run_starry_night(args: argparse.Namespace) -> None:
+def _run(args: argparse.Namespace) -> None:
     check_outputs([args.output], args.force)
-    _print_summary(convert_starry_night(args.file, args.output, args.force), args.output)
-
-
-def _run_mrclam(args: argparse.Namespace) -> None:
-    check_outputs([args.output], args.force)
-    data_set = convert_mrclam(args.folder, args.robot, args.output, args.force)
-    _print_summary(data_set, args.output)
-
-
-def _print_summary(data_set: DataSet, output: Path) -> None:
+    data_set: DataSet = args.load(args)
+    write_data_set(data_set, args.output, args.force)
     rows = {
         'velocities': str(len(data_set.velocity_stamps_ns)),
         'observations': str(len(data_set.observations)),
@@ -60,4 +52,4 @@ def _print_summary(data_set: DataSet, output: Path) -> None:
         'true landmarks': str(len(data_set.landmarks.ids)),
     }
     rows |= {f'left out: {reason}': str(count) for reason, count in data_set.left_out.items()}
-    print_table(str(output), rows)
+    print_table(str(args.output), rows)

@@ -45,7 +45,7 @@ from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.opening import files_of
-from slam_observer_ros.recording.reader import open_recording
+from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import replay
 
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
     _check_files(args)
     warn_of_unused(args, settings)
     landmark_map = None if args.load_map is None else read_map(args.load_map)
-    with open_recording(args.recording) as recording:
+    with Recording(args.recording) as recording:
         if recording.warning:
             logger.warning('%s', recording.warning)
         selected = recording.find_topics(topic_names(args), inputs)

@@ -50,12 +50,19 @@ _Decoded = TypeVar('_Decoded')
 
 
 class Recording:
-    """An open recording; :func:`open_recording` makes one. Close it, or use it in ``with``.
+    """An open MCAP file, rosbag2 (directory or bare .db3) or ROS 1 .bag: use it in ``with``.
+
+    A truncated MCAP file is read up to the damage; :attr:`warning` says so.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file or directory.
 
     Attributes
     ----------
     path : Path
-        The file or directory.
+        The same.
     topics : tuple of Topic
         All topics, with types and message counts.
     warning : str or None
@@ -67,11 +74,16 @@ class Recording:
     unstamped : Counter
         Measurements without stamp so far, by topic.
 
+    Raises
+    ------
+    RecordingError
+        If there is nothing to read; one line that says what to do.
+
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._source, self.warning = open_source(path)
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self._source, self.warning = open_source(self.path)
         self.topics = self._source.topics
         self.malformed: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
@@ -293,22 +305,3 @@ class Recording:
         if not self.dropped[reason]:
             _logger.warning('Dropped a message (%s): %s', reason, error)
         self.dropped[reason] += 1
-
-
-def open_recording(path: Path | str) -> Recording:
-    """Open an MCAP file, a rosbag2 (directory or bare .db3), or a ROS 1 .bag.
-
-    A truncated MCAP file is read up to the damage; :attr:`Recording.warning` says so.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file or directory.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing to read; one line that says what to do.
-
-    """
-    return Recording(Path(path))

@@ -16,7 +16,7 @@ import numpy as np
 from slam_observer_ros.errors import DataSetError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.recording.datasets.data_set import DataSet
 from slam_observer_ros.types import FloatArray, IntArray
 
 FIRST_LANDMARK_SUBJECT = 6
@@ -66,35 +66,6 @@ def load_mrclam(folder: Path | str, robot: int) -> DataSet:
         LandmarkTruth(landmarks[:, 0].astype(np.int64), _on_ground(landmarks[:, 1:3])),
         left_out,
     )
-
-
-def convert_mrclam(
-    folder: Path | str, robot: int, out: Path | str, overwrite: bool = False
-) -> DataSet:
-    """Write one robot's run as a recording.
-
-    Parameters
-    ----------
-    folder : Path or str
-        For example ``MRCLAM_Dataset6``.
-    robot : int
-        1 to 5.
-    out : Path or str
-        The .mcap file to be made.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    DataSetError
-        If the data set can't be read.
-    RecordingError
-        If the recording can't be written.
-
-    """
-    data_set = load_mrclam(folder, robot)
-    write_data_set(data_set, out, overwrite)
-    return data_set
 
 
 def _require_robot(folder: Path, robot: int) -> None:

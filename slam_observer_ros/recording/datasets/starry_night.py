@@ -14,7 +14,7 @@ import scipy.io
 from slam_observer_ros.errors import DataSetError
 from slam_observer_ros.events import LandmarkTruth, ObservationEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.recording.datasets.data_set import DataSet
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
@@ -66,31 +66,6 @@ def load_starry_night(file: Path | str) -> DataSet:
         se3.pose(rotations, variables['r_i_vk_i'].T),
         LandmarkTruth(np.arange(len(world_points)), world_points),
     )
-
-
-def convert_starry_night(file: Path | str, out: Path | str, overwrite: bool = False) -> DataSet:
-    """Write ``dataset3.mat`` as a recording.
-
-    Parameters
-    ----------
-    file : Path or str
-        The .mat file.
-    out : Path or str
-        The .mcap file to be made.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    DataSetError
-        If the data set can't be read.
-    RecordingError
-        If the recording can't be written.
-
-    """
-    data_set = load_starry_night(file)
-    write_data_set(data_set, out, overwrite)
-    return data_set
 
 
 def triangulate(pixels: FloatArray, variables: dict[str, FloatArray]) -> FloatArray:
