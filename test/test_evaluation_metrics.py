@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-import json
-
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from strategies import generators, poses
 
-from slam_observer_ros.commands.console import print_json
-from slam_observer_ros.commands.replay_report import Report
 from slam_observer_ros.evaluation import consistency, metrics
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.errors import EvaluationError
@@ -217,11 +212,3 @@ def test_so_few_poses_that_any_truth_fits_have_no_error(count: int) -> None:
     few = Trajectory(estimate.stamps_ns[:count], estimate.poses[:count])
     with pytest.raises(EvaluationError, match=f'{count} of its {count} poses .* it takes 3'):
         metrics.trajectory_errors(few, truth)
-
-
-def test_a_report_is_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:
-    print_json(asdict(Report(10, 2.0, 0.1, 4, {'not_finite': 1}, ate_rmse_m=0.25)))
-    content = json.loads(capsys.readouterr().out)
-    assert content['dropped'] == {'not_finite': 1}
-    assert content['ate_rmse_m'] == 0.25
-    assert content['landmark_rmse_m'] is None

@@ -19,7 +19,12 @@ from slam_observer_ros.commands.outputs import (
     check_plots,
     filled_directory,
 )
-from slam_observer_ros.commands.replay_checks import check_place, check_used, tell_restart
+from slam_observer_ros.commands.replay_checks import (
+    check_place,
+    check_used,
+    tell_restart,
+    warn_of_input,
+)
 from slam_observer_ros.commands.replay_inputs import (
     add_input_options,
     INPUT_NAMES,
@@ -29,14 +34,13 @@ from slam_observer_ros.commands.replay_inputs import (
     warn_of_unused,
     with_base_frame,
 )
-from slam_observer_ros.commands.replay_report import (
-    as_json,
+from slam_observer_ros.commands.replay_outcome import (
     Outcome,
     outcome_of,
-    print_summary,
     unused_messages,
     with_smoothed,
 )
+from slam_observer_ros.commands.replay_report import as_json, print_summary
 from slam_observer_ros.errors import SlamObserverError
 from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.map_plot import plot_map
@@ -115,11 +119,11 @@ def run(args: argparse.Namespace) -> None:
         )
         result = replay(events, settings, truth, landmark_map)
         tell_restart(result)
-        unused = unused_messages(recording, selected)
-        check_used(args, result, result.estimator.dropped + unused)
+        check_used(args, result, result.estimator.dropped + unused_messages(recording, selected))
         if landmark_map is not None:
             check_place(args, result, landmark_map)
-        outcome = outcome_of(recording, selected, result, truth, unused)
+        outcome = outcome_of(recording, selected, result, truth)
+        warn_of_input(recording, selected, result)
     if args.smooth:
         outcome = with_smoothed(outcome)
     map_frame = landmark_map.frame_id if landmark_map else inputs.map_frame
@@ -215,6 +219,6 @@ def _draw_figures(
         result.residual_stamps_ns,
         result.residuals,
         result.rejected,
-        outcome.report.dropped,
-        outcome.report.events,
+        outcome.dropped,
+        outcome.events,
     )

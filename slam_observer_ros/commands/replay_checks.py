@@ -1,4 +1,4 @@
-"""What must hold of a replay before its outcome is told and written."""
+"""What a replay must have, and what it gives reason to warn of, before its outcome is told."""
 
 from __future__ import annotations
 
@@ -11,10 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.commands.errors import UsageError
-from slam_observer_ros.estimates import UNUSED_POINTS
+from slam_observer_ros.estimates import MOST_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import Replay
+
+MOST_UNMAPPED = 0.5
+"""Share of the points beyond which they are more than what a map lacks."""
 
 logger = logging.getLogger(__name__)
 
@@ -119,3 +124,58 @@ def _advice(result: Replay) -> str:
         '. Where the start is known: --set set_initial_pose=true '
         '--set initial_position=[X,Y,Z] --set initial_yaw=YAW'
     )
+
+
+def warn_of_input(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
+    """Say what of the recording, or of the settings, is likely to be wrong."""
+    _warn_of_missing_stamps(recording)
+    _warn_of_rejections(result)
+    _warn_of_unmapped(result)
+    _warn_of_unused_poses(recording, selected, result)
+
+
+def _warn_of_missing_stamps(recording: Recording) -> None:
+    """Say which times were used, if publishers don't fill in header.stamp."""
+    if recording.unstamped:
+        logger.warning(
+            'Stamps are zero on %s; %d messages have the time of their reception instead.',
+            ', '.join(recording.unstamped),
+            recording.unstamped.total(),
+        )
+
+
+def _warn_of_rejections(result: Replay) -> None:
+    """Say what may be wrong if more points were rejected than a sensor has outliers."""
+    share = point_share(result.estimator.counts, 'rejected_landmark')
+    if share > MOST_REJECTED:
+        logger.warning(
+            '%.0f %% of the points were rejected: look at the signs, units and frames of the '
+            'velocity and of the points, then at their noise%s.',
+            100.0 * share,
+            ', and whether the map is still true' if result.in_known_map else '',
+        )
+
+
+def _warn_of_unmapped(result: Replay) -> None:
+    """Say what may be wrong if most points are of no landmark of a map that does not grow."""
+    settings = result.estimator.settings
+    share = point_share(result.estimator.counts, 'unmapped_landmark')
+    is_growing = not result.in_known_map or settings.localization_mode == 'off'
+    if share > MOST_UNMAPPED and not is_growing:
+        logger.warning(
+            '%.0f %% of the points are of no landmark of the map: is it the map of this place%s?',
+            100.0 * share,
+            ', and did the robot start where it was said to' if settings.set_initial_pose else '',
+        )
+
+
+def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
+    """Say where the motion is, if an odometry's velocities are all zero and its poses are not."""
+    poses = result.dead_reckoning.poses
+    stands_still = len(poses) > 0 and bool((poses == poses[0]).all())
+    if stands_still and recording.poses_move(selected.velocity):
+        logger.warning(
+            'All velocities on %s are zero, but its poses move; '
+            'try --velocity-source pose_differences.',
+            selected.velocity.name,
+        )
