@@ -15,9 +15,10 @@ import numpy as np
 from odometry import Event, Odometry
 
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.gains.robust import block_diagonal, observation_weights
+from slam_observer_ros.gains.robust import observation_weights
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.matrices import block_diagonal
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray

@@ -35,7 +35,7 @@ class ObservationNoise(Immutable):
         self._settings = settings
 
     def covariances(self, event: ObservationEvent, sights: FloatArray | None = None) -> FloatArray:
-        """Return the covariances (m, 3, 3) of an observation's points, body frame, m².
+        """Return what an observation's points may be off by: (m, 3, 3), body frame, m².
 
         All of them can be inverted, even if a message or a point at the sensor itself says that
         some direction is known exactly. ``sights`` (m, 3) lead from the sensor to where points of

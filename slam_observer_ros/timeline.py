@@ -9,8 +9,9 @@ from typing import TypeAlias
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.odometry import transition, transition_covariance
 from slam_observer_ros.motion.velocity_history import VelocityHistory
@@ -134,7 +135,7 @@ class Timeline:
             self.velocities, slam.gains.calibration, slam.motion_noise, event.stamp_ns, state_ns
         )
         C = SPATIAL.output_matrix(points)
-        moved = len(points) * C @ Q @ so3.transpose(C)
+        moved = len(points) * C @ Q @ transpose(C)
         covariances = slam.observation_noise.covariances(event) + moved
         return replace(
             event,

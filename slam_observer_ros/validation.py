@@ -14,6 +14,7 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import FloatArray, IntArray
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
@@ -156,7 +157,7 @@ def _check_definite(name: str, covariances: FloatArray) -> None:
     """Check that covariances (…, d, d) are symmetric and have no negative eigenvalue."""
     with np.errstate(over='ignore'):  # the largest number there is means 'unknown'
         allowed = ROUNDING * np.trace(covariances, axis1=-2, axis2=-1)
-    skew = np.abs(covariances - covariances.swapaxes(-1, -2)).max(axis=(-2, -1))
+    skew = np.abs(covariances - transpose(covariances)).max(axis=(-2, -1))
     if np.any(skew > allowed) or np.any(np.linalg.eigvalsh(covariances)[..., 0] < -allowed):
         raise InvalidEventError(
             'bad_covariance', f'{name}: asymmetric, or with a negative eigenvalue'

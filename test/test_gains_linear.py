@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam_observer_ros.gains.linear import solve
+from slam_observer_ros.matrices import solve
 
 
 @pytest.mark.parametrize('shape', [(5,), (5, 3), (5, 0), (0,), (0, 3)])

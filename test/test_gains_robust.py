@@ -13,14 +13,9 @@ from strategies import generators
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
-from slam_observer_ros.gains.robust import (
-    block_diagonal,
-    far_from_the_others,
-    huber_weights,
-    mahalanobis,
-    observation_weights,
-)
+from slam_observer_ros.gains.robust import far_from_the_others, huber_weights, observation_weights
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.matrices import block_diagonal, mahalanobis
 from slam_observer_ros.settings import Settings
 
 designs = pytest.mark.parametrize('gains', ['scheduled', 'riccati'])

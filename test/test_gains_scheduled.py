@@ -18,10 +18,10 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.gains.core import CAPACITY
 from slam_observer_ros.gains.leaves import Leaves
-from slam_observer_ros.gains.robust import block_diagonal
 from slam_observer_ros.gains.scheduled import ScheduledGains
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.matrices import block_diagonal
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulated_run import run_simulation
 from slam_observer_ros.simulation import Scenario, Simulation

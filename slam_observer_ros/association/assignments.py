@@ -26,9 +26,9 @@ from slam_observer_ros.association.joint_compatibility import (
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import mahalanobis, with_blocks
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.matrices import mahalanobis, transpose, with_blocks
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -146,7 +146,7 @@ def _candidates(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray,
 def _pairs_near(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
     C = SPATIAL.output_matrix(seen.points)
-    covariances = C @ gains.pose_covariance @ C.swapaxes(1, 2) + seen.noise
+    covariances = C @ gains.pose_covariance @ transpose(C) + seen.noise
     spread_m = _spread_m(covariances) + np.max(_spread_m(gains.landmark_covariances), initial=0.0)
     reach_m = slam.settings.rejection_distance * spread_m
     return slam.index.near(slam.observer.points, seen.points, reach_m)

@@ -22,8 +22,7 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.gains.robust import diagonal_blocks, mahalanobis
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.matrices import diagonal_blocks, mahalanobis, transpose
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 MAX_PARTIAL = 16
@@ -193,7 +192,7 @@ class JointSearch:
         columns = np.array([columns_of(one.chosen, k) for one in pairings])
         own = k * options[:, None] + np.arange(k)
         W = L[:, None] @ S[columns[:, None, :, None], own[:, None, :]]  # (b, o, q k, k)
-        left = S[own[:, :, None], own[:, None, :]] - so3.transpose(W) @ W
+        left = S[own[:, :, None], own[:, None, :]] - transpose(W) @ W
         corners = np.linalg.inv(np.linalg.cholesky(left))
         ahead = r[options] - (z[:, None, None] @ W)[:, :, 0]
         tails = (corners @ ahead[..., None])[..., 0]
@@ -204,7 +203,7 @@ class JointSearch:
         is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
         without = np.where(is_certain, np.inf, self._unpaired_costs[options[0]])
         costs = np.array([[one.cost] for one in pairings]) + np.column_stack([rises, without])
-        rows = np.concatenate([-corners @ so3.transpose(W) @ L[:, None], corners], axis=3)
+        rows = np.concatenate([-corners @ transpose(W) @ L[:, None], corners], axis=3)
         return _Extensions(pairings, options, costs, rows, tails)
 
     def _are_taken(self, pairings: list[Pairing], options: IntArray) -> BoolArray:

@@ -22,14 +22,9 @@ from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import (
-    are_far,
-    far_from_the_others,
-    gated,
-    mahalanobis,
-    with_blocks,
-)
+from slam_observer_ros.gains.robust import are_far, far_from_the_others, gated
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.matrices import mahalanobis, with_blocks
 from slam_observer_ros.slam.sighting import Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, IntArray

@@ -9,6 +9,7 @@ from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_s
 
@@ -55,7 +56,7 @@ def normalised_squared_errors(
     if eigenvalues.min(initial=0.0) < -_SINGULAR:
         raise EvaluationError('a covariance has a negative eigenvalue')
     uncertain = eigenvalues > _SINGULAR
-    components = (directions.swapaxes(-1, -2) @ (errors / deviations)[..., None])[..., 0]
+    components = (transpose(directions) @ (errors / deviations)[..., None])[..., 0]
     squares = np.where(uncertain, components**2, 0.0) / np.where(uncertain, eigenvalues, 1.0)
     return squares.sum(axis=-1), uncertain.sum(axis=-1)
 

@@ -11,6 +11,7 @@ from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
 from slam_observer_ros.events import LandmarkTruth
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_s
 
@@ -119,7 +120,7 @@ def pose_errors(poses: FloatArray, true_poses: FloatArray) -> FloatArray:
         (..., 6) rotation vector log(R̂ Rᵀ), rad, then x̂ − x, m, both in world axes.
 
     """
-    R_error = poses[..., :3, :3] @ true_poses[..., :3, :3].swapaxes(-1, -2)
+    R_error = poses[..., :3, :3] @ transpose(true_poses[..., :3, :3])
     return np.concatenate([so3.log(R_error), poses[..., :3, 3] - true_poses[..., :3, 3]], axis=-1)
 
 

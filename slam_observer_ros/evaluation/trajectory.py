@@ -10,6 +10,7 @@ import numpy as np
 
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.output_files import unfinished_file
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
@@ -144,7 +145,7 @@ def interpolate(
 
 def _between(start: FloatArray, end: FloatArray, fraction: FloatArray) -> FloatArray:
     R = start[:, :3, :3]
-    turn = so3.log(R.swapaxes(-1, -2) @ end[:, :3, :3])
+    turn = so3.log(transpose(R) @ end[:, :3, :3])
     rotations = R @ so3.exp(fraction[:, None] * turn)
     shift = end[:, :3, 3] - start[:, :3, 3]
     return se3.pose(rotations, start[:, :3, 3] + fraction[:, None] * shift)

@@ -14,10 +14,9 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.gains.leaves import Leaves
-from slam_observer_ros.gains.linear import symmetric
 from slam_observer_ros.gains.prediction import initial_covariance, predict
-from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.types import FloatArray, IntArray
@@ -83,7 +82,7 @@ class Core:
 
     def step(self, H: FloatArray, gain_k: FloatArray, r: FloatArray) -> FloatArray:
         """Return −P⁺ Σ H_iᵀ k_i r_i (q, 1), for H (m, k, q), k_i (m, k, k) and r (m, k, 1)."""
-        pull = so3.transpose(H) @ gain_k
+        pull = transpose(H) @ gain_k
         information, gradient = np.sum(pull @ H, axis=0), np.sum(pull @ r, axis=0)
         eye = np.eye(len(self.P))
         x: FloatArray = -np.linalg.solve(eye + self.P @ information, self.P @ gradient)
@@ -91,7 +90,7 @@ class Core:
 
     def shrink(self, H: FloatArray, gain_k: FloatArray) -> None:
         """Make P what m observations leave of it; in Joseph's form it stays positive."""
-        root = so3.transpose(np.linalg.cholesky(gain_k).astype(np.float64)) @ H
+        root = transpose(np.linalg.cholesky(gain_k).astype(np.float64)) @ H
         W = np.asarray(np.linalg.qr(root.reshape(-1, len(self.P)), mode='r'))  # WᵀW = Σ Hᵀ k H
         WP = W @ self.P
         S = WP @ W.T + np.eye(len(W))

@@ -11,7 +11,8 @@ from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.gains.base import InHindsight, Residuals
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
@@ -65,7 +66,7 @@ class FixedMapGains(RiccatiGains):
         self, C: FloatArray, columns: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the covariances of C ε with ε (…, p, j), and of its own (…, j, j)."""
-        PC = self._joint.pose @ so3.transpose(C)
+        PC = self._joint.pose @ transpose(C)
         return PC, C @ PC
 
     def _as_correction(self, x: FloatArray) -> Correction:

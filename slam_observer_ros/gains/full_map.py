@@ -16,9 +16,9 @@ from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import block_diagonal
-from slam_observer_ros.geometry import slam_group, so3
+from slam_observer_ros.geometry import slam_group
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.matrices import block_diagonal, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
@@ -150,8 +150,8 @@ class FullMapGains(RiccatiGains):
         """
         P = self._joint.P
         to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
-        PC = self._joint.pose @ so3.transpose(C) - so3.transpose(to_pose)
-        return PC, C @ PC - to_pose @ so3.transpose(C) + own
+        PC = self._joint.pose @ transpose(C) - transpose(to_pose)
+        return PC, C @ PC - to_pose @ transpose(C) + own
 
     def settle(self, observer: Observer) -> None:
         """Take the landmarks' estimates for their reference, so that â_i = 0."""

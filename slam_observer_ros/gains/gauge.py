@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from slam_observer_ros.gains.linear import symmetric
+from slam_observer_ros.matrices import symmetric
 from slam_observer_ros.types import FloatArray, IntArray
 
 JITTER_M2 = 1e-12

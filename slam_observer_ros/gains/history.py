@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_observer_ros.gains.base import Seen
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.smoothing.gauss_newton import Frames, joined, no_frames
 from slam_observer_ros.smoothing.prior import Prior
@@ -190,7 +191,7 @@ class History:
         numbers = np.arange(first, first + len(frames))
         return Frames(
             motions=se3.inverse(back @ starts),
-            motion_covariances=to_body @ noises @ so3.transpose(to_body),
+            motion_covariances=to_body @ noises @ transpose(to_body),
             sensitivities=to_body @ np.array([frame.sensitivity for frame in frames]),
             calibrations=np.array([frame.calibration for frame in frames]),
             frames=np.repeat(numbers, [len(part.rows) for part in seen]),

@@ -7,9 +7,9 @@ from copy import copy
 import numpy as np
 
 from slam_observer_ros.gains.prediction import initial_covariance
-from slam_observer_ros.gains.robust import block_diagonal
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import block_diagonal
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray, IntArray

@@ -22,8 +22,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import FloatArray, IntArray
 
 CORE = 0
@@ -79,7 +79,7 @@ class Leaves:
     def change_core(self, G: FloatArray, V: FloatArray) -> None:
         """Express the errors by another core z', with z = G z' + ζ and ζ ~ N(0, V), (q, q)."""
         before = self._G[1:]
-        self._V[1:] += before @ V @ so3.transpose(before)
+        self._V[1:] += before @ V @ transpose(before)
         self._G[1:] = before @ G
 
     def shift(self, x: FloatArray) -> None:
@@ -100,7 +100,7 @@ class Leaves:
         shifts = self._followed(F, group)
         turns = self._axes.turn_matrix(shifts)
         F[:, :, : len(self._axes.pose)] += turns * (group != CORE)[:, None, None]
-        N = self._N[rows] + F @ self._V[group] @ so3.transpose(F)
+        N = self._N[rows] + F @ self._V[group] @ transpose(F)
         return F @ self._G[group], N, shifts + self._shifts[rows]
 
     def _followed(self, F: FloatArray, group: IntArray) -> FloatArray:

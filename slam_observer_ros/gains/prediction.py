@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.linear import symmetric
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.types import FloatArray
@@ -43,7 +43,7 @@ def predict(
     c = slice(p, p + calibration.count)
     Ad = se3.adjoint(motion.path)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
-    turned = Ad[:-1] @ motion.covariances @ so3.transpose(Ad[:-1])
+    turned = Ad[:-1] @ motion.covariances @ transpose(Ad[:-1])
     noise: FloatArray = turned.sum(axis=0)
     if calibration.count:
         P[:p] += F @ P[c]

@@ -25,10 +25,10 @@ import numpy as np
 
 from slam_observer_ros.gains.base import GainDesign, Residuals
 from slam_observer_ros.gains.joint_covariance import JointCovariance
-from slam_observer_ros.gains.linear import solve
 from slam_observer_ros.gains.prediction import predict
-from slam_observer_ros.gains.robust import mahalanobis, observation_weights, with_blocks
+from slam_observer_ros.gains.robust import observation_weights
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.matrices import mahalanobis, solve, with_blocks
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.linear import solve
+from slam_observer_ros.matrices import diagonal_blocks, mahalanobis, solve, with_blocks
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray
 
@@ -119,33 +119,6 @@ def huber_weights(
         return np.ones(len(pull))
     left = np.sqrt(np.einsum('ij,ijk,ik->i', pull, noise, pull)) / weights
     return np.asarray(threshold / np.maximum(left, threshold))
-
-
-def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return √(r_iᵀ Σ_i⁻¹ r_i) (m,) of residuals (m, k) with covariances (m, k, k)."""
-    whitened = np.linalg.solve(covariances, r[:, :, None])
-    return np.asarray(np.sqrt((r[:, None, :] @ whitened)[:, 0, 0]))
-
-
-def block_diagonal(blocks: FloatArray) -> FloatArray:
-    """Return the block-diagonal matrix (m k, m k) of blocks (m, k, k)."""
-    m, k = blocks.shape[:2]
-    return with_blocks(np.zeros((m * k, m * k)), blocks)
-
-
-def with_blocks(matrix: FloatArray, blocks: FloatArray) -> FloatArray:
-    """Return a matrix (m k, m k) plus the block-diagonal one of blocks (m, k, k)."""
-    total: FloatArray = matrix.copy()
-    diagonal = diagonal_blocks(total, blocks.shape[1])
-    diagonal += blocks
-    return total
-
-
-def diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
-    """Return the blocks (m, k, k) on the diagonal of a matrix (m k, m k), as a view of it."""
-    m = len(matrix) // k
-    blocks: FloatArray = np.einsum('ijik->ijk', matrix.reshape(m, k, m, k))
-    return blocks
 
 
 def _pull(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:

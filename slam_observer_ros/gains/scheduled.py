@@ -35,15 +35,10 @@ import numpy as np
 from slam_observer_ros.gains.base import GainDesign, Residuals
 from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
-from slam_observer_ros.gains.linear import symmetric
-from slam_observer_ros.gains.robust import (
-    block_diagonal,
-    huber_weights,
-    mahalanobis,
-    REWEIGHTINGS,
-)
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.gains.robust import huber_weights, REWEIGHTINGS
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.matrices import block_diagonal, mahalanobis, symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
@@ -141,7 +136,7 @@ class ScheduledGains(GainDesign):
         J -= F[:, :, :p]
         shifts = F @ x[z] + J @ x[gamma]
         B, left = regression(P, gamma, z)
-        F, N = F + J @ B, N + J @ left @ so3.transpose(J)
+        F, N = F + J @ B, N + J @ left @ transpose(J)
         shifts[rows] = x[known].reshape(m, k)
         B, left = regression(P, known, z)
         F[rows] = B.reshape(m, k, q)
@@ -210,7 +205,7 @@ class ScheduledGains(GainDesign):
     def _distances(self, residuals: Residuals, F: FloatArray, N: FloatArray) -> FloatArray:
         """Return them with C_i at the middle of the chord, for the reason Riccati gains have."""
         H = self._output_matrix(residuals.e + residuals.a - 0.5 * residuals.r) - F
-        S = H @ self._core.P @ so3.transpose(H) + N + self._noise(residuals.covariances)
+        S = H @ self._core.P @ transpose(H) + N + self._noise(residuals.covariances)
         return mahalanobis(residuals.r[:, : self._axes.point], S)
 
     def _with_landmarks(self, F: FloatArray, N: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import FloatArray
 
 _HAT = np.array(
@@ -76,7 +77,7 @@ def inverse(T: FloatArray) -> FloatArray:
         Inverse pose.
 
     """
-    R_transposed = so3.transpose(T[..., :3, :3])
+    R_transposed = transpose(T[..., :3, :3])
     return pose(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
 
 
@@ -118,7 +119,7 @@ def rotate(T: FloatArray, directions: FloatArray) -> FloatArray:
         Directions in the frame that T maps to.
 
     """
-    return directions @ so3.transpose(T[..., :3, :3])
+    return directions @ transpose(T[..., :3, :3])
 
 
 def hat(xi: FloatArray) -> FloatArray:
@@ -188,7 +189,7 @@ def project(M: FloatArray) -> FloatArray:
 
     """
     V = np.zeros_like(M)
-    V[..., :3, :3] = 0.5 * (M[..., :3, :3] - so3.transpose(M[..., :3, :3]))
+    V[..., :3, :3] = 0.5 * (M[..., :3, :3] - transpose(M[..., :3, :3]))
     V[..., :3, 3] = M[..., :3, 3]
     return V
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import FloatArray
 
 _HAT = np.array(
@@ -25,12 +26,6 @@ _IDENTITY = np.eye(3)
 
 # Added to θ²: 0/0 becomes 0 / 1e-300, and any angle above 1e-142 rad keeps all its bits.
 _ZERO_GUARD = 1e-300
-
-
-def transpose(M: FloatArray) -> FloatArray:
-    """Transpose each matrix of a stack: shape (..., m, n) to (..., n, m)."""
-    transposed: FloatArray = M.swapaxes(-1, -2)
-    return transposed
 
 
 def hat(phi: FloatArray) -> FloatArray:

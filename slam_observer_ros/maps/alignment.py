@@ -6,10 +6,10 @@ import numpy as np
 from scipy import special
 
 from slam_observer_ros.gains.gauge import anchor, JITTER_M2
-from slam_observer_ros.gains.robust import block_diagonal
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import block_diagonal
 from slam_observer_ros.types import BoolArray, FloatArray
 
 MAX_TURN_STD_RAD = 0.2

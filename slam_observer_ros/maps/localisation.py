@@ -13,9 +13,10 @@ import numpy as np
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.gains.full_map import FullMapGains
 from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.alignment import find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -134,7 +135,7 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
     information = gauge_information(G, _with_variances_above(least_m2, P))
     G_each = G.reshape(n, k, -1)
-    common = G_each @ np.linalg.pinv(information, hermitian=True) @ so3.transpose(G_each)
+    common = G_each @ np.linalg.pinv(information, hermitian=True) @ transpose(G_each)
     own = np.zeros((n, 3, 3))
     i = np.arange(n)
     own[:, :k, :k] = P.reshape(n, k, n, k)[i, :, i] - common
@@ -158,8 +159,8 @@ def _find_frame(
 
 def _with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArray:
     """Return covariances (…, k, k) whose variances rounding has made neither too small nor < 0."""
-    variances, U = np.linalg.eigh(0.5 * (covariances + so3.transpose(covariances)))
-    clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ so3.transpose(U)
+    variances, U = np.linalg.eigh(0.5 * (covariances + transpose(covariances)))
+    clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ transpose(U)
     return clipped
 
 

@@ -39,7 +39,7 @@ class MotionNoise(Immutable):
         self._has_scale = bool(self._scale.any())
 
     def covariances(self, held: HeldVelocities) -> FloatArray:
-        """Return the covariances (k, 6, 6) of k motions, body frame, rad² and m².
+        """Return what k motions may be off by: (k, 6, 6), body frame, rad² and m².
 
         *A velocity in force* has white noise: of the stated density, and proportional to speed.
         The speed is the mean over :data:`SPEED_WINDOW_S`, or over all of ``held`` if that is

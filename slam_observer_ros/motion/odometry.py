@@ -7,7 +7,8 @@ from itertools import accumulate
 
 import numpy as np
 
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
@@ -37,7 +38,7 @@ def transition_covariance(
     motions = se3.exp(calibration.apply(held.body_velocities) * held.dt_s[:, None])
     starts = list(accumulate(motions[:-1], np.matmul, initial=np.eye(4)))
     Ad = se3.adjoint(np.array(starts))
-    covariance: FloatArray = (Ad @ noise.covariances(held) @ so3.transpose(Ad)).sum(axis=0)
+    covariance: FloatArray = (Ad @ noise.covariances(held) @ transpose(Ad)).sum(axis=0)
     return covariance
 
 

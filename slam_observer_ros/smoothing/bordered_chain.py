@@ -24,7 +24,7 @@ from scipy.linalg.blas import dtbsv
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csc_array
 
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import FloatArray, IntArray
 
 STRIDE = 8
@@ -136,7 +136,7 @@ class _Stretches:
         self._is_inner = (stretch < self._count) & (place > 0)
         T, X = self._matrices(equations), self._links(equations)
         self._solved = np.linalg.solve(T, X)
-        self._lost = so3.transpose(X) @ self._solved
+        self._lost = transpose(X) @ self._solved
 
     def _matrices(self, equations: Equations) -> FloatArray:
         """Return the part of T (J, (STRIDE − 1) d, (STRIDE − 1) d) of each stretch."""
@@ -145,7 +145,7 @@ class _Stretches:
         above = equations.above[self._inner[:, :-1]].swapaxes(0, 1)
         T[:, row, :, row] = equations.diagonal[self._inner].swapaxes(0, 1)
         T[:, row[:-1], :, row[1:]] = above
-        T[:, row[1:], :, row[:-1]] = so3.transpose(above)
+        T[:, row[1:], :, row[:-1]] = transpose(above)
         return T.reshape(J, (STRIDE - 1) * d, (STRIDE - 1) * d)
 
     def _links(self, equations: Equations) -> FloatArray:
@@ -159,7 +159,7 @@ class _Stretches:
         seen = np.zeros((J, STRIDE - 1, d, local.shape[1], k))
         seen[stretch, place - 1, :, slots] = equations.seen[self._is_inner]
         to_start, to_end = np.zeros((2, J, STRIDE - 1, d, d))
-        to_start[:, 0] = so3.transpose(equations.above[self._inner[:, 0] - 1])
+        to_start[:, 0] = transpose(equations.above[self._inner[:, 0] - 1])
         to_end[:, -1] = equations.above[self._inner[:, -1]]
         shared, gradient = equations.shared[self._inner], equations.gradient[self._inner]
         own_links = seen.reshape(J, STRIDE - 1, d, own.shape[1])
@@ -179,8 +179,8 @@ class _Stretches:
         gradient[1 : J + 1] -= self._lost[:, end, -1]
         above = np.concatenate([-self._lost[:, start, end], equations.above[STRIDE * J :]])
         rows, stretch = self._kept_links(equations), np.arange(J)[:, None]
-        rows[self._columns, stretch] -= so3.transpose(self._lost[:, start, 2 * d : -1])
-        rows[self._columns, stretch + 1] -= so3.transpose(self._lost[:, end, 2 * d : -1])
+        rows[self._columns, stretch] -= transpose(self._lost[:, start, 2 * d : -1])
+        rows[self._columns, stretch + 1] -= transpose(self._lost[:, end, 2 * d : -1])
         b = len(equations.corner)
         rows[b] = gradient
         return diagonal, above, rows[: b + 1]
@@ -192,7 +192,7 @@ class _Stretches:
         columns = landmark_columns(equations.landmarks[is_kept], c, k)
         places = np.searchsorted(self._kept, equations.poses[is_kept])
         rows = np.zeros((b + k, len(self._kept), self._d))
-        rows[columns, places[:, None]] = so3.transpose(equations.seen[is_kept])
+        rows[columns, places[:, None]] = transpose(equations.seen[is_kept])
         rows[:c] += equations.shared[self._kept].transpose(2, 0, 1)
         rows[:b, 0] += equations.first.T
         return rows

@@ -17,8 +17,9 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.smoothing.prior import EXACT_M, Prior
@@ -266,9 +267,9 @@ class Smoother:
         poses = solution.poses[frames.frames + 1]
         R = poses[:, :3, :3]
         arms = solution.points[frames.landmarks] - poses[:, :3, 3]
-        predicted = (so3.transpose(R) @ arms[:, :, None])[:, :, 0]
+        predicted = (transpose(R) @ arms[:, :, None])[:, :, 0]
         error = (predicted - frames.points)[:, :k]
-        J_point = so3.transpose(R)[:, :k, :k]
+        J_point = transpose(R)[:, :k, :k]
         J = np.concatenate([-self._axes.output_matrix(predicted), J_point], axis=2)
         return _normal(J, frames.information * self._weights(error)[:, None, None], error)
 
@@ -284,7 +285,7 @@ class Smoother:
 
 def _normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return Jᵀ W J (M, q, q) and Jᵀ W e (M, q) for J (M, k, q), W (M, k, k) and e (M, k)."""
-    JW = so3.transpose(J) @ W
+    JW = transpose(J) @ W
     return JW @ J, (JW @ error[:, :, None])[:, :, 0]
 
 
