@@ -12,11 +12,10 @@ from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.constant import (
     centroid_step,
     ConstantGains,
-    lyapunov_rate,
-    paper_innovation,
     paper_step,
     safe_step,
 )
+from slam_observer_ros.gains.paper import lyapunov_rate, paper_innovation
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
 from slam_observer_ros.observer import lyapunov, Observer
