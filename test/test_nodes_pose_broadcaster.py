@@ -104,6 +104,20 @@ def test_without_odometry_the_base_is_published_until_there_is_some(robot):
     assert "publishing 'map' to 'odom' on /tf: /tf has 'odom' to 'base_link'" in robot.logged
 
 
+@pytest.mark.parametrize(('parent', 'is_static'), [('odom_combined', False), ('body', True)])
+def test_the_base_gets_no_second_parent(robot, parent, is_static):
+    robot.buffer.insert(parent, 'base_link', robot.now_ns, ODOMETRY, is_static=is_static)
+    robot.run(DISCOVERY_S + 1.0)
+    assert not robot.take()
+    assert f"'base_link' has the parent '{parent}' on /tf" in robot.broadcaster.trouble
+    assert 'set odom_frame to the frame of the odometry' in robot.logged
+    robot.buffer.insert('odom', parent, robot.now_ns, ODOMETRY, is_static=True)
+    robot.buffer.insert(parent, 'base_link', robot.now_ns + STEP_NS, ODOMETRY, is_static=is_static)
+    robot.run(0.1)
+    assert children(robot.take()) == {'odom'}
+    assert not robot.broadcaster.trouble
+
+
 @pytest.mark.parametrize('rate_factor', [1, 10])
 @pytest.mark.parametrize('lag_s', [0.1, 0.7, 3.0])
 def test_odometry_that_is_late_is_waited_for(monkeypatch, rate_factor, lag_s):

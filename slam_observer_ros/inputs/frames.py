@@ -59,6 +59,9 @@ class TransformSource(Protocol):
 
         """
 
+    def parent_of(self, frame: str) -> str | None:
+        """Return the frame that this one is told in; None if none is."""
+
     def newest_ns(self, target: str, source: str) -> int | None:
         """Return the newest stamp at which both frames are known, nanoseconds; None if never."""
 

@@ -113,6 +113,11 @@ class TransformBuffer:
         target_chain, source_chain = self._chains(target, source)
         return se3.inverse(self._pose(target_chain, stamp_ns)) @ self._pose(source_chain, stamp_ns)
 
+    def parent_of(self, frame: str) -> str | None:
+        """Return the frame that this one is told in; None if none is."""
+        track = self._tracks.get(frame.lstrip('/'))
+        return None if track is None else track.parent
+
     def newest_ns(self, target: str, source: str) -> int | None:
         """Return the newest stamp at which both frames are known, nanoseconds.
 

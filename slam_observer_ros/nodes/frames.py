@@ -8,6 +8,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
+import yaml
 
 from slam_observer_ros.errors import MessageError, TransformError
 from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
@@ -44,6 +45,7 @@ class TopicTransforms:
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
         self.newest_ns = self._buffer.newest_ns
+        self.parent_of = self._buffer.parent_of
         self.clear = self._buffer.clear
         if TFMessage is not None:
             self._subscribe('/tf', TF_QOS, is_static=False)
@@ -89,6 +91,12 @@ class Tf2Transforms:
         return pose_matrices(
             np.array([position.x, position.y, position.z]), np.array([q.x, q.y, q.z, q.w])
         )
+
+    def parent_of(self, frame: str) -> str | None:
+        """As :meth:`TransformSource.parent_of`."""
+        frames = yaml.safe_load(self._buffer.all_frames_as_yaml())
+        known = frames.get(frame) if isinstance(frames, dict) else None
+        return known['parent'] if known else None
 
     def newest_ns(self, target: str, source: str) -> int | None:
         """As :meth:`TransformSource.newest_ns`."""

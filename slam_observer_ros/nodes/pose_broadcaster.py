@@ -91,6 +91,7 @@ class PoseBroadcaster:
         if not self._waiting:
             return
         newest_ns = self._odometry_ns()
+        self.trouble = ''
         self._find_parent(newest_ns)
         self._look_for_delay(newest_ns)
         if self._child == self._settings.odom_frame:
@@ -123,13 +124,22 @@ class PoseBroadcaster:
         if newest_ns is not None and self._child != self._settings.odom_frame:
             self._settle(self._settings.odom_frame, '/tf has')
         searched_s = time.monotonic() - (self._begin_s or 0.0)
-        if not self._child and searched_s > DISCOVERY_S:
-            self._settle(self._settings.base_frame, 'nobody publishes')
+        if self._child or searched_s <= DISCOVERY_S:
+            return
+        settings = self._settings
+        parent = self._transforms.parent_of(settings.base_frame)
+        if settings.invert_tf or parent in (None, settings.map_frame):
+            self._settle(settings.base_frame, 'nobody publishes')
+        else:
+            self._report(
+                f"'{settings.base_frame}' has the parent '{parent}' on /tf, so that no pose is "
+                'published there: set odom_frame to the frame of the odometry, or base_frame to '
+                "the robot's uppermost frame, or publish_tf to false"
+            )
 
     def _look_for_delay(self, newest_ns: int | None) -> None:
         """Report odometry that is far behind the poses, or has ended."""
         settings = self._settings
-        self.trouble = ''
         known_ns = self._waiting[0][0] if newest_ns is None else newest_ns
         behind_ns = self._waiting[-1][0] - known_ns
         if self._child != settings.odom_frame or behind_ns <= LATE_NS:
