@@ -206,6 +206,14 @@ def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observ
     assert ended.errors.count('Dropped a message (no_transform)') == 1
 
 
+def test_fiducials_on_tf_by_another_name_are_told(recordings, slam_observer):
+    options = ('--landmarks-topic', '/tags/tf')
+    told = slam_observer('replay', recordings['all'], *options).errors
+    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in told
+    assert 'dock0' in told
+    assert 'set tag_frame_prefix' in told
+
+
 @pytest.mark.parametrize(
     ('name', 'options', 'reason'),
     [

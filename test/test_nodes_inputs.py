@@ -25,7 +25,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.message_types import IMU
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
-from slam_observer_ros.nodes import inputs
+from slam_observer_ros.nodes import decoders, inputs
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_message,
@@ -33,7 +33,6 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
     vector_message,
 )
-from slam_observer_ros.nodes.input_topics import CloudDecoder
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
@@ -177,13 +176,29 @@ def test_points_whose_ids_are_named_otherwise_are_told_once(message_type, name, 
             ros_messages.point_cloud(np.ones((count, 3)), {name: np.ones(count)})
             for count in (0, 2, 2)
         ]
-    decode = CloudDecoder(node, message_type)
+    decode = decoders.CloudDecoder(node, message_type)
     decoded = [decode(ros_messages.serialise(cloud), 0) for cloud in clouds]
     assert [len(message.event.ids) for message in decoded] == [0, 2, 2]
     told = [call.args[0] for call in node.get_logger().warning.call_args_list]
     start = f"points on '/robot/landmarks' come without ids; {found}: they are told apart"
     assert [text.startswith(start) for text in told] == ([] if found is None else [True])
     assert all(text.endswith("name these 'id'") for text in told)
+
+
+@pytest.mark.parametrize('is_seen', [False, True])
+def test_fiducials_on_tf_by_another_name_are_told_once(monkeypatch, is_seen):
+    node, now = Mock(), [0.0]
+    monkeypatch.setattr(decoders, 'time', Mock(monotonic=lambda: now[0]))
+    decode = decoders.TagDecoder(node, 'dock')
+    for name in ('dock7' if is_seen else 'fiducial_7', 'wheel', 'wheel'):
+        names, position, quaternion = ('camera', name), (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)
+        sent = [ros_messages.transform_stamped(names, position, quaternion)]
+        decode(ros_messages.serialise(ros_messages.make('tf2_msgs/msg/TFMessage', sent)), 0)
+        now[0] += decoders.WITHOUT_TAG_S
+    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    assert len(told) == (not is_seen)
+    assert all("named 'dock<id>'" in text for text in told)
+    assert all('(there are fiducial_7, wheel)' in text for text in told)
 
 
 def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):

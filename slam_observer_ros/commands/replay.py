@@ -34,12 +34,7 @@ from slam_observer_ros.commands.replay_inputs import (
     warn_of_unused,
     with_base_frame,
 )
-from slam_observer_ros.commands.replay_outcome import (
-    Outcome,
-    outcome_of,
-    unused_messages,
-    with_smoothed,
-)
+from slam_observer_ros.commands.replay_outcome import Outcome, outcome_of, with_smoothed
 from slam_observer_ros.commands.replay_report import as_json, print_summary
 from slam_observer_ros.errors import SlamObserverError
 from slam_observer_ros.evaluation.gaps import fill_gaps
@@ -119,7 +114,7 @@ def run(args: argparse.Namespace) -> None:
         )
         result = replay(events, settings, truth, landmark_map)
         tell_restart(result)
-        check_used(args, result, result.estimator.dropped + unused_messages(recording, selected))
+        check_used(args, recording, selected, inputs, result)
         if landmark_map is not None:
             check_place(args, result, landmark_map)
         outcome = outcome_of(recording, selected, result, truth)

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.commands.errors import UsageError
+from slam_observer_ros.commands.replay_outcome import unused_messages
 from slam_observer_ros.estimates import MOST_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
+from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -36,17 +38,14 @@ def tell_restart(result: Replay) -> None:
     )
 
 
-def check_used(args: argparse.Namespace, result: Replay, dropped: Mapping[str, int]) -> None:
+def check_used(
+    args: argparse.Namespace,
+    recording: Recording,
+    selected: SelectedTopics,
+    inputs: InputSettings,
+    result: Replay,
+) -> None:
     """Warn if no velocity was used, or no observation.
-
-    Parameters
-    ----------
-    args : Namespace
-        The command's options.
-    result : Replay
-        What came of the events.
-    dropped : mapping of str to int
-        How many events were dropped, by reason.
 
     Raises
     ------
@@ -54,6 +53,7 @@ def check_used(args: argparse.Namespace, result: Replay, dropped: Mapping[str, i
         If no observation was used though ``--smooth``, ``--map`` or ``--load-map`` needs some.
 
     """
+    dropped = result.estimator.dropped + unused_messages(recording, selected)
     counts = result.estimator.counts
     if not counts['velocity']:
         logger.warning(
@@ -65,7 +65,10 @@ def check_used(args: argparse.Namespace, result: Replay, dropped: Mapping[str, i
         return
     unused = Counter({'without a point that is used': counts['observation']})
     unused += Counter({f'points {fate}': counts[name] for name, fate in UNUSED_POINTS.items()})
-    why = f'observation was used (dropped: {list_dropped(unused + Counter(dropped))})'
+    why = f'observation was used (dropped: {list_dropped(unused + dropped)})'
+    if not unused + dropped:
+        hint = recording.missing_tags(selected.landmarks, inputs.tag_frame_prefix)
+        why += f'; {hint}' if hint else ''
     if args.smooth or args.map is not None or args.load_map is not None:
         raise UsageError(f'no {why}; --smooth, --map and --load-map need some')
     logger.warning('No %s; the trajectory is that of the velocities alone.', why)

@@ -24,6 +24,9 @@ _COVARIANCE = 36
 _SIZE = 3
 _CORNERS = 10
 _HOMOGRAPHY = 9
+MOST_NAMES = 12
+"""Names of frames that a message lists."""
+
 _TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
 
 
@@ -125,6 +128,16 @@ def observed_tags(
         _observation(frame_id, stamp_ns, list(group))
         for (frame_id, stamp_ns), group in groupby(seen, key=_camera_and_stamp)
     ]
+
+
+def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
+    """Say that none of the frames on /tf is that of a fiducial, and what to do."""
+    names = sorted(frames)
+    there = ', '.join(names[:MOST_NAMES]) + (', …' if len(names) > MOST_NAMES else '')
+    return (
+        f"no frame on /tf is named '{tag_frame_prefix}<id>' or '<family>:<id>' "
+        f'(there are {there}): set tag_frame_prefix'
+    )
 
 
 def _landmark_id(digits: str) -> int:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, TypeVar
 
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.inputs.settings import AUTO, ON_TF
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.messages.cloud_ids import missing_ids
 from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_pose_array,
-    observed_tags,
 )
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
@@ -29,15 +25,13 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.messages.point_cloud_layout import ID_NAME
-from slam_observer_ros.messages.point_clouds import field_names, ObservationMessage
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
-    decode_transforms,
     ImuMessage,
     PoseMessage,
 )
+from slam_observer_ros.nodes.decoders import CloudDecoder, TagDecoder
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
@@ -72,8 +66,8 @@ def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
 def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
     if settings.landmarks_type == ON_TF:
-        decode = partial(_decode_tags, settings.tag_frame_prefix)
-        return Input(node, '/tf', {TRANSFORMS: decode}, intake.add_observations, qos)
+        decoder = TagDecoder(node, settings.tag_frame_prefix)
+        return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos)
     if settings.landmarks_type == 'AprilTagDetectionArray':
         return Input(node, 'landmarks', {APRILTAGS: decode_apriltags}, intake.add_tags, qos)
     if settings.landmarks_type == AUTO:
@@ -82,44 +76,6 @@ def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
         return Input(node, 'landmarks', decoders, intake.add_observation, qos)
     decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
     return Input(node, 'landmarks', decoders, intake.add_observation, qos)
-
-
-class CloudDecoder:
-    """Decodes clouds, and says once if their points have no field or channel for ids.
-
-    They are told apart by where they are then, as is wanted, or as a name is misspelt.
-
-    Parameters
-    ----------
-    node : Node
-        Node that logs.
-    message_type : str
-        One of ``CLOUD_DECODERS``.
-
-    """
-
-    def __init__(self, node: Node, message_type: str) -> None:
-        self._node = node
-        self._message_type = message_type
-        self._is_looked_at = False
-
-    def __call__(self, raw: Buffer, receive_ns: int) -> ObservationMessage:
-        """Decode a cloud."""
-        message = CLOUD_DECODERS[self._message_type](raw, receive_ns)
-        ids = message.event.ids
-        if not self._is_looked_at and len(ids) and (ids == UNKNOWN_ID).all():
-            self._is_looked_at = True
-            self._look(raw)
-        return message
-
-    def _look(self, raw: Buffer) -> None:
-        missing = missing_ids(field_names(raw, self._message_type), self._message_type)
-        if missing:
-            topic = self._node.resolve_topic_name('landmarks')
-            self._node.get_logger().warning(
-                f"points on '{topic}' come {missing}: they are told apart by where they are; if "
-                f"they have ids, name these '{ID_NAME}'"
-            )
 
 
 def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:
@@ -149,7 +105,3 @@ def _decode_imu(raw: Buffer, _receive_ns: int) -> ImuMessage:
 
 def _decode_odometry_pose(raw: Buffer, _receive_ns: int) -> PoseMessage:
     return decode_odometry_pose(raw)
-
-
-def _decode_tags(prefix: str, raw: Buffer, _receive_ns: int) -> list[ObservationMessage]:
-    return observed_tags(decode_transforms(raw), prefix)

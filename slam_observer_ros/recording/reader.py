@@ -27,7 +27,13 @@ from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.cloud_ids import missing_ids
-from slam_observer_ros.messages.message_types import CLOUD_DECODERS, ODOMETRY, POSE_ARRAY
+from slam_observer_ros.messages.detections import no_tags
+from slam_observer_ros.messages.message_types import (
+    CLOUD_DECODERS,
+    ODOMETRY,
+    POSE_ARRAY,
+    TRANSFORMS,
+)
 from slam_observer_ros.messages.point_cloud_layout import ID_NAME
 from slam_observer_ros.messages.point_clouds import field_names
 from slam_observer_ros.recording.decoding import (
@@ -216,6 +222,14 @@ class Recording:
         if topic.message_type not in CLOUD_DECODERS:
             return ''
         return missing_ids(self._field_names(topic), topic.message_type)
+
+    def missing_tags(self, topic: Topic, tag_frame_prefix: str) -> str:
+        """Tell that no frame on /tf is that of a fiducial, if they are looked for there."""
+        if topic.message_type != TRANSFORMS:
+            return ''
+        messages = self._all_decoded(topic, decode_transform_message)
+        frames = {transform.child_frame_id for transforms in messages for transform in transforms}
+        return no_tags(tag_frame_prefix, frames)
 
     def poses_move(self, topic: Topic) -> bool:
         """Tell whether a topic holds an odometry's poses, and they are not all the same."""
