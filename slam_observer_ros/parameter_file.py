@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+import logging
 from pathlib import Path
 import re
 
@@ -10,6 +11,8 @@ import yaml
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import suggestion
+
+logger = logging.getLogger(__name__)
 
 OBSERVER_NODE = 'observer_node'
 
@@ -68,7 +71,20 @@ def read_parameter_file(path: Path) -> dict[str, object]:
             f"parameter file {path} has no '/**: ros__parameters:' or "
             f"'{OBSERVER_NODE}: ros__parameters:' section"
         )
+    for name, value in values.items():
+        if _is_mixed(value):
+            logger.warning(
+                "%s: the node can't read '%s': in ROS all numbers of a list are written alike, "
+                '0.0 for 0.',
+                path,
+                name,
+            )
     return values
+
+
+def _is_mixed(value: object) -> bool:
+    """Return whether some of a list's numbers are integers and some are not."""
+    return isinstance(value, list) and {int, float} <= {type(entry) for entry in value}
 
 
 def _is_misspelt(name: str, ours: str) -> bool:

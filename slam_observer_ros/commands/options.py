@@ -123,15 +123,25 @@ def _for_estimator(values: Mapping[str, object]) -> dict[str, object]:
 def find_config(name: str) -> Path:
     """Return the path of a parameter file, or of one that comes with the package, by its name."""
     path = Path(name)
-    if path.exists() or path.suffix or len(path.parts) > 1:
-        return path
     shipped = {file.stem: file for file in _shipped_configs()}
-    if name not in shipped:
-        raise ParameterError(
-            f"no parameter file '{name}'; those that come with the package: "
-            f'{", ".join(sorted(shipped)) or "none"}'
-        )
-    return shipped[name]
+    if path.exists() or len(path.parts) > 1:
+        return path
+    if path.stem in shipped and path.suffix in ('', '.yaml'):
+        return shipped[path.stem]
+    if path.suffix:
+        return path
+    usable = sorted(name for name, file in shipped.items() if _is_for_observer(file))
+    raise ParameterError(
+        f"no parameter file '{name}'; those that come with the package: "
+        f'{", ".join(usable) or "none"}'
+    )
+
+
+def _is_for_observer(file: Path) -> bool:
+    try:
+        return bool(read_parameter_file(file))
+    except ParameterError:
+        return False
 
 
 def _shipped_configs() -> Iterable[Path]:

@@ -45,7 +45,6 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import replay
 
 logger = logging.getLogger(__name__)
@@ -122,7 +121,14 @@ def run(args: argparse.Namespace) -> None:
     if args.smooth:
         outcome = with_smoothed(outcome)
     map_frame = landmark_map.frame_id if landmark_map else inputs.map_frame
-    _give_out(args, selected, outcome, map_frame)
+    if map_frame != inputs.map_frame:
+        logger.warning(
+            "The map is in frame '%s', and so is what is written; the node takes it with "
+            'map_frame: %s only.',
+            map_frame,
+            map_frame,
+        )
+    _give_out(args, outcome, map_frame)
 
 
 def _check_files(args: argparse.Namespace) -> None:
@@ -137,15 +143,13 @@ def _check_files(args: argparse.Namespace) -> None:
     check_plots(args.plot, FIGURES, args.force)
 
 
-def _give_out(
-    args: argparse.Namespace, selected: SelectedTopics, outcome: Outcome, map_frame: str
-) -> None:
+def _give_out(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> None:
     """Write and print all that can be, and only then say what could not be written."""
     written, errors = _write_files(args, outcome, map_frame)
     if args.json:
         print_json(as_json(outcome))
     else:
-        print_summary(args.recording, selected, outcome, written)
+        print_summary(args.recording, outcome, written)
     if errors:
         raise OutputError('; '.join(errors))
 

@@ -27,6 +27,8 @@ class Outcome:
 
     Attributes
     ----------
+    selected : SelectedTopics
+        Which topics were used.
     result : Replay
         What the estimator made of the recording.
     truth : Truth
@@ -44,6 +46,7 @@ class Outcome:
 
     """
 
+    selected: SelectedTopics
     result: Replay
     truth: Truth
     accuracy: Accuracy
@@ -63,6 +66,12 @@ class Outcome:
     def dropped(self) -> dict[str, int]:
         """How many of them were dropped, by reason."""
         return dict(self.result.estimator.dropped + self.unused)
+
+    @property
+    def truth_covered(self) -> float | None:
+        """Share of the trajectory that the truth covers; None without true poses."""
+        errors = self.accuracy.pose_errors
+        return None if errors is None else float(errors.covered.mean())
 
     @property
     def localised_after_s(self) -> float | None:
@@ -89,6 +98,7 @@ def outcome_of(
 ) -> Outcome:
     """Measure a replay of a recording that has been read to its end."""
     return Outcome(
+        selected,
         result,
         truth,
         measure(result, truth),

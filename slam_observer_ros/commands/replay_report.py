@@ -12,7 +12,6 @@ from slam_observer_ros.commands.replay_checks import list_dropped
 from slam_observer_ros.commands.replay_outcome import Outcome
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
-from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import Replay
 
 NEARLY_ALL = 0.99
@@ -39,7 +38,12 @@ def as_json(outcome: Outcome) -> dict[str, object]:
     """Return the figures as ``--json`` prints them; null is what was not measured."""
     estimator, accuracy = outcome.result.estimator, outcome.accuracy
     errors = accuracy.pose_errors
+    selected = outcome.selected
     return {
+        'velocity_topic': selected.velocity.name,
+        'landmarks_topic': selected.landmarks.name,
+        'imu_topic': None if selected.imu is None else selected.imu.name,
+        'gains': estimator.settings.gains,
         'events': outcome.events,
         'duration_s': outcome.duration_s,
         'seconds': outcome.result.seconds,
@@ -48,6 +52,7 @@ def as_json(outcome: Outcome) -> dict[str, object]:
         'used': dict(estimator.counts),
         'calibration': {part.name: asdict(part) for part in estimator.calibration},
         'localised_after_s': outcome.localised_after_s,
+        'truth_covered': outcome.truth_covered,
         'ate_rmse_m': _ate_rmse_m(errors),
         'unaligned_rmse_m': outcome.unaligned_rmse_m,
         'rotation_rmse_rad': None if errors is None else errors.rotation_rmse_rad,
@@ -65,10 +70,9 @@ def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
     return None if errors is None else errors.ate_rmse_m
 
 
-def print_summary(
-    recording: Path, selected: SelectedTopics, outcome: Outcome, written: Mapping[str, Path]
-) -> None:
+def print_summary(recording: Path, outcome: Outcome, written: Mapping[str, Path]) -> None:
     """Print the figures as a table, and what was written where."""
+    selected = outcome.selected
     estimator = outcome.result.estimator
     note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
     rows = {
@@ -121,10 +125,10 @@ def _told_points(counts: Counter[str]) -> str:
 
 def _covered_rows(outcome: Outcome) -> dict[str, str]:
     """Tell of how much of the trajectory the figures are, if not of nearly all."""
-    errors = outcome.accuracy.pose_errors
-    if errors is None or errors.covered.mean() > NEARLY_ALL:
+    share = outcome.truth_covered
+    if share is None or share > NEARLY_ALL:
         return {}
-    return {'truth': f'covers {100.0 * errors.covered.mean():.1f} % of the trajectory'}
+    return {'truth': f'covers {100.0 * share:.1f} % of the trajectory'}
 
 
 def _accuracy_rows(outcome: Outcome) -> dict[str, str]:

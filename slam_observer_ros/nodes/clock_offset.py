@@ -46,14 +46,17 @@ class ClockOffset:
         side = 'ahead of' if offset_ns > 0 else 'behind'
         return f"{to_s(abs(offset_ns)):.3f} s {side} this machine's clock"
 
-    def trouble(self, source: str) -> str:
-        """Say how far off the stamps of ``source`` are; empty if they are right."""
+    def trouble(self, source: str, is_simulated: bool) -> str:
+        """Say how far off the stamps of ``source`` are; empty if they are right.
+
+        ``is_simulated`` says that this machine's clock is /clock.
+        """
         if not self.is_off:
             return ''
-        return (
-            f'stamps of {source} are {self}: synchronise the clocks, or set use_sim_time (for a '
-            'recording) or correct_clock_offset'
-        )
+        advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
+        if is_simulated:
+            advice = 'does what publishes it use /clock, and does this machine keep up with it'
+        return f'stamps of {source} are {self}: {advice}, or set correct_clock_offset'
 
     def add(self, stamp_ns: int, receive_ns: int) -> None:
         """Take the stamp and the time of reception of a message."""

@@ -1,9 +1,10 @@
-"""Decoders of landmarks that say once what the messages lack."""
+"""Decoders that say once what the messages lack."""
 
 from __future__ import annotations
 
 import time
 
+import numpy as np
 from rclpy.node import Node
 
 from slam_observer_ros.events import UNKNOWN_ID
@@ -13,7 +14,16 @@ from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.message_types import CLOUD_DECODERS
 from slam_observer_ros.messages.point_cloud_layout import ID_NAME
 from slam_observer_ros.messages.point_clouds import field_names, ObservationMessage
-from slam_observer_ros.messages.poses_and_velocities import decode_transforms
+from slam_observer_ros.messages.poses_and_velocities import (
+    decode_odometry_pose,
+    decode_odometry_twist,
+    decode_transforms,
+    VelocityMessage,
+)
+from slam_observer_ros.types import FloatArray
+
+MOVED_M = 0.1
+"""How far an odometry's poses go before its velocities can't all be zero, metres."""
 
 WITHOUT_TAG_S = 20.0
 """Time without any fiducial on /tf after which their names may be others."""
@@ -54,6 +64,42 @@ class CloudDecoder:
             self._node.get_logger().warning(
                 f"points on '{topic}' come {missing}: they are told apart by where they are; if "
                 f"they have ids, name these '{ID_NAME}'"
+            )
+
+
+class OdometryDecoder:
+    """Decodes velocities of odometries, and says once if these are zero though the poses move.
+
+    Parameters
+    ----------
+    node : Node
+        Node that logs.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._is_told = False
+        self._first: FloatArray | None = None
+
+    def __call__(self, raw: Buffer, receive_ns: int) -> VelocityMessage:
+        """Decode the velocity of a nav_msgs/Odometry."""
+        message = decode_odometry_twist(raw, receive_ns)
+        # One that has told a velocity will do so again.
+        self._is_told = self._is_told or bool(message.event.body_velocity.any())
+        if not self._is_told:
+            self._look(decode_odometry_pose(raw).position)
+        return message
+
+    def _look(self, position: FloatArray) -> None:
+        if self._first is None:
+            self._first = position
+        if np.linalg.norm(position - self._first) > MOVED_M:
+            self._is_told = True
+            topic = self._node.resolve_topic_name('twist')
+            self._node.get_logger().warning(
+                f"all velocities on '{topic}' are zero, but its poses move: set velocity_source "
+                "to 'pose_differences'"
             )
 
 

@@ -72,7 +72,7 @@ class InitialPose:
         self._node.get_logger().info(f'the robot is set to ({x:.2f}, {y:.2f}, {z:.2f}) m')
 
     def _check(self, message: PoseMessage) -> None:
-        if message.frame_id not in ('', self._map_frame):
+        if message.frame_id.lstrip('/') not in ('', self._map_frame):
             raise MessageError(f"it is in frame '{message.frame_id}', not '{self._map_frame}'")
         if not np.isfinite(message.position).all():
             raise MessageError('its position has a NaN or infinite entry')

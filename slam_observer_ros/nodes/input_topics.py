@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.inputs.settings import AUTO, ON_TF
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.detections import (
@@ -31,7 +32,7 @@ from slam_observer_ros.messages.poses_and_velocities import (
     ImuMessage,
     PoseMessage,
 )
-from slam_observer_ros.nodes.decoders import CloudDecoder, TagDecoder
+from slam_observer_ros.nodes.decoders import CloudDecoder, OdometryDecoder, TagDecoder
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
@@ -58,8 +59,15 @@ def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> l
 def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
     qos = _qos(settings.twist_qos, settings.queue_depth)
     if settings.velocity_source == 'pose_differences':
+        if settings.velocity_type not in (AUTO, 'Odometry'):
+            raise ParameterError(
+                f"velocity_type '{settings.velocity_type}' has no poses: with velocity_source "
+                "'pose_differences' it is 'Odometry' or 'auto'"
+            )
         return Input(node, 'twist', {ODOMETRY: _decode_odometry_pose}, intake.add_pose, qos)
-    decoders = _chosen(VELOCITY_DECODERS, settings.velocity_type)
+    decoders = _chosen(
+        VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
+    )
     return Input(node, 'twist', decoders, intake.add_velocity, qos)
 
 

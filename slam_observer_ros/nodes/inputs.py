@@ -55,8 +55,6 @@ class Input(Generic[MessageT]):
         Messages so far.
     malformed : int
         Messages that could not be decoded.
-    trouble : str
-        Why no message comes, or comes late; empty while they come in time.
     backlog : Backlog
         How long messages wait to be read.
     last_received_s : float or None
@@ -86,7 +84,7 @@ class Input(Generic[MessageT]):
         self.topic = node.resolve_topic_name(topic)
         self.received = 0
         self.malformed = 0
-        self.trouble = ''
+        self._fault = ''
         self.backlog = Backlog()
         self.last_received_s: float | None = None
         self._quiet_until_s = time.monotonic() + DISCOVERY_S
@@ -100,6 +98,18 @@ class Input(Generic[MessageT]):
             return None
         return time.monotonic() - self.last_received_s
 
+    @property
+    def trouble(self) -> str:
+        """Why no message comes, or comes late; empty while they come in time."""
+        if self._fault:
+            return self._fault
+        if self.received == 0:
+            return f"no message yet on '{self.topic}' ({self._type_name})"
+        age_s = self.age_s or 0.0
+        if age_s > DISCOVERY_S:
+            return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
+        return self.backlog.trouble(self.topic, time.monotonic())
+
     def look(self) -> None:
         """Look at what the topic carries; subscribe to it, or report why nothing comes."""
         publishers = self._node.get_publishers_info_by_topic(self.topic)
@@ -107,9 +117,9 @@ class Input(Generic[MessageT]):
         usable = [name for name in self._decoders if name in found]
         if usable and self._type_name not in usable:
             self._subscribe(usable[0])
-        self.trouble = self._trouble(publishers, usable)
-        if self.trouble:
-            self._warn(self.trouble)
+        self._fault = self._find_fault(publishers, usable)
+        if trouble := self.trouble:
+            self._warn(trouble)
 
     def close(self) -> None:
         """Stop receiving."""
@@ -156,7 +166,8 @@ class Input(Generic[MessageT]):
             self._quiet_until_s = now_s + REPORT_PERIOD_S
             self._node.get_logger().warning(text)
 
-    def _trouble(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
+    def _find_fault(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
+        """Return why no publisher can be heard; empty if all can."""
         wanted = ' or '.join(self._decoders)
         if not publishers:
             return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
@@ -170,12 +181,7 @@ class Input(Generic[MessageT]):
                     f"'{publisher.node_name}' can't be heard on '{self.topic}', its quality of "
                     f'service does not fit: {reason.strip()}'
                 )
-        if self.received == 0:
-            return f"no message yet on '{self.topic}' ({self._type_name})"
-        age_s = self.age_s or 0.0
-        if age_s > DISCOVERY_S:
-            return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
-        return self.backlog.trouble(self.topic, time.monotonic())
+        return ''
 
 
 def message_class(type_name: str) -> Any:

@@ -157,7 +157,15 @@ class Intake:
         """Return which inputs have stamps of another clock that are not corrected."""
         if self._settings.correct_clock_offset:
             return []
-        return [clock.trouble(name) for name, clock in self.clocks.items() if clock.is_off]
+        return [
+            clock.trouble(name, self._is_simulated)
+            for name, clock in self.clocks.items()
+            if clock.is_off
+        ]
+
+    @property
+    def _is_simulated(self) -> bool:
+        return bool(self._node.get_clock().ros_time_is_active)
 
     def take_mean_processing_ms(self) -> float:
         """Return the mean time that an event took since this was asked last, milliseconds."""
@@ -217,7 +225,7 @@ class Intake:
         clock.add(stamp_ns, receive_ns)
         if not self._settings.correct_clock_offset:
             if clock.is_off:
-                self._warn(source, clock.trouble(source))
+                self._warn(source, clock.trouble(source, self._is_simulated))
         elif clock.correction_ns != before_ns:
             fate = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
             self._node.get_logger().info(f'stamps of {source} are {clock}, and {fate}')
