@@ -115,7 +115,7 @@ class TestReport:
         report = slam_observer('replay', path, '--json').json
         unknown = {key for key, value in report.items() if value is None}
         assert unknown == {key for key in REPORT_KEYS if 'rmse' in key} | {
-            'anees', 'localised_after_s',
+            'anees', 'localised_after_s', 'truth_covered', 'imu_topic',
         }  # fmt: skip
         assert 'no truth to compare with' in slam_observer('replay', path).output
 

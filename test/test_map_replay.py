@@ -106,7 +106,8 @@ def test_a_map_keeps_the_name_of_its_frame(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
     slam_observer.succeed('replay', path, '--map', first, '--set', 'map_frame=hall', *SETTINGS)
-    slam_observer('replay', path, '--load-map', first, '--map', again, *SETTINGS)
+    ended = slam_observer('replay', path, '--load-map', first, '--map', again, *SETTINGS)
+    assert 'the node takes it with map_frame: hall only' in ended.errors
     assert [read_map(file).frame_id for file in (first, again)] == ['hall', 'hall']
 
 

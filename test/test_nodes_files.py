@@ -87,4 +87,4 @@ def test_parameter_file_holds_known_parameters_in_range(name, tables):
 def test_simulator_file_lists_every_parameter():
     content = yaml.safe_load((CHECKOUT / 'config' / 'simulator.yaml').read_text())
     rows = {row.name for settings in (Scenario, SimulatorNodeSettings) for row in table(settings)}
-    assert set(content['/**']['ros__parameters']) == rows
+    assert set(content['/**/simulator_node']['ros__parameters']) == rows

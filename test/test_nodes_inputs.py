@@ -20,6 +20,7 @@ from robots import own_topics, Robot, stamp_ns, TransformSender
 import ros_messages
 from sensor_msgs.msg import Imu, PointCloud2
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.message_types import IMU
@@ -33,8 +34,10 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
     vector_message,
 )
+from slam_observer_ros.nodes.input_topics import open_inputs
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.nodes.transforms import TFMessage
 
 pytestmark = pytest.mark.ros
@@ -128,6 +131,17 @@ def test_a_message_that_had_to_wait_was_received_when_the_middleware_had_it(is_s
         assert first_ns == waited_since_ns
 
 
+def test_a_first_message_ends_the_report_that_there_is_none():
+    node = Mock()
+    source, receive = unstamped_input(node, [])
+    publisher = Mock(topic_type='geometry_msgs/msg/Twist', qos_profile=QOS)
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    source.look()
+    assert source.trouble == "no message yet on '/twist' (geometry_msgs/msg/Twist)"
+    receive(TWIST, {'received_timestamp': time.time_ns()})
+    assert not source.trouble
+
+
 def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
     node = Mock()
     source, receive = unstamped_input(node, [])
@@ -183,6 +197,30 @@ def test_points_whose_ids_are_named_otherwise_are_told_once(message_type, name, 
     start = f"points on '/robot/landmarks' come without ids; {found}: they are told apart"
     assert [text.startswith(start) for text in told] == ([] if found is None else [True])
     assert all(text.endswith("name these 'id'") for text in told)
+
+
+@pytest.mark.parametrize(
+    ('velocity', 'speed', 'is_told'),
+    [(np.zeros(6), 0.5, True), (V, 0.5, False), (np.zeros(6), 0.001, False)],
+    ids=['poses alone', 'both', 'at rest'],
+)
+def test_an_odometry_with_poses_alone_is_told_once(velocity, speed, is_told):
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    decode = decoders.OdometryDecoder(node)
+    for step in range(20):
+        message = odometry(round(speed * step * SECOND), 0, velocity)
+        assert_allclose(decode(serialize_message(message), 0).event.body_velocity, velocity)
+    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    assert len(told) == is_told
+    assert all("all velocities on '/robot/twist' are zero" in text for text in told)
+    assert all("velocity_source to 'pose_differences'" in text for text in told)
+
+
+def test_a_velocity_without_poses_has_no_pose_differences():
+    settings = ObserverNodeSettings(velocity_source='pose_differences', velocity_type='Twist')
+    with pytest.raises(ParameterError, match="'Twist' has no poses"):
+        open_inputs(Mock(), settings, Mock())
 
 
 @pytest.mark.parametrize('is_seen', [False, True])

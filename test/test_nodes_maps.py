@@ -247,6 +247,12 @@ def test_an_initial_pose_beyond_what_the_parameter_allows_is_refused(x):
     assert_allclose(given.estimator.pose, np.eye(4), atol=1e-9)
 
 
+def test_an_initial_pose_may_have_a_frame_with_a_slash():
+    given = GivenPose()
+    given.give(se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0])), frame_id='/map')
+    assert_allclose(given.estimator.pose[0, 3], 3.0)
+
+
 def test_an_initial_pose_whose_covariance_is_none_is_refused():
     given = GivenPose()
     message = initial_pose(np.eye(4))
