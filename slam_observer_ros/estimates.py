@@ -21,7 +21,7 @@ def used_points(counts: Counter[str]) -> int:
     return counts['observed_point'] - sum(counts[name] for name in UNUSED_POINTS)
 
 
-MOST_REJECTED = 0.1
+MAX_REJECTED = 0.1
 """Share of the points beyond which they are more than a sensor's outliers."""
 
 

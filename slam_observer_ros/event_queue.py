@@ -25,7 +25,7 @@ RECENT = 1000
 More than inputs keep while the node is busy: those were received late, and tell of no delay.
 """
 
-LEAST_KNOWN = 1024
+MIN_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
 
 
@@ -65,7 +65,7 @@ class EventQueue:
         self._near_ns = max(self._reach_ns, NEAR_NS)
         self._heap: list[tuple[Key, Event]] = []
         self._known: set[Key] = set()
-        self._most_known = LEAST_KNOWN
+        self._most_known = MIN_KNOWN
         self._strays = 0
         self._stray_ns = 0
         # The newest stamp that is taken, believed or not; how far the believed one moved last.
@@ -138,7 +138,7 @@ class EventQueue:
         """Forget events so old that they would be refused as too late; O(1) for each event."""
         oldest_ns = (self.newest_ns or 0) - self._reach_ns
         self._known = {key for key in self._known if key[0] >= oldest_ns}
-        self._most_known = max(2 * len(self._known), LEAST_KNOWN)
+        self._most_known = max(2 * len(self._known), MIN_KNOWN)
 
     def _note_reception(self, event: Event) -> None:
         if event.receive_ns is not None:

@@ -11,7 +11,7 @@ from slam_observer_ros.types import IntArray
 
 logger = logging.getLogger(__name__)
 
-MOST_NAMED = 10
+MAX_NAMED = 10
 """Ids that a warning lists at most."""
 
 LOST_PLACES = {
@@ -40,8 +40,8 @@ class EventWarnings:
 
     def repeated_ids(self, ids: Sequence[int]) -> None:
         """Tell that an observation has several points of each of these ids."""
-        named = ', '.join(str(landmark_id) for landmark_id in ids[:MOST_NAMED])
-        more = ' and others' if len(ids) > MOST_NAMED else ''
+        named = ', '.join(str(landmark_id) for landmark_id in ids[:MAX_NAMED])
+        more = ' and others' if len(ids) > MAX_NAMED else ''
         text = f'Not used: an observation has several points of the ids {named}{more}'
         self._warn('repeated_id', text)
 

@@ -16,7 +16,7 @@ from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
 
-LARGEST_ID = 2**32 - 2
+MAX_ID = 2**32 - 2
 """Largest landmark id: those that go out are uint32, whose last one says that it is unknown."""
 
 FIRST_AUTOMATIC_ID = 10_000_000

@@ -14,7 +14,7 @@ RESOLUTION_M = 1e-6
 RELATIVE_RESOLUTION = 1e-6
 """The same as a share of the distance, for messages with points in single precision or better."""
 
-LEAST_SHARE = 1e-6
+MIN_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
 _TINY = np.finfo(np.float64).tiny
@@ -75,7 +75,7 @@ class ObservationNoise(Immutable):
 
 def _invertible(covariances: FloatArray) -> FloatArray:
     """Return covariances (m, 3, 3) of which no direction is known exactly, m²."""
-    least = RESOLUTION_M**2 + LEAST_SHARE * np.einsum('ijj->i', covariances)
+    least = RESOLUTION_M**2 + MIN_SHARE * np.einsum('ijj->i', covariances)
     invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
     return invertible
 

@@ -8,7 +8,7 @@ from slam_observer_ros.errors import InvalidEventError, MapError, ParameterError
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
-    LARGEST_ID,
+    MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,
     VelocityEvent,
@@ -23,10 +23,10 @@ ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 ROTATION_TOLERANCE = 1e-3
 """How far RᵀR of a pose may be from identity: much further than single precision puts it."""
 
-LARGEST_STAMP_NS = 2**63 - 1
+MAX_STAMP_NS = 2**63 - 1
 """What fits into the integers of numpy."""
 
-LARGEST = 1e6
+MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
 
 
@@ -47,7 +47,7 @@ def check_event(event: Event) -> None:
         raise InvalidEventError('wrong_type', reason)
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
-    if event.stamp_ns > LARGEST_STAMP_NS:
+    if event.stamp_ns > MAX_STAMP_NS:
         raise InvalidEventError('too_large', f'stamp {event.stamp_ns} ns is beyond 64 bits')
     if isinstance(event, VelocityEvent):
         _check_velocity(event.body_velocity, event.covariance, 6)
@@ -98,8 +98,8 @@ def check_map(landmark_map: LandmarkMap) -> None:
             _check_definite('map covariances', landmark_map.covariances)
     except InvalidEventError as error:
         raise MapError(str(error)) from error
-    if ids.dtype.kind not in 'iu' or np.any((ids < 0) | (ids > LARGEST_ID)):
-        raise MapError(f'map ids: integers from 0 to {LARGEST_ID} are wanted')
+    if ids.dtype.kind not in 'iu' or np.any((ids < 0) | (ids > MAX_ID)):
+        raise MapError(f'map ids: integers from 0 to {MAX_ID} are wanted')
     if np.any(landmark_map.counts < 0):
         raise MapError('map counts: one is negative')
     if len(np.unique(ids)) < n:
@@ -137,11 +137,11 @@ def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> 
     if isinstance(array, np.ndarray) and array.shape == shape and array.dtype.kind == 'f':
         # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
         entries = array.ravel()
-        if entries.dot(entries) <= LARGEST**2:
+        if entries.dot(entries) <= MAX_MEASURED**2:
             return
     _check_array(name, array, shape)
-    if np.abs(array).max(initial=0.0) > LARGEST:
-        raise InvalidEventError('too_large', f'an entry of the {name} is beyond {LARGEST:g}')
+    if np.abs(array).max(initial=0.0) > MAX_MEASURED:
+        raise InvalidEventError('too_large', f'an entry of the {name} is beyond {MAX_MEASURED:g}')
 
 
 def _check_array(name: str, array: FloatArray | IntArray, shape: tuple[int, ...]) -> None:

@@ -9,7 +9,7 @@ import pytest
 import ros_messages as ros
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.events import LARGEST_ID
+from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_detections,
@@ -79,12 +79,12 @@ def transform(parent, child, x, stamp_ns=5):
     return PoseMessage(stamp_ns, parent, child, np.array([x, 0.0, 0.0]), detector.NO_TURN)
 
 
-TOO_LARGE = [str(LARGEST_ID + 1), '20240501123', '9' * 19, '1' * 5000]
+TOO_LARGE = [str(MAX_ID + 1), '20240501123', '9' * 19, '1' * 5000]
 
 
 @pytest.mark.parametrize('number', TOO_LARGE)
 def test_an_id_that_could_not_be_published_is_refused(number):
-    reason = f'landmark id {number[:30]} is beyond {LARGEST_ID}'
+    reason = f'landmark id {number[:30]} is beyond {MAX_ID}'
     for item in (detector.detection(number), detector.detection('', f'reflector_{number}')):
         with pytest.raises(MessageError, match=reason):
             detections(item)
@@ -99,8 +99,8 @@ def test_a_frame_with_a_serial_number_is_no_fiducial():
 
 
 def test_the_largest_id_is_taken():
-    assert_array_equal(detections(detector.detection(f'000{LARGEST_ID}')).ids, [LARGEST_ID])
-    (seen,) = observed_tags([transform('camera', f'tag_{LARGEST_ID}', 1.0)], 'tag_')
+    assert_array_equal(detections(detector.detection(f'000{MAX_ID}')).ids, [MAX_ID])
+    (seen,) = observed_tags([transform('camera', f'tag_{MAX_ID}', 1.0)], 'tag_')
     layout = point_cloud2_layout(seen.event.ids, seen.event.points)
     assert layout.width == 1
 

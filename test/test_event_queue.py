@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.event_queue import CONFIRMATIONS, EventQueue, LEAST_KNOWN
+from slam_observer_ros.event_queue import CONFIRMATIONS, EventQueue, MIN_KNOWN
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 
 SECOND = 1_000_000_000
@@ -110,7 +110,7 @@ def test_keys_of_old_events_are_forgotten():
     for k in range(2000):
         queue.push(velocity(SECOND // 100 * k))
         queue.pop_ready()
-    assert len(queue._known) <= LEAST_KNOWN
+    assert len(queue._known) <= MIN_KNOWN
 
 
 @pytest.mark.parametrize(

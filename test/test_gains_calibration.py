@@ -17,7 +17,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.motion.calibration import Calibration, LEAST_DELAY_S
+from slam_observer_ros.motion.calibration import Calibration, MIN_DELAY_S
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
 
@@ -150,7 +150,7 @@ def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
 
 def test_a_delay_stays_within_what_is_made_up_for():
     calibration = Calibration(Settings(velocity_delay_error=0.1), PLANAR)
-    for change_s, limit_s in ((-5.0, LEAST_DELAY_S), (10.0, MAX_DELAY_S)):
+    for change_s, limit_s in ((-5.0, MIN_DELAY_S), (10.0, MAX_DELAY_S)):
         calibration.shift(np.array([change_s]))
         assert calibration.delay_ns == round(limit_s * 1e9)
 

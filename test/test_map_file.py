@@ -14,7 +14,7 @@ import yaml
 
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError, SlamObserverError
-from slam_observer_ros.events import LARGEST_ID
+from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import check_writable, read_map, write_map
 from slam_observer_ros.settings import Settings
@@ -33,7 +33,7 @@ def a_map(n=5, seed=0):
     noise = np.random.default_rng(seed)
     roots = noise.normal(scale=0.1, size=(n, 3, 3))
     return LandmarkMap(
-        noise.choice(LARGEST_ID + 1, n, replace=False),
+        noise.choice(MAX_ID + 1, n, replace=False),
         noise.normal(scale=1e3, size=(n, 3)),
         roots @ roots.swapaxes(1, 2),
         noise.integers(0, 10**6, n),

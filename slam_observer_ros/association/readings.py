@@ -35,7 +35,7 @@ SLIP_COST = 20.0
 SAME_CAUSE_COST = 3.0
 """What it costs to reject another point for the reason for which one was rejected already."""
 
-MOST_OF_ONE_CAUSE = 3
+MAX_OF_ONE_CAUSE = 3
 """Points that cost this, at most: one garbled message is one, however much it tells."""
 
 
@@ -128,7 +128,7 @@ def may_name(slam: Slam, event: ObservationEvent) -> bool:
 def _rejected_or_slipped(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
     """Return the readings of an observation all of whose known landmarks are rejected."""
     m, rejected, causes = len(event.ids), len(sighting.residuals.rows), _causes(slam, sighting)
-    more = min(rejected - causes, MOST_OF_ONE_CAUSE)
+    more = min(rejected - causes, MAX_OF_ONE_CAUSE)
     each = unpaired_cost(slam.settings.rejection_distance)
     as_rejected = Reading(event, (m - rejected + causes) * each + more * SAME_CAUSE_COST)
     return [as_rejected, *(_after_slip(slam, sighting, event) if causes else ())]

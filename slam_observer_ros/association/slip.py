@@ -14,16 +14,16 @@ from slam_observer_ros.slam.sighting import Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
 
-LONGEST_S = 4.0
+MAX_DURATION_S = 4.0
 """Time, seconds, for which odometry is taken to have told nothing, at most."""
 
 LARGE_TURN_RAD = 0.3
 """Turn, radians, that a correction, which is linear in it, does not find well."""
 
-LEAST_SPREAD = 10.0
+MIN_SPREAD = 10.0
 """Least extent of landmarks, in standard deviations, that tells how the robot has turned."""
 
-LEAST_VARIANCE_M2 = 1e-6
+MIN_VARIANCE_M2 = 1e-6
 """Variance, m², at least, of where a robot without odometry sees what it does after a second."""
 
 
@@ -36,7 +36,7 @@ def slip(slam: Slam, sighting: Sighting) -> None:
     observer, start = slam.observer, slam.observer.A
     needed_s = _duration_s(slam, sighting)
     observer.propagate(np.array([start, _pose_after(slam, sighting)]))
-    stray = HeldVelocities.unknown(np.array([0.0, min(needed_s, LONGEST_S)]))
+    stray = HeldVelocities.unknown(np.array([0.0, min(needed_s, MAX_DURATION_S)]))
     moved = Motion(
         path=np.array([start, observer.A, observer.A]),
         measured_velocities=stray.body_velocities,
@@ -55,7 +55,7 @@ def _duration_s(slam: Slam, sighting: Sighting) -> float:
     points = sighting.event.points[sighting.known]
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
-    needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, LEAST_VARIANCE_M2)
+    needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE_M2)
     return float(np.mean(needed_s))
 
 
@@ -70,11 +70,11 @@ def _pose_after(slam: Slam, sighting: Sighting) -> FloatArray:
     weights = 1.0 / np.trace(residuals.covariances, axis1=1, axis2=2)
     offsets = landmarks - np.average(landmarks, axis=0, weights=weights)
     spreads = np.linalg.svd(np.sqrt(weights)[:, None] * offsets, compute_uv=False)
-    if len(rows) < k or spreads[k - 2] < LEAST_SPREAD:
+    if len(rows) < k or spreads[k - 2] < MIN_SPREAD:
         return A
     seen = se3.transform(A, sighting.event.points[sighting.known])
     found = rigid_alignment(seen, landmarks, weights) @ A
     turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
     shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
-    reach_m = slam.settings.unknown_linear_motion * math.sqrt(LONGEST_S)
+    reach_m = slam.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)
     return found if turn_rad > LARGE_TURN_RAD or shift_m > reach_m else A

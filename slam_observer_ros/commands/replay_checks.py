@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.commands.replay_outcome import unused_messages
-from slam_observer_ros.estimates import MOST_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.maps.landmark_map import LandmarkMap
@@ -20,7 +20,7 @@ from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.replay import Replay
 
-MOST_UNMAPPED = 0.5
+MAX_UNMAPPED = 0.5
 """Share of the points beyond which they are more than what a map lacks."""
 
 logger = logging.getLogger(__name__)
@@ -150,7 +150,7 @@ def _warn_of_missing_stamps(recording: Recording) -> None:
 def _warn_of_rejections(result: Replay) -> None:
     """Say what may be wrong if more points were rejected than a sensor has outliers."""
     share = point_share(result.estimator.counts, 'rejected_landmark')
-    if share > MOST_REJECTED:
+    if share > MAX_REJECTED:
         logger.warning(
             '%.0f %% of the points were rejected: look at the signs, units and frames of the '
             'velocity and of the points, then at their noise%s.',
@@ -164,7 +164,7 @@ def _warn_of_unmapped(result: Replay) -> None:
     settings = result.estimator.settings
     share = point_share(result.estimator.counts, 'unmapped_landmark')
     is_growing = not result.in_known_map or settings.localization_mode == 'off'
-    if share > MOST_UNMAPPED and not is_growing:
+    if share > MAX_UNMAPPED and not is_growing:
         logger.warning(
             '%.0f %% of the points are of no landmark of the map: is it the map of this place%s?',
             100.0 * share,

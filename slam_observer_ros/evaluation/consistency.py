@@ -13,7 +13,7 @@ from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_s
 
-MOST_OF_ANCHOR = 0.1
+MAX_SHARE_OF_ANCHOR = 0.1
 """ANEES that the anchor's own error may make up at most; 1 is what all errors together have."""
 
 _SINGULAR = 1e-12
@@ -143,7 +143,7 @@ def anchored_average_nees(
     paired, true_paired, covered = associate(estimate, truth)
     if len(paired) == 0:
         return None
-    if _nees_of_anchor(paired, covariances[covered]) > MOST_OF_ANCHOR:
+    if _nees_of_anchor(paired, covariances[covered]) > MAX_SHARE_OF_ANCHOR:
         late_s = to_s(paired.stamps_ns[0] - estimate.stamps_ns[0])
         raise EvaluationError(
             f'the truth begins {late_s:.1f} s after the estimate, when the pose is uncertain '

@@ -29,7 +29,7 @@ from slam_observer_ros.events import is_automatic, LandmarkTruth
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray, IntArray
 
-_MOST_LABELS = 80
+_MAX_LABELS = 80
 """Maps with more landmarks than this are drawn without ids, which would cover each other."""
 
 _LABEL_RIGHT_PT, _LABEL_UP_PT = 8.0, 12.0
@@ -103,7 +103,7 @@ def plot_map(
         axes.set(xlim=(low[0], high[0]), ylim=(low[up], high[up]), aspect='equal')
         axes.set_ylabel(f'{"xyz"[up]} [m]')
     named = ~is_automatic(ids)
-    if np.sum(named) <= _MOST_LABELS:
+    if np.sum(named) <= _MAX_LABELS:
         _label_landmarks(panels[0], ids[named], world_points[named], landmark_truth)
     aligned = '' if truth is None else ' after rigid alignment'
     panels[0].set_title(f'Trajectory and map{aligned}')

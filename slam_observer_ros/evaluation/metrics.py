@@ -15,7 +15,7 @@ from slam_observer_ros.matrices import transpose
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_s
 
-LEAST_POSES = 3
+MIN_POSES = 3
 """Fewer positions can be aligned without an error left."""
 
 
@@ -95,10 +95,10 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
 
     """
     paired, true_paired, covered = associate(estimate, truth)
-    if len(paired) < LEAST_POSES:
+    if len(paired) < MIN_POSES:
         raise EvaluationError(
             f'{len(paired)} of its {len(estimate)} poses are at times that the truth covers, '
-            f'where true poses are no more than {to_s(MAX_GAP_NS)} s apart; it takes {LEAST_POSES}'
+            f'where true poses are no more than {to_s(MAX_GAP_NS)} s apart; it takes {MIN_POSES}'
         )
     alignment = align(paired.positions, true_paired.positions)
     aligned = paired.moved(alignment)

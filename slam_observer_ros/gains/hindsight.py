@@ -33,20 +33,20 @@ from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
 
-GROWTH = 0.1
-"""Share of all observations so far that are looked back at at least, but no more than ``MANY``.
+SHARE_OF_HISTORY = 0.1
+"""Share of all observations so far that are looked back at at least, up to ``MAX_INTERVAL``.
 
 As large maps take many observations, the O(n³) that looking back costs for n landmarks is shared
 by so many that each of them costs no more than an update, O(n²).
 """
 
-MANY = 300
+MAX_INTERVAL = 300
 """Observations that are enough to be looked back at, however many there were before."""
 
-MOST_BENT_RAD = 0.2
+MAX_BEND_RAD = 0.2
 """Angle by which a summary may yet be bent, see :meth:`.Prior.least_bent`; else there is none."""
 
-HURRY = 0.1
+EARLY_SHARE = 0.1
 """Share of the observations otherwise waited for that will do after a single large correction:
 what is linearised before the next time of looking back is linearised in the wrong place.
 """
@@ -116,9 +116,9 @@ class Hindsight:
         if self._is_owed:
             return True
         settings = self.settings
-        least = max(settings.hindsight_interval, min(GROWTH * self._seen, MANY))
+        least = max(settings.hindsight_interval, min(SHARE_OF_HISTORY * self._seen, MAX_INTERVAL))
         if 0.0 < settings.hindsight_turn < self._largest_turn:
-            least *= HURRY
+            least *= EARLY_SHARE
         turned_far = self._turn_squared > settings.hindsight_turn**2
         return turned_far and self._observations >= least
 
@@ -148,7 +148,7 @@ class Hindsight:
         known, angle_rad = self._known(observer).least_bent(self._axes)
         if self._window_is_full:
             self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
-        elif is_done and angle_rad < MOST_BENT_RAD:
+        elif is_done and angle_rad < MAX_BEND_RAD:
             self.history.summarise(known)
 
     def smooth(self, observer: Observer) -> Solution:

@@ -33,7 +33,7 @@ Measured: TypeAlias = _InFrame | PoseMessage
 DropError: TypeAlias = TransformError | InvalidEventError
 """Why a measurement makes no event."""
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ class EventBuilder:
         except TransformError:
             return True
         del self._taken_as_base[frame_id]
-        _logger.info(
+        logger.info(
             "Velocities in frame '%s' are brought into '%s' from now on: its transform is known.",
             frame_id,
             self._base_frame.name,
@@ -203,7 +203,7 @@ class EventBuilder:
             self._on_drop(error)
             return None
         self._taken_as_base[measured.frame_id] = item.deadline_ns, measured
-        _logger.warning(
+        logger.warning(
             "Velocities in frame '%s' are taken to be those of '%s' until their transform is "
             'known: %s',
             measured.frame_id,

@@ -17,7 +17,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 HISTORY_NS = 10_000_000_000
 """How far back transforms are kept, nanoseconds; tf2's default."""
@@ -95,7 +95,7 @@ class TransformBuffer:
         """Tell, once for each frame, why a transform is not used."""
         if child not in self._refused:
             self._refused.add(child)
-            _logger.warning("A transform on /tf of frame '%s' is not used: %s.", child, reason)
+            logger.warning("A transform on /tf of frame '%s' is not used: %s.", child, reason)
 
     def clear(self) -> None:
         """Forget what has a time, as after a jump of the clock; static transforms stay."""

@@ -13,10 +13,10 @@ from slam_observer_ros.units import to_s
 POSE_JUMP = 'pose_jump'
 """Reason under which a difference of poses is dropped that no robot can have moved by."""
 
-LARGEST_SPEED = 50.0
+MAX_SPEED = 50.0
 """Beyond this, rad/s or m/s, it was not the robot that moved: its odometry was reset."""
 
-LEAST_JUMP = 0.1
+MIN_JUMP = 0.1
 """Rad or m up to which two poses may differ in any time: a stamp may be off."""
 
 
@@ -58,7 +58,7 @@ class PoseDifferences:
 
 def _check_plausible(motion: FloatArray, duration_s: float) -> None:
     turn, way = np.linalg.norm(motion.reshape(2, 3), axis=1).tolist()
-    if max(turn, way) > max(LARGEST_SPEED * duration_s, LEAST_JUMP):
+    if max(turn, way) > max(MAX_SPEED * duration_s, MIN_JUMP):
         raise InvalidEventError(
             POSE_JUMP,
             f"the odometry's pose has jumped, by {way:.2f} m and {turn:.2f} rad in "

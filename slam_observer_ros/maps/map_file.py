@@ -28,7 +28,7 @@ import yaml
 
 from slam_observer_ros import __version__
 from slam_observer_ros.errors import MapError
-from slam_observer_ros.events import LARGEST_ID
+from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
@@ -39,7 +39,7 @@ FORMAT_VERSION = 1
 
 _MAX_INT64 = 2**63 - 1
 
-_LARGEST = 1e12
+_MAX_NUMBER = 1e12
 """Metres; nothing larger is meant seriously, and its square still has all digits."""
 
 _ROUNDING = 1e-6
@@ -191,7 +191,7 @@ def _landmark_id(row: Any, place: int) -> int:
     _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
     _check_names(who, row, ('id', 'position'), ('sigma', 'covariance', 'observations'))
     landmark_id = _natural(row['id'], f"{who}: 'id'")
-    _expect(landmark_id <= LARGEST_ID, f"{who}: 'id' is {landmark_id}, beyond {LARGEST_ID}")
+    _expect(landmark_id <= MAX_ID, f"{who}: 'id' is {landmark_id}, beyond {MAX_ID}")
     return landmark_id
 
 
@@ -254,7 +254,7 @@ def _numbers(value: Any, count: int, what: str) -> list[float]:
     for entry in value:
         is_number = isinstance(entry, int | float) and not isinstance(entry, bool)
         # Written so that NaN is refused too.
-        _expect(is_number and abs(entry) <= _LARGEST, f'{what} has {entry!r}, no finite number')
+        _expect(is_number and abs(entry) <= _MAX_NUMBER, f'{what} has {entry!r}, no finite number')
     return [float(entry) for entry in value]
 
 

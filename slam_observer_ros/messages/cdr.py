@@ -15,7 +15,7 @@ Buffer: TypeAlias = bytes | bytearray | memoryview
 """One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""
 
 ENCAPSULATION_BYTES = 4
-MAXIMUM_PADDING_BYTES = 3
+MAX_PADDING_BYTES = 3
 
 _UINT32 = {'<': struct.Struct('<I'), '>': struct.Struct('>I')}
 _STAMP = {'<': struct.Struct('<iI'), '>': struct.Struct('>iI')}
@@ -124,5 +124,5 @@ class CdrReader:
 
         """
         left = len(self._raw) - self._position
-        if left > MAXIMUM_PADDING_BYTES:
+        if left > MAX_PADDING_BYTES:
             raise MessageError(f'{left} bytes too long: is it of another type?')

@@ -13,7 +13,7 @@ import re
 import numpy as np
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.events import LARGEST_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.point_clouds import measured, ObservationMessage
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
@@ -24,7 +24,7 @@ _COVARIANCE = 36
 _SIZE = 3
 _CORNERS = 10
 _HOMOGRAPHY = 9
-MOST_NAMES = 12
+MAX_NAMES = 12
 """Names of frames that a message lists."""
 
 _TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
@@ -113,7 +113,7 @@ def observed_tags(
     Raises
     ------
     MessageError
-        If an id is beyond ``LARGEST_ID``.
+        If an id is beyond ``MAX_ID``.
 
     """
     # Other things have names with a colon, too, and longer numbers than a family has tags.
@@ -133,7 +133,7 @@ def observed_tags(
 def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
     """Say that none of the frames on /tf is that of a fiducial, and what to do."""
     names = sorted(frames)
-    there = ', '.join(names[:MOST_NAMES]) + (', …' if len(names) > MOST_NAMES else '')
+    there = ', '.join(names[:MAX_NAMES]) + (', …' if len(names) > MAX_NAMES else '')
     return (
         f"no frame on /tf is named '{tag_frame_prefix}<id>' or '<family>:<id>' "
         f'(there are {there}): set tag_frame_prefix'
@@ -143,8 +143,8 @@ def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
 def _landmark_id(digits: str) -> int:
     significant = digits.lstrip('0') or '0'
     # Python converts no number of thousands of digits.
-    if len(significant) > len(str(LARGEST_ID)) or int(significant) > LARGEST_ID:
-        raise MessageError(f'landmark id {significant[:30]} is beyond {LARGEST_ID}')
+    if len(significant) > len(str(MAX_ID)) or int(significant) > MAX_ID:
+        raise MessageError(f'landmark id {significant[:30]} is beyond {MAX_ID}')
     return int(significant)
 
 

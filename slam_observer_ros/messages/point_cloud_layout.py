@@ -11,7 +11,7 @@ import struct
 import numpy as np
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.events import LARGEST_ID, UNKNOWN_ID
+from slam_observer_ros.events import MAX_ID, UNKNOWN_ID
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
@@ -20,7 +20,7 @@ POINT_NAMES = ('x', 'y', 'z')
 COVARIANCE_NAMES = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
 VELOCITY_NAMES = ('vx', 'vy', 'vz')
 
-UNKNOWN_UINT32_ID = LARGEST_ID + 1
+UNKNOWN_UINT32_ID = MAX_ID + 1
 """How an unknown id is written where ids are uint32: the same bits as -1."""
 
 FLOAT32_ID_LIMIT = 2**24
@@ -102,7 +102,7 @@ def point_cloud2_layout(
         If an id doesn't fit into a uint32.
 
     """
-    if np.any((ids < UNKNOWN_ID) | (ids > LARGEST_ID)):
+    if np.any((ids < UNKNOWN_ID) | (ids > MAX_ID)):
         raise MessageError('landmark ids must lie between 0 and 2³² - 2, or be -1 for unknown')
     columns: dict[str, FloatArray] = dict(zip(POINT_NAMES, points.T, strict=True))
     if covariances is not None:

@@ -24,7 +24,7 @@ NAMES = (
 
 DELAY = NAMES.index('velocity_delay')
 
-LEAST_DELAY_S = -0.2
+MIN_DELAY_S = -0.2
 """An odometry's velocity, averaged over the time before its stamp, shows in observations before
 that. How the robot moves so much later is not known yet when it is needed: without a limit the
 estimate, which can't make up for it, would stray ever further.
@@ -90,7 +90,7 @@ class Calibration:
     def delay_ns(self) -> int:
         """Delay τ, nanoseconds; where it is negative the latest velocity is held for longer.
 
-        From ``LEAST_DELAY_S`` to ``MAX_DELAY_S``.
+        From ``MIN_DELAY_S`` to ``MAX_DELAY_S``.
         """
         return to_ns(float(self._all[DELAY]))
 
@@ -118,4 +118,4 @@ class Calibration:
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
         self._all[self._estimated] += change
-        self._all[DELAY] = min(max(self._all[DELAY], LEAST_DELAY_S), MAX_DELAY_S)
+        self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)

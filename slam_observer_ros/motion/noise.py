@@ -8,7 +8,7 @@ from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, Immutable
 
-LARGEST_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
+MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
 """Standard deviations of a velocity (Ω, v), rad/s and m/s, beyond which a message only says
 'unknown': no robot turns or moves as fast.
 """
@@ -62,7 +62,7 @@ class MotionNoise(Immutable):
         if held.is_stated.any():
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
             grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
-            stated = limited(held.covariances, LARGEST_SPEED_ERRORS)
+            stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
 

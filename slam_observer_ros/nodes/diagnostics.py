@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from slam_observer_ros.estimates import MOST_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
@@ -22,7 +22,7 @@ SILENT_S = 2.0
 RECENT = 30
 """Statuses, of about a second each, over which rejected points are looked at."""
 
-FEWEST_POINTS = 50
+MIN_POINTS = 50
 """Points that it takes to tell how large a share of them is rejected."""
 
 LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id')
@@ -144,7 +144,7 @@ class Diagnostics:
         self._recent_counts.append(new)
         recent = sum(self._recent_counts, Counter())
         share = point_share(recent, 'rejected_landmark')
-        if recent['observed_point'] < FEWEST_POINTS or share <= MOST_REJECTED:
+        if recent['observed_point'] < MIN_POINTS or share <= MAX_REJECTED:
             return ''
         return f'{100.0 * share:.0f} % of the points seen lately were rejected'
 

@@ -23,10 +23,10 @@ from slam_observer_ros.types import FloatArray
 
 TOPICS = ('initialpose', '~/set_pose')
 
-LARGEST_ERRORS = np.repeat([np.pi, 1e4], 3)
+MAX_ERRORS = np.repeat([np.pi, 1e4], 3)
 """Standard deviations of a pose, rad and m, beyond which a message only says 'unknown'."""
 
-_LARGEST_M = next(row.maximum for row in table(Settings) if row.name == 'initial_position')
+_MAX_POSITION_M = next(row.maximum for row in table(Settings) if row.name == 'initial_position')
 
 
 class InitialPose:
@@ -76,8 +76,8 @@ class InitialPose:
             raise MessageError(f"it is in frame '{message.frame_id}', not '{self._map_frame}'")
         if not np.isfinite(message.position).all():
             raise MessageError('its position has a NaN or infinite entry')
-        if np.abs(message.position).max() > _LARGEST_M:
-            raise MessageError(f'its position has an entry beyond {_LARGEST_M:g} m')
+        if np.abs(message.position).max() > _MAX_POSITION_M:
+            raise MessageError(f'its position has an entry beyond {_MAX_POSITION_M:g} m')
 
 
 def filled_in(covariance: FloatArray | None) -> FloatArray:
@@ -94,7 +94,7 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
     """
     given = np.zeros((6, 6)) if covariance is None else covariance
     if np.isfinite(given).all():
-        given = limited(given, LARGEST_ERRORS)
+        given = limited(given, MAX_ERRORS)
     rounding = 1e-9 + 1e-12 * np.trace(given)
     if not (np.isfinite(given).all() and np.linalg.eigvalsh(given).min() > -rounding):
         raise MessageError('its covariance is not finite, or negative in some direction')

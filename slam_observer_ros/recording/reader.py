@@ -51,7 +51,7 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')
 
 
@@ -276,7 +276,7 @@ class Recording:
             return decode(raw)
         except MessageError as error:
             if raw.topic.name not in self.malformed:
-                _logger.warning('%s: malformed message on %s: %s', self.path, raw.topic, error)
+                logger.warning('%s: malformed message on %s: %s', self.path, raw.topic, error)
             self.malformed[raw.topic.name] += 1
             return None
 
@@ -317,5 +317,5 @@ class Recording:
     def _drop(self, error: DropError) -> None:
         reason = drop_reason(error)
         if not self.dropped[reason]:
-            _logger.warning('Dropped a message (%s): %s', reason, error)
+            logger.warning('Dropped a message (%s): %s', reason, error)
         self.dropped[reason] += 1

@@ -28,7 +28,7 @@ TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
 ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
 """Landmarks that an observer publishes, and does not measure."""
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:
         topic for topic in topics if _is_truth(topic.name) and topic.message_type not in read
     ]
     if unread:
-        _logger.warning(
+        logger.warning(
             'Named like ground truth, but not of a type that true poses are read of (%s): %s.',
             _join(_POSE_TRUTH.message_types),
             _join(unread),

@@ -10,7 +10,7 @@ from os.path import commonpath
 from slam_observer_ros.messages.message_types import TRANSFORMS
 from slam_observer_ros.recording.sources import last_part, Topic
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
     if not fitting and len({_namespace(tree) for tree in trees}) == 1:
         fitting = trees
     if trees and not fitting:
-        _logger.warning(
+        logger.warning(
             'No transforms are used: those on %s are of several robots, and none of them is in '
             'the namespace that %s share.',
             ', '.join(tree.name for tree in trees),

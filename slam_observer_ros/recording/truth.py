@@ -18,7 +18,7 @@ from slam_observer_ros.messages.point_clouds import ObservationMessage
 from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
 from slam_observer_ros.types import FloatArray, IntArray
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 _AT_BASE = np.eye(4)
 
@@ -161,7 +161,7 @@ def base_in_frames(
         try:
             base_in[frame] = transforms.lookup(frame, base_frame, 0)
         except TransformError as error:
-            _logger.warning(
+            logger.warning(
                 "The true poses are of '%s', and the estimated ones of '%s': they are compared "
                 'as if that were one place (%s).',
                 frame,

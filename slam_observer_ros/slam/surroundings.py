@@ -15,12 +15,12 @@ from slam_observer_ros.types import BoolArray
 IMPROBABLE = 20.0
 """−ln of the probability below which it is no chance that none of several landmarks is seen."""
 
-LEAST_SHARE, MOST_SHARE = 0.1, 0.9
+MIN_SHARE, MOST_SHARE = 0.1, 0.9
 """How often a landmark in view is seen at least, as in a map that was loaded, and at most: one
 that was seen each time may yet be hidden.
 """
 
-MOST_SURPRISING = 2.0
+MAX_SURPRISE = 2.0
 """Surprise of one observation at most: what hides a landmark hides others, and for some time."""
 
 
@@ -80,9 +80,9 @@ class Surroundings:
         if (old & seen).any():
             self._surprise = 0.0
         elif len(event.points) and self._field_of_view.is_known:
-            share = min(max(landmarks.seen_share, LEAST_SHARE), MOST_SHARE)
+            share = min(max(landmarks.seen_share, MIN_SHARE), MOST_SHARE)
             surprise = -math.log1p(-share) * int(np.sum(old))
-            self._surprise += min(surprise, MOST_SURPRISING)
+            self._surprise += min(surprise, MAX_SURPRISE)
         is_strange = self._surprise > IMPROBABLE
         if is_strange or self._surprise == 0.0:
             self._surprise = 0.0
