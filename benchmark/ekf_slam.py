@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import numpy as np
 from odometry import Event, Odometry
+from sightings import SightingNoise
 
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.gains.robust import observation_weights
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.matrices import block_diagonal
-from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -39,7 +39,7 @@ class EkfSlam:
     def __init__(self, settings: Settings, initial_pose: FloatArray | None = None) -> None:
         self._settings = settings
         self._odometry = Odometry(settings)
-        self._noise = ObservationNoise(settings)
+        self._noise = SightingNoise(settings)
         axes = PLANAR if settings.two_d_mode else SPATIAL
         self._pose_axes, self._k = axes.pose, axes.point
         self._pose = np.eye(4) if initial_pose is None else initial_pose
@@ -85,9 +85,10 @@ class EkfSlam:
             return
         self._predict(event.stamp_ns)
         known = np.array([landmark_id in self._rows for landmark_id in event.ids.tolist()])
-        covariances = self._noise.covariances(event)
+        covariances, factors = self._noise.add(event)
         if known.any():
-            self._update(event.ids[known], event.points[known], covariances[known])
+            seen = event.select(known)
+            self._update(seen.ids, seen.points, covariances[known], factors[known])
         if not known.all():
             self._initialise(event.ids[~known], event.points[~known], covariances[~known])
 
@@ -105,7 +106,9 @@ class EkfSlam:
         self._P[:, :d] = self._P[:, :d] @ F.T
         self._P[:d, :d] += Q
 
-    def _update(self, ids: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+    def _update(
+        self, ids: IntArray, points: FloatArray, covariances: FloatArray, factors: FloatArray
+    ) -> None:
         k, R = self._k, self._pose[:3, :3]
         rows = np.array([self._rows[landmark_id] for landmark_id in ids.tolist()])
         predicted = se3.transform(se3.inverse(self._pose), self._points[rows])
@@ -116,7 +119,8 @@ class EkfSlam:
         weights = observation_weights(z, HPH, noise, self._settings)
         used = weights > 0.0
         every = np.repeat(used, k)
-        S = HPH[np.ix_(every, every)] + block_diagonal(noise[used] / weights[used, None, None])
+        share = weights[used] / factors[used]
+        S = HPH[np.ix_(every, every)] + block_diagonal(noise[used] / share[:, None, None])
         H = H[every]
         K = np.linalg.solve(S, H @ self._P).T
         error = K @ z[used].ravel()

@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 from odometry import Event, Odometry
+from sightings import SightingNoise
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
 
@@ -198,7 +198,7 @@ class FrameBuilder:
         kind = PlanarFactors if settings.two_d_mode else SpatialFactors
         self.kind: Factors = kind(settings.huber_threshold)
         self._odometry = Odometry(settings)
-        self._noise = ObservationNoise(settings)
+        self._noise = SightingNoise(settings)
         self._count = 0
 
     def move(self, event: VelocityEvent) -> None:
@@ -218,7 +218,8 @@ class FrameBuilder:
             covariance = covariance + 1e-12 * np.eye(6)
             factors.add(self.kind.between(key, motion, covariance))
         landmarks = [gtsam.symbol('l', landmark_id) for landmark_id in event.ids.tolist()]
-        covariances = self._noise.covariances(event)
+        own, larger = self._noise.add(event)
+        covariances = own * larger[:, None, None]
         for landmark, point, noise in zip(landmarks, event.points, covariances, strict=True):
             factors.add(self.kind.sighting(key, landmark, point, noise))
         return Frame(key, self.kind.pose(motion), factors, landmarks)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ekf_slam import EkfSlam
 from estimators import EKF, observer
 import numpy as np
-from worlds import drive, Loop, shipped_settings, without_calibration, World
+from worlds import drive, Loop, simulated_settings, without_calibration, World
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import (
@@ -74,7 +74,7 @@ def run_once(loop_name: str, estimator_name: str, seed: int) -> FloatArray:
     nor bias, and nobody estimates them, so that all estimators are judged by the same model.
     """
     loop = LOOPS[loop_name]
-    settings = without_calibration(shipped_settings(loop.config))
+    settings = without_calibration(simulated_settings(loop.config))
     world = drive(loop, settings, seed)
     estimator = EkfSlam(settings) if estimator_name == EKF else observer('riccati')(settings)
     due_ns = list(np.rint(checkpoints_s(loop) * 1e9))
@@ -90,7 +90,7 @@ def run_once(loop_name: str, estimator_name: str, seed: int) -> FloatArray:
 def summarise(loop_name: str, nees: FloatArray) -> Consistency:
     """Average the NEES (runs, c, 2) of all runs."""
     loop = LOOPS[loop_name]
-    degrees_of_freedom = 3 if shipped_settings(loop.config).two_d_mode else 6
+    degrees_of_freedom = 3 if simulated_settings(loop.config).two_d_mode else 6
     mean = nees.mean(axis=0)
     band = average_nees_band(degrees_of_freedom, len(nees))
     starts = range(0, len(nees), BATCH) if len(nees) > BATCH else ()

@@ -127,6 +127,11 @@ def shipped_settings(config: str) -> Settings:
     return replace(from_parameters(Settings, values), reorder_window=0.0)
 
 
+def simulated_settings(config: str) -> Settings:
+    """Return the same for a simulated sensor, whose errors are new in each observation."""
+    return replace(shipped_settings(config), observation_error_time=0.0)
+
+
 def without_calibration(settings: Settings) -> Settings:
     """Return settings that estimate neither scale, bias nor delay of the velocity."""
     zero = (0.0, 0.0, 0.0)
@@ -195,7 +200,7 @@ def drive(loop: Loop, settings: Settings, seed: int) -> World:
 
 
 def _drive_shipped(loop: Loop) -> World:
-    return drive(loop, shipped_settings(loop.config), seed=0)
+    return drive(loop, simulated_settings(loop.config), seed=0)
 
 
 def _recorded(data_set: DataSet, settings: Settings) -> World:

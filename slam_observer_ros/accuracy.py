@@ -39,6 +39,9 @@ class Accuracy:
         Of the pose, per degree of freedom; None where the gains know no covariance, too, and
         where no pose is certain to which the truth could be moved: in a known map, or if the
         truth begins too late.
+    configuration_anees : float or None
+        Of the map as the robot sees it, jointly, per degree of freedom: it needs no pose that is
+        certain. None where the gains know no joint covariance.
 
     """
 
@@ -47,6 +50,7 @@ class Accuracy:
     landmark_rmse_m: float | None
     configuration_rmse_m: float | None
     anees: float | None
+    configuration_anees: float | None
 
 
 def measure(result: Replay, truth: Truth) -> Accuracy:
@@ -58,6 +62,7 @@ def measure(result: Replay, truth: Truth) -> Accuracy:
         _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
         result.configuration.rmse_m,
         _anees(result, pose_truth),
+        result.configuration.anees,
     )
 
 

@@ -371,6 +371,15 @@ class Estimator:
         return None if covariances is None else covariances[self._slam.confirmed]
 
     @property
+    def configuration_covariance(self) -> FloatArray | None:
+        """(n k, n k) joint covariance of the landmarks as seen from the robot, body frame, m².
+
+        It is that of the latest observation. k is 2 in ``two_d_mode``, else 3; None where the
+        gains know none.
+        """
+        return self._slam.configuration_covariance(self._slam.confirmed)
+
+    @property
     def landmark_velocities(self) -> FloatArray:
         """(n, 3) velocities of landmarks that move, known or estimated, m/s, world."""
         observer = self._slam.observer

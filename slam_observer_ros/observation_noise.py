@@ -17,6 +17,9 @@ RELATIVE_RESOLUTION = 1e-6
 MIN_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
+MIN_INTERVAL_S = 1e-3
+"""Observations that are less apart count as so far apart, seconds: two cameras may see at once."""
+
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 
@@ -29,10 +32,16 @@ class ObservationNoise(Immutable):
     settings : Settings
         ``observation_model`` and the figures that belong to it.
 
+    Attributes
+    ----------
+    error_time_s : float
+        Correlation time of the errors, see :func:`lasting`.
+
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        self.error_time_s = settings.observation_error_time
 
     def covariances(self, event: ObservationEvent, sights: FloatArray | None = None) -> FloatArray:
         """Return what an observation's points may be off by: (m, 3, 3), body frame, m².
@@ -71,6 +80,28 @@ class ObservationNoise(Immutable):
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2
         return _invertible(_along_and_across(sights, range_squared, along, across))
+
+
+def lasting(dt_s: FloatArray, error_time_s: float) -> FloatArray | float:
+    """Return by how much less observations (m,) tell if their errors last.
+
+    An error with the correlation time τ is ρ = e^(−dt/τ) times what it was ``dt_s`` before, and
+    noise beside. n observations of one thing then weigh as much as one, and n − 1 whose variance
+    is (1 + ρ)/(1 − ρ) times as large: exactly so if they come at a steady rate.
+
+    Parameters
+    ----------
+    dt_s : FloatArray
+        (m,) seconds since each landmark was seen before; infinite if it was not.
+    error_time_s : float
+        τ, seconds; with 0 all errors are new.
+
+    """
+    if error_time_s == 0.0:
+        return 1.0
+    new = -np.expm1(-np.maximum(dt_s, MIN_INTERVAL_S) / error_time_s)  # 1 − ρ
+    factors: FloatArray = (2.0 - new) / new
+    return factors
 
 
 def _invertible(covariances: FloatArray) -> FloatArray:

@@ -26,6 +26,9 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_s
 
+NEES_PERIOD_NS = 5_000_000_000
+"""Time between two covariances of the configuration, nanoseconds: they cost O(n³)."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
@@ -144,6 +147,7 @@ class _Run:
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None
+        self._next_nees_ns = 0
 
     def add(self, event: Event) -> None:
         self._events += 1
@@ -225,4 +229,11 @@ class _Run:
                 self._estimator.world_points,
                 true_poses[0],
                 self._landmark_tracks.at(update.stamp_ns),
+                self._covariance_if_due(update.stamp_ns),
             )
+
+    def _covariance_if_due(self, stamp_ns: int) -> FloatArray | None:
+        if stamp_ns < self._next_nees_ns:
+            return None
+        self._next_nees_ns = stamp_ns + NEES_PERIOD_NS
+        return self._estimator.configuration_covariance

@@ -149,6 +149,14 @@ class Settings(Immutable):
     disparity_noise: float = parameter(
         1.0, 'Stereo: standard deviation of the disparity', unit='px', minimum=1e-6
     )
+    observation_error_time: float = parameter(
+        0.0,
+        'How long the error of an observed landmark lasts, as its correlation time, where it is '
+        'not new in each observation: that of a calibration, or of a tag seen from one side',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
+    )
     angular_scale_error: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Scale error of the angular velocity x y z to be estimated: its standard deviation',

@@ -27,7 +27,7 @@ REPORT_KEYS = {
     'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
     'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',
     'localised_after_s', 'unaligned_rmse_m', 'used', 'velocity_topic', 'landmarks_topic',
-    'imu_topic', 'gains', 'truth_covered',
+    'imu_topic', 'gains', 'truth_covered', 'configuration_anees',
 }  # fmt: skip
 
 
@@ -116,6 +116,7 @@ class TestReport:
         unknown = {key for key, value in report.items() if value is None}
         assert unknown == {key for key in REPORT_KEYS if 'rmse' in key} | {
             'anees', 'localised_after_s', 'truth_covered', 'imu_topic',
+            'configuration_anees',
         }  # fmt: skip
         assert 'no truth to compare with' in slam_observer('replay', path).output
 

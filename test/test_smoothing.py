@@ -242,7 +242,9 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
             part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], no_gaps, covariances[a:b], at_ends)
             P = initial_covariance(axes, calibration)
             history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
-        nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None)
+        nothing = Seen(
+            0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+        )
         history.see(nothing, path[-1])
         return history.frames()
 
@@ -388,7 +390,7 @@ def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad
     calibration = Calibration(settings, SPATIAL)
     joint = JointCovariance(SPATIAL, calibration, 0.0)
     hindsight, observer = Hindsight(SPATIAL, settings, calibration, joint), Observer(np.eye(4))
-    nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None)
+    nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0))
     looked_back_at = []
     for turn_rad in turns_rad:
         hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))

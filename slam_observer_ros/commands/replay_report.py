@@ -27,7 +27,8 @@ ACCURACY_ROWS = {
     'heading_rmse_rad': ('heading error, RMS', 'rad after alignment'),
     'landmark_rmse_m': ('landmark error, RMS', 'm after alignment'),
     'configuration_rmse_m': ('configuration error, RMS', 'm, not aligned'),
-    'anees': ('ANEES', '(1 is honest)'),
+    'anees': ('ANEES of the pose', '(1 is honest)'),
+    'configuration_anees': ('ANEES of the configuration', '(1 is honest)'),
     'smoothed_ate_rmse_m': ('smoothed: position error, RMS', 'm after alignment'),
     'smoothed_landmark_rmse_m': ('smoothed: landmark error, RMS', 'm after alignment'),
 }
@@ -60,6 +61,7 @@ def as_json(outcome: Outcome) -> dict[str, object]:
         'landmark_rmse_m': accuracy.landmark_rmse_m,
         'configuration_rmse_m': accuracy.configuration_rmse_m,
         'anees': accuracy.anees,
+        'configuration_anees': accuracy.configuration_anees,
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
         'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
         'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,

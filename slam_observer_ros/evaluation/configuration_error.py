@@ -12,6 +12,9 @@ from slam_observer_ros.events import is_automatic, LandmarkTruth
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray, IntArray
 
+ROUNDING = 1e-13
+"""Share of the total variance that rounding may have left out of a direction."""
+
 
 @dataclass(slots=True)
 class ConfigurationError:
@@ -26,11 +29,14 @@ class ConfigurationError:
         When :meth:`add` found landmarks to compare.
     values_m : list of float
         The error at these times, metres.
+    nees : list of float
+        Normalised squared errors per degree of freedom, of those that came with a covariance.
 
     """
 
     stamps_ns: list[int] = field(default_factory=list)
     values_m: list[float] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
     _votes: defaultdict[int, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
 
     def add(
@@ -41,6 +47,7 @@ class ConfigurationError:
         world_points: FloatArray,
         true_pose: FloatArray,
         truth: LandmarkTruth,
+        covariance: FloatArray | None = None,
     ) -> None:
         """Take in one configuration, once after each observation.
 
@@ -60,6 +67,9 @@ class ConfigurationError:
             (4, 4) true pose at that time.
         truth : LandmarkTruth
             True landmark positions at that time.
+        covariance : FloatArray, optional
+            (n k, n k) joint covariance of the landmarks as seen by the robot, of their first k
+            coordinates, m².
 
         """
         if not len(truth.ids):
@@ -74,13 +84,30 @@ class ConfigurationError:
         if not len(rows):
             return
         self.stamps_ns.append(stamp_ns)
-        self.values_m.append(root_mean_square(seen[rows] - true_seen[true_rows]))
+        errors = seen[rows] - true_seen[true_rows]
+        self.values_m.append(root_mean_square(errors))
+        if covariance is not None:
+            self.nees.append(_nees(errors, covariance, rows, len(ids)))
 
     def _true_id(self, landmark_id: int) -> int:
         votes = self._votes.get(landmark_id)
         return landmark_id if votes is None else votes.most_common(1)[0][0]
 
     @property
+    def anees(self) -> float | None:
+        """Mean of the normalised squared errors; None if there are none."""
+        return float(np.mean(self.nees)) if self.nees else None
+
+    @property
     def rmse_m(self) -> float | None:
         """RMS over the run, metres; None before anything could be compared."""
         return root_mean_square(np.array(self.values_m)) if self.values_m else None
+
+
+def _nees(errors: FloatArray, covariance: FloatArray, rows: IntArray, n: int) -> float:
+    """Return eᵀ P⁻¹ e per degree of freedom of the errors (m, 3) of ``rows``, of n landmarks."""
+    k = len(covariance) // n
+    columns = (k * rows[:, None] + np.arange(k)).ravel()
+    e, P = errors[:, :k].ravel(), covariance[np.ix_(columns, columns)]
+    regular = P + ROUNDING * np.trace(P) * np.eye(len(P))
+    return float(e @ np.linalg.solve(regular, e)) / len(e)

@@ -74,6 +74,8 @@ class Seen:
         they were seen, metres, body frame.
     covariances : FloatArray or None
         (m, 3, 3) covariance of the points, body frame, m²; None where the noise model has it.
+    dt_s : FloatArray
+        (m,) seconds since each of them was seen before; infinite if it was not.
 
     """
 
@@ -82,6 +84,7 @@ class Seen:
     points: FloatArray
     sights: FloatArray
     covariances: FloatArray | None
+    dt_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True)

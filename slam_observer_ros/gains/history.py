@@ -12,7 +12,7 @@ from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.matrices import transpose
-from slam_observer_ros.observation_noise import ObservationNoise
+from slam_observer_ros.observation_noise import lasting, ObservationNoise
 from slam_observer_ros.smoothing.gauss_newton import Frames, joined, no_frames
 from slam_observer_ros.smoothing.prior import Prior
 from slam_observer_ros.types import FloatArray, IntArray
@@ -197,8 +197,15 @@ class History:
             frames=np.repeat(numbers, [len(part.rows) for part in seen]),
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
-            information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
+            information=self._information(seen, k),
         )
+
+    def _information(self, seen: list[Seen], k: int) -> FloatArray:
+        """Return the inverse covariances (M, k, k) as which all points count, 1/m²."""
+        dt_s = np.concatenate([part.dt_s for part in seen])
+        share = np.ones(len(dt_s)) / lasting(dt_s, self._observation_noise.error_time_s)
+        information = np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64)
+        return information * share[:, None, None]
 
     def _covariances(self, seen: list[Seen]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""

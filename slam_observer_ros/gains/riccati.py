@@ -31,6 +31,7 @@ from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.matrices import mahalanobis, solve, with_blocks
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
+from slam_observer_ros.observation_noise import lasting
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -101,7 +102,8 @@ class RiccatiGains(GainDesign):
         passed = weights > 0.0
         used = residuals.select(passed)
         CP, CPC = self._project(used)
-        S = with_blocks(CPC, used.covariances[:, :k, :k] / weights[passed, None, None])
+        share = weights[passed] / lasting(used.dt_s, self._settings.observation_error_time)
+        S = with_blocks(CPC, used.covariances[:, :k, :k] / share[:, None, None])
         K = solve(S, CP).T
         half = K @ (0.5 * S @ K.T - CP)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out

@@ -41,6 +41,7 @@ from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.matrices import block_diagonal, mahalanobis, symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
+from slam_observer_ros.observation_noise import lasting
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -176,14 +177,15 @@ class ScheduledGains(GainDesign):
         passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
         H = self._output_matrix(residuals.e + residuals.a - residuals.r) - F
         weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
+        error_time_s = self._settings.observation_error_time
+        repeated = lasting(residuals.dt_s[passed], error_time_s)
         for _ in range(1 + REWEIGHTINGS):
-            noise = R[passed] / weights[passed, None, None]
+            share = weights[passed] / repeated
+            noise = R[passed] / share[:, None, None]
             gain_k[passed] = np.linalg.inv(N[passed] + noise)
             x = self._core.step(H, gain_k, r)
             pull = gain_k @ (r + H @ x)
-            weights[passed] = huber_weights(
-                pull[passed, :, 0], R[passed], weights[passed], threshold
-            )
+            weights[passed] = huber_weights(pull[passed, :, 0], R[passed], share, threshold)
             if (weights[passed] == 1.0).all():
                 break
         shifts = self._axes.full_points((F @ x + N @ pull).ravel())

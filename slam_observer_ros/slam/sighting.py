@@ -30,6 +30,8 @@ class Sighting:
         (m,) which are not new.
     covariances : FloatArray
         (m, 3, 3) their covariances, body frame, m².
+    dt_s : FloatArray
+        (m,) seconds since each was seen before; infinite if it is new.
     residuals : Residuals
         Of those that are not new.
     left_out : dict
@@ -42,6 +44,7 @@ class Sighting:
     rows: IntArray
     known: BoolArray
     covariances: FloatArray
+    dt_s: FloatArray
     residuals: Residuals
     left_out: dict[str, int]
 
@@ -101,7 +104,9 @@ class Outlook:
         """Return what the points of ``event`` tell, which are the ``known`` of ``rows`` (m,)."""
         covariances = self._covariances(event, rows)
         residuals = self.residuals(event.select(known), rows[known], covariances[known])
-        return Sighting(event, rows, known, covariances, residuals, left_out)
+        dt_s = np.full(len(rows), np.inf)
+        dt_s[known] = residuals.dt_s
+        return Sighting(event, rows, known, covariances, dt_s, residuals, left_out)
 
     def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
@@ -119,11 +124,11 @@ class Outlook:
             to_s(unseen_ns),
         )
 
-    def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:
-        """Return what there is to look back at later."""
+    def seen(self, event: ObservationEvent, rows: IntArray, dt_s: FloatArray) -> Seen:
+        """Return what there is to look back at later; ``dt_s`` (m,) is that of the sighting."""
         sights = self._sights(event, rows)
         stated = None if event.covariances is None else self._noise.covariances(event, sights)
-        return Seen(event.stamp_ns, rows, event.points, sights, stated)
+        return Seen(event.stamp_ns, rows, event.points, sights, stated, dt_s)
 
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return the covariances (m, 3, 3) of observed points, body frame, m².

@@ -108,6 +108,23 @@ class Slam:
         world: FloatArray = R @ covariances @ R.T
         return world
 
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (m k, m k) of where landmarks are seen from the robot, m².
+
+        Joint, along the axes of the body that are estimated; None where the gains know none. The
+        choice of the world's frame has no part in it.
+        """
+        joint = self.gains.joint_covariance(rows)
+        if joint is None:
+            return None
+        k = self.axes.point
+        C = self.axes.output_matrix(self.observer.points[rows])
+        C = C.reshape(-1, len(self.axes.pose))
+        J = np.hstack([C, -np.eye(len(C))])
+        back = np.kron(np.eye(len(rows)), self.observer.A[:k, :k].T)
+        seen: FloatArray = back @ J @ joint @ J.T @ back.T
+        return seen
+
     def pose_covariance(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
     ) -> FloatArray | None:
@@ -194,6 +211,7 @@ class Slam:
         """Use what :meth:`look` has returned for an observation; return what was made of it."""
         self.counts.update(sighting.left_out)
         event, rows, known = sighting.event, sighting.rows, sighting.known
+        dt_s = sighting.dt_s
         forgotten = self._in_the_way(sighting)
         if len(forgotten):
             # A history without them would lose what they have told of the pose.
@@ -204,11 +222,11 @@ class Slam:
             self._make_room(forgotten)
             self._initialise(event.select(~known), sighting.covariances[~known])
             rows = self.landmarks.rows_of(event.ids)
-            event, rows = event.select(rows >= 0), rows[rows >= 0]
+            event, rows, dt_s = event.select(rows >= 0), rows[rows >= 0], dt_s[rows >= 0]
         if event.velocities is not None:
             used = ~np.isin(event.ids, seen_before.ids[rejected])
             self.observer.set_landmark_velocities(rows[used], event.velocities[used])
-        moved_ids = self._look_back(event, rows)
+        moved_ids = self._look_back(event, rows, dt_s)
         return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
 
     def are_rejected_again(self, sighting: Sighting) -> BoolArray:
@@ -288,7 +306,7 @@ class Slam:
         spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
         return se3.transform(self.observer.pose, event.points), SAME_PLACE * spread_m
 
-    def _look_back(self, event: ObservationEvent, rows: IntArray) -> IntArray:
+    def _look_back(self, event: ObservationEvent, rows: IntArray, dt_s: FloatArray) -> IntArray:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
 
         Now that the state is corrected, it is known better than before from where they were seen.
@@ -297,7 +315,7 @@ class Slam:
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
         if some_are or self.gains.looks_back:
-            self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
+            self.gains.look_back(self.observer, self._outlook.seen(event, rows, dt_s), some_are)
         if some_are:
             return self._relocate(event.select(in_doubt), rows[in_doubt])
         return np.empty(0, dtype=np.int64)

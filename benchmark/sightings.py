@@ -1,0 +1,45 @@
+"""Noise of observed points, for estimators that keep no account of what they saw when."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.observation_noise import lasting, ObservationNoise
+from slam_observer_ros.settings import Settings
+from slam_observer_ros.types import FloatArray
+
+
+class SightingNoise:
+    """The observer's noise of points, and by how much less those tell whose errors last.
+
+    Parameters
+    ----------
+    settings : Settings
+        Noise figures.
+
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._noise = ObservationNoise(settings)
+        self._last_seen_ns: dict[int, int] = {}
+
+    def add(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
+        """Take in an observation; call it once for each, in the order of the stamps.
+
+        Returns
+        -------
+        covariances : FloatArray
+            (m, 3, 3) of its points alone, body frame, m².
+        factors : FloatArray
+            (m,) by which they are larger where landmarks were seen a short time ago.
+
+        """
+        ids = event.ids.tolist()
+        before_ns = [self._last_seen_ns.get(landmark_id) for landmark_id in ids]
+        self._last_seen_ns.update(dict.fromkeys(ids, event.stamp_ns))
+        dt_s = np.array(
+            [np.inf if last is None else (event.stamp_ns - last) * 1e-9 for last in before_ns]
+        )
+        factors = np.ones(len(ids)) * lasting(dt_s, self._noise.error_time_s)
+        return self._noise.covariances(event), factors
