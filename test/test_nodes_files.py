@@ -10,6 +10,7 @@ import pytest
 import setuptools  # noqa: F401 (provides distutils)
 import yaml
 
+from slam_observer_ros.nodes import initial_pose
 from slam_observer_ros.nodes.settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.parameters import table
 from slam_observer_ros.settings import Settings
@@ -69,6 +70,15 @@ def test_rviz_shows_topics_that_are_published():
     assert topics == PUBLISHED
 
 
+def test_rviz_gives_the_pose_where_it_is_heard():
+    view = yaml.safe_load((CHECKOUT / 'rviz' / 'slam_observer.rviz').read_text())
+    manager = view['Visualization Manager']
+    topics = {tool['Class']: tool.get('Topic', {}).get('Value') for tool in manager['Tools']}
+    assert topics['rviz_default_plugins/SetInitialPose'] in initial_pose.TOPICS
+    # RViz gives it in the fixed frame, and in another one it is refused.
+    assert manager['Global Options']['Fixed Frame'] == ObserverNodeSettings().map_frame
+
+
 @pytest.mark.parametrize(
     ('name', 'tables'),
     [
@@ -82,6 +92,15 @@ def test_parameter_file_holds_known_parameters_in_range(name, tables):
     for section in content.values():
         for parameter, value in section['ros__parameters'].items():
             rows[parameter].check(value)
+
+
+@pytest.mark.parametrize(
+    'path', sorted((CHECKOUT / 'config').glob('*.yaml')), ids=lambda path: path.name
+)
+def test_ros_can_read_lists_of_parameter_files(path):
+    for section in yaml.safe_load(path.read_text()).values():
+        for value in section['ros__parameters'].values():
+            assert not isinstance(value, list) or {type(entry) for entry in value} == {float}
 
 
 def test_simulator_file_lists_every_parameter():
