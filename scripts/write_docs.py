@@ -60,7 +60,7 @@ OUTPUTS = {
     'map': 'landmarks seen `confirmations` times or more, with ids; with covariances where the '
     'gains know them',
     'landmark_estimates': 'the same landmarks for tools that read PointCloud',
-    'markers': 'landmarks, ids and residuals for RViz and Foxglove',
+    'markers': 'landmarks with ids and ellipsoids of 3σ, and residuals, for RViz and Foxglove',
     'lyapunov': 'the Lyapunov value L (34) of the last observation',
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
     'else `map_frame` → `base_frame`',

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from distutils.core import run_setup  # setuptools' own where Python has none any more
+import inspect
 from itertools import pairwise
 import json
 from pathlib import Path
@@ -17,6 +18,8 @@ import setuptools  # noqa: F401 (provides distutils)
 import yaml
 
 from slam_observer_ros.cli import make_parser
+from slam_observer_ros.commands.replay_report import as_json
+from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map
 from slam_observer_ros.nodes.settings import ObserverNodeSettings, SimulatorNodeSettings
@@ -121,8 +124,22 @@ def test_parameter_names_and_values_are_right(page):
         if isinstance(content, dict) and 'ros__parameters' in content.get('/**', {}):
             for name, value in content['/**']['ros__parameters'].items():
                 rows[name].check(value)
+                # ROS refuses lists that mix integers and others.
+                assert not isinstance(value, list) or {type(entry) for entry in value} == {float}
     for _node, name, value in commands(page, ['ros2', 'param', 'set']):
         rows[name].check(yaml.safe_load(value))
+
+
+def test_all_counts_are_explained():
+    page = (CHECKOUT / 'docs' / 'topics.md').read_text()
+    for name in re.findall(r"``'(\w+)'``", Estimator.__doc__):
+        assert f'`used: {name}`' in page
+
+
+def test_all_keys_of_json_are_explained():
+    page = (CHECKOUT / 'docs' / 'first_run.md').read_text()
+    keys = re.findall(r"^        '(\w+)': ", inspect.getsource(as_json), re.MULTILINE)
+    assert re.findall(r'^\| `(\w+)` ', page, re.MULTILINE) == keys
 
 
 @pages
