@@ -235,7 +235,7 @@ class Settings(Immutable):
     min_support: int = parameter(
         5,
         'Points without id: how often a landmark must be seen to be in the map; it is forgotten '
-        'if it was not by when others as often in view would have been seen four times as often',
+        'if it has been in view four times as long as others take for that',
         minimum=1,
     )
     max_hypotheses: int = parameter(
@@ -246,8 +246,8 @@ class Settings(Immutable):
     )
     hindsight_interval: int = parameter(
         20,
-        'Riccati gains: least observations to look back at at once, or a tenth of all so far up '
-        'to 300; 0 for never',
+        'Riccati gains: new observations that it takes at least to look back; after many of them '
+        'a tenth of all so far, up to 300; 0 for never',
         minimum=0,
     )
     hindsight_turn: float = parameter(
