@@ -329,11 +329,14 @@ class Estimator:
     def pose_covariance(self) -> FloatArray | None:
         """(6, 6) covariance of the pose at ``stamp_ns``: rotation vector, then position.
 
-        Both along the world's axes, rad² and m². None where the gains know none.
+        Both along the world's axes, rad² and m². Where it is in doubt what was seen, it holds
+        that the most likely place may be the wrong one. None where the gains know none.
         """
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        return self._slam.pose_covariance(timeline.velocities, start_ns, end_ns)
+        covariance = self._slam.pose_covariance(timeline.velocities, start_ns, end_ns)
+        doubt = self._frame.states.doubt
+        return covariance if covariance is None or doubt is None else covariance + doubt
 
     @property
     def body_velocity(self) -> FloatArray:
@@ -370,14 +373,14 @@ class Estimator:
         covariances = self._slam.landmark_covariances
         return None if covariances is None else covariances[self._slam.confirmed]
 
-    @property
-    def configuration_covariance(self) -> FloatArray | None:
-        """(n k, n k) joint covariance of the landmarks as seen from the robot, body frame, m².
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
 
-        It is that of the latest observation. k is 2 in ``two_d_mode``, else 3; None where the
-        gains know none.
+        It is that of the latest observation, in the body frame, of the first k coordinates: 2 in
+        ``two_d_mode``, else 3. ``rows`` (m,) are places in ``landmark_ids``. None where the gains
+        know none.
         """
-        return self._slam.configuration_covariance(self._slam.confirmed)
+        return self._slam.configuration_covariance(self._slam.confirmed[rows])
 
     @property
     def landmark_velocities(self) -> FloatArray:

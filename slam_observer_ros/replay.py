@@ -222,6 +222,9 @@ class _Run:
             return
         true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
         if covered[0]:
+            is_due = update.stamp_ns >= self._next_nees_ns
+            if is_due:
+                self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
             self._configuration.add(
                 update.stamp_ns,
                 update.pose,
@@ -229,11 +232,5 @@ class _Run:
                 self._estimator.world_points,
                 true_poses[0],
                 self._landmark_tracks.at(update.stamp_ns),
-                self._covariance_if_due(update.stamp_ns),
+                self._estimator.configuration_covariance if is_due else None,
             )
-
-    def _covariance_if_due(self, stamp_ns: int) -> FloatArray | None:
-        if stamp_ns < self._next_nees_ns:
-            return None
-        self._next_nees_ns = stamp_ns + NEES_PERIOD_NS
-        return self._estimator.configuration_covariance

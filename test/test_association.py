@@ -33,7 +33,7 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import axes, se3
+from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.parameter_file import read_parameter_file
 from slam_observer_ros.parameters import from_parameters, table
@@ -221,12 +221,16 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     for step in range(100, 105):
         observe(estimator, 0.1 * step, seen[1:2])
     followed = len(estimator._frame.states)
+    error_rad = np.linalg.norm(so3.log(estimator.pose[:3, :3].T @ turned[:3, :3]))
+    in_doubt_rad = np.sqrt(estimator.pose_covariance[2, 2])
+    assert error_rad < 4.0 * in_doubt_rad
     observe(estimator, 10.45, np.empty((0, 3)))  # tells nothing, and so decides nothing
     assert len(estimator._frame.states) == followed
     for step in range(105, 110):
         observe(estimator, 0.1 * step, seen[1:])
     assert followed > 1
     assert_allclose(estimator.pose, turned, atol=0.1)
+    assert np.sqrt(estimator.pose_covariance[2, 2]) < 0.2 * in_doubt_rad
     assert_array_equal(estimator.landmark_ids, known)
     assert_allclose(estimator.world_points, posts, atol=0.1)
 

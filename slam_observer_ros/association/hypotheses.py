@@ -31,10 +31,12 @@ from slam_observer_ros.events import (
     ObservationEvent,
     UNKNOWN_ID,
 )
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,7 @@ class Hypotheses:
         self._limit = settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
+        self._doubt: FloatArray | None = None
 
     def __len__(self) -> int:
         """Return how many states are followed."""
@@ -76,8 +79,32 @@ class Hypotheses:
 
     def decide(self) -> Slam:
         """Give up all states but the most likely one, and return that."""
-        self._states, self._costs = self._states[:1], [0.0]
+        self._states, self._costs, self._doubt = self._states[:1], [0.0], None
         return self.best
+
+    @property
+    def doubt(self) -> FloatArray | None:
+        """(6, 6) what the pose's covariance lacks if the most likely state may be wrong.
+
+        Σ w_i (P_i + d_i d_iᵀ) − P_1 at the last observation, with w_i the likelihoods of the
+        states and d_i how far their poses are from that of the first, in its coordinates. None
+        if there is one state.
+        """
+        if self._doubt is None and len(self._states) > 1:
+            self._doubt = self._spread()
+        return self._doubt
+
+    def _spread(self) -> FloatArray | None:
+        likelihoods = np.exp(-0.5 * np.array(self._costs))
+        weights, spread = likelihoods / likelihoods.sum(), np.zeros((6, 6))
+        own = self.best.state_covariance
+        for slam, weight in zip(self._states, weights.tolist(), strict=True):
+            covariance = slam.state_covariance
+            if own is None or covariance is None:
+                return None
+            d = _difference(self.best.observer.pose, slam.observer.pose)
+            spread += weight * (covariance - own + np.outer(d, d))
+        return spread
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all states, which are those of ``start_ns``, on to ``end_ns``."""
@@ -104,6 +131,7 @@ class Hypotheses:
 
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at the states' instant; return what the best one makes of it."""
+        self._doubt = None
         is_unknown = event.ids == UNKNOWN_ID
         some_are_unknown = bool(is_unknown.any())
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
@@ -152,6 +180,12 @@ class Hypotheses:
                 worst = min(worst, cost + reading.cost + MARGIN)
         possible.sort(key=lambda one: one[1].cost)
         return [one for one in possible if one[1].cost <= worst]
+
+
+def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
+    """Return rotation vector and shift (6,) from one pose to another, along the world's axes."""
+    turn = so3.log(other[:3, :3] @ pose[:3, :3].T)
+    return np.concatenate([turn, other[:3, 3] - pose[:3, 3]])
 
 
 def _are_one(slam: Slam, reading: Reading, other: _Followed) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +12,9 @@ from slam_observer_ros.evaluation.metrics import root_mean_square
 from slam_observer_ros.events import is_automatic, LandmarkTruth
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray, IntArray
+
+MAX_JOINT = 100
+"""Landmarks whose errors are normalised together, at most: it costs the cube of them."""
 
 ROUNDING = 1e-13
 """Share of the total variance that rounding may have left out of a direction."""
@@ -47,7 +51,7 @@ class ConfigurationError:
         world_points: FloatArray,
         true_pose: FloatArray,
         truth: LandmarkTruth,
-        covariance: FloatArray | None = None,
+        covariance_of: Callable[[IntArray], FloatArray | None] | None = None,
     ) -> None:
         """Take in one configuration, once after each observation.
 
@@ -67,9 +71,9 @@ class ConfigurationError:
             (4, 4) true pose at that time.
         truth : LandmarkTruth
             True landmark positions at that time.
-        covariance : FloatArray, optional
-            (n k, n k) joint covariance of the landmarks as seen by the robot, of their first k
-            coordinates, m².
+        covariance_of : callable, optional
+            Gives the joint covariance (m k, m k) of m of the landmarks as seen by the robot, of
+            their first k coordinates, m²; None if it is not known.
 
         """
         if not len(truth.ids):
@@ -86,8 +90,11 @@ class ConfigurationError:
         self.stamps_ns.append(stamp_ns)
         errors = seen[rows] - true_seen[true_rows]
         self.values_m.append(root_mean_square(errors))
-        if covariance is not None:
-            self.nees.append(_nees(errors, covariance, rows, len(ids)))
+        if covariance_of is not None:
+            some = slice(None, None, -(-len(rows) // MAX_JOINT))
+            P = covariance_of(rows[some])
+            if P is not None:
+                self.nees.append(_nees(errors[some], P))
 
     def _true_id(self, landmark_id: int) -> int:
         votes = self._votes.get(landmark_id)
@@ -104,10 +111,8 @@ class ConfigurationError:
         return root_mean_square(np.array(self.values_m)) if self.values_m else None
 
 
-def _nees(errors: FloatArray, covariance: FloatArray, rows: IntArray, n: int) -> float:
-    """Return eᵀ P⁻¹ e per degree of freedom of the errors (m, 3) of ``rows``, of n landmarks."""
-    k = len(covariance) // n
-    columns = (k * rows[:, None] + np.arange(k)).ravel()
-    e, P = errors[:, :k].ravel(), covariance[np.ix_(columns, columns)]
+def _nees(errors: FloatArray, P: FloatArray) -> float:
+    """Return eᵀ P⁻¹ e per degree of freedom of errors (m, 3), P (m k, m k) that of k of them."""
+    e = errors[:, : len(P) // len(errors)].ravel()
     regular = P + ROUNDING * np.trace(P) * np.eye(len(P))
     return float(e @ np.linalg.solve(regular, e)) / len(e)

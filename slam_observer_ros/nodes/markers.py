@@ -17,8 +17,8 @@ LINE_WIDTH_M = 0.03
 
 GREEN = ColorRGBA(r=0.0, g=0.62, b=0.45, a=1.0)
 WHITE = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
-BLUE = ColorRGBA(r=0.0, g=0.45, b=0.7, a=0.3)
-RED = ColorRGBA(r=0.84, g=0.37, b=0.0, a=1.0)
+PALE_GREEN = ColorRGBA(r=0.0, g=0.62, b=0.45, a=0.3)
+ORANGE = ColorRGBA(r=0.84, g=0.37, b=0.0, a=1.0)
 
 MAX_LABELS = 200
 """Landmarks that get a text; more could not be read, and each is a message of its own."""
@@ -80,7 +80,7 @@ def _ellipsoids(
     sizes_m = 2.0 * ELLIPSOID_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
     markers = []
     for number, (point, size, turn) in enumerate(zip(points, sizes_m, axes, strict=False)):
-        marker = _marker(header, 'uncertainties', Marker.SPHERE, BLUE, MIN_SIZE_M)
+        marker = _marker(header, 'uncertainties', Marker.SPHERE, PALE_GREEN, MIN_SIZE_M)
         marker.id = number
         marker.pose.position = point_message(point)
         marker.pose.orientation = quaternion_message(turn)
@@ -91,7 +91,7 @@ def _ellipsoids(
 
 def _residual_lines(header: Header, estimator: Estimator) -> Marker:
     """Return a line from each landmark just seen to where it was seen."""
-    marker = _marker(header, 'residuals', Marker.LINE_LIST, RED, LINE_WIDTH_M)
+    marker = _marker(header, 'residuals', Marker.LINE_LIST, ORANGE, LINE_WIDTH_M)
     update = estimator.last_update
     if update is not None:
         _, seen, rows = np.intersect1d(update.ids, estimator.landmark_ids, return_indices=True)

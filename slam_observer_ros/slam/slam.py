@@ -114,15 +114,15 @@ class Slam:
         Joint, along the axes of the body that are estimated; None where the gains know none. The
         choice of the world's frame has no part in it.
         """
-        joint = self.gains.joint_covariance(rows)
-        if joint is None:
+        P = self.gains.joint_covariance(rows)
+        if P is None:
             return None
-        k = self.axes.point
-        C = self.axes.output_matrix(self.observer.points[rows])
-        C = C.reshape(-1, len(self.axes.pose))
-        J = np.hstack([C, -np.eye(len(C))])
-        back = np.kron(np.eye(len(rows)), self.observer.A[:k, :k].T)
-        seen: FloatArray = back @ J @ joint @ J.T @ back.T
+        m, k, p = len(rows), self.axes.point, len(self.axes.pose)
+        C = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, p)
+        CP = C @ P[:p] - P[p:]
+        blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
+        R = self.observer.A[:k, :k]
+        seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
         return seen
 
     def pose_covariance(
@@ -134,10 +134,18 @@ class Slam:
         know that of ε in Â = exp(ε) A. None where they know none.
         """
         moved = self._motion(velocities, start_ns, end_ns)
-        covariance = self.gains.pose_covariance_after(moved)
+        return self._in_world(self.gains.pose_covariance_after(moved), moved.path[-1])
+
+    @property
+    def state_covariance(self) -> FloatArray | None:
+        """(6, 6) the same of the pose as it is."""
+        return self._in_world(self.gains.pose_covariance, self.observer.A)
+
+    def _in_world(self, covariance: FloatArray | None, A: FloatArray) -> FloatArray | None:
+        """Return that of the pose from that of ε (6, 6), at Â (4, 4)."""
         if covariance is None:
             return None
-        turn = self._turn_to_world(moved.path[-1])
+        turn = self._turn_to_world(A)
         world: FloatArray = turn @ covariance @ turn.T
         return world
 
