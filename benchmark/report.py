@@ -84,7 +84,9 @@ INTRODUCTION = """\
 Written by `make benchmark-accuracy` (`python benchmark/accuracy.py --write-docs`). One run, the
 same events and the same noise figures for all: those of `config/wheeled_bearing_range.yaml` and
 `config/stereo_inertial.yaml`, which come from descriptions of the sensors and not from these
-recordings. The simulated worlds are made with the noise that these files state.
+recordings. The simulated worlds are made with the noise that these files state, but with errors
+that are new in each observation. Where errors last (`observation_error_time`, for wheeled robots)
+all are given the same larger covariances.
 
 - **constant, scheduled, riccati**: this project's gain designs. The wheeled configuration also
   lets `scheduled` and `riccati` estimate the scale and the delay of the odometry, which GTSAM and
