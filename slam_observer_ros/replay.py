@@ -160,25 +160,24 @@ class _Run:
         start_s = time.thread_time()
         self._estimator.flush()
         self._seconds += time.thread_time() - start_s
+        updates = self._updates
+        counts = np.array([len(update.residuals) for update in updates], dtype=np.int64)
+        stamps_ns = np.array([update.stamp_ns for update in updates], dtype=np.int64)
+        no_points, none = np.empty((0, 3)), np.empty(0, dtype=np.bool_)
         return Replay(
-            self._estimator,
-            self._sampler.trajectory,
-            self._sampler.covariances,
-            self._dead_reckoning.trajectory,
-            self._configuration,
-            np.repeat(
-                np.array([update.stamp_ns for update in self._updates], dtype=np.int64),
-                np.array([len(update.residuals) for update in self._updates], dtype=np.int64),
-            ),
-            np.concatenate([np.empty((0, 3)), *(update.residuals for update in self._updates)]),
-            np.concatenate(
-                [np.empty(0, dtype=np.bool_), *(update.rejected for update in self._updates)]
-            ),
-            self._events,
-            self._seconds,
-            self._in_known_map,
-            self._start_ns or 0,
-            self._observations,
+            estimator=self._estimator,
+            trajectory=self._sampler.trajectory,
+            pose_covariances=self._sampler.covariances,
+            dead_reckoning=self._dead_reckoning.trajectory,
+            configuration=self._configuration,
+            residual_stamps_ns=np.repeat(stamps_ns, counts),
+            residuals=np.concatenate([no_points, *(update.residuals for update in updates)]),
+            rejected=np.concatenate([none, *(update.rejected for update in updates)]),
+            events=self._events,
+            seconds=self._seconds,
+            in_known_map=self._in_known_map,
+            start_ns=self._start_ns or 0,
+            observations=self._observations,
         )
 
     def _on_stamp(self) -> None:
