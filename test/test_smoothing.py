@@ -215,7 +215,7 @@ def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_togethe
     covariance = together @ turn @ together.T + own
     if not turns_together:
         covariance[:d, d:] = covariance[d:, :d] = 0.0
-    prior, angle_rad = Prior(np.eye(4), np.empty(0), points, covariance).least_bent(axes)
+    prior, angle_rad = Prior(np.eye(4), np.empty(0), points, covariance).least_nonlinear(axes)
     assert prior.is_relative == turns_together
     assert angle_rad < 0.1
 

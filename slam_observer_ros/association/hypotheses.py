@@ -158,8 +158,8 @@ class Hypotheses:
             if len(followed) == self._limit:
                 break
         least = followed[0].reading.cost
-        self._costs = [one.reading.cost - least for one in followed]
-        self._states = [one.slam for one in followed]
+        self._costs = [state.reading.cost - least for state in followed]
+        self._states = [state.slam for state in followed]
         return followed[0].outcome
 
     def _possible(self, event: ObservationEvent) -> list[tuple[int, Reading]]:
@@ -178,8 +178,8 @@ class Hypotheses:
             for reading in readings(slam, event, new_ids, worst - cost):
                 possible.append((number, replace(reading, cost=cost + reading.cost)))
                 worst = min(worst, cost + reading.cost + MARGIN)
-        possible.sort(key=lambda one: one[1].cost)
-        return [one for one in possible if one[1].cost <= worst]
+        possible.sort(key=lambda pair: pair[1].cost)
+        return [(number, reading) for number, reading in possible if reading.cost <= worst]
 
 
 def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:

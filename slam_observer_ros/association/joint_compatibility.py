@@ -113,14 +113,14 @@ class _Extensions:
 
     def extended(self, i: int, j: int) -> Pairing:
         """Return pairing i with pair j, or without any."""
-        one, cost = self.pairings[i], float(self.costs[i, j])
+        pairing, cost = self.pairings[i], float(self.costs[i, j])
         if j == len(self.options):
-            return replace(one, cost=cost)
-        n = len(one.z)
+            return replace(pairing, cost=cost)
+        n = len(pairing.z)
         L = np.zeros((self.rows.shape[3],) * 2)
-        L[:n, :n], L[n:] = one.L, self.rows[i, j]
-        chosen = [*one.chosen, int(self.options[j])]
-        return Pairing(cost, chosen, L, np.append(one.z, self.tails[i, j]))
+        L[:n, :n], L[n:] = pairing.L, self.rows[i, j]
+        chosen = [*pairing.chosen, int(self.options[j])]
+        return Pairing(cost, chosen, L, np.append(pairing.z, self.tails[i, j]))
 
 
 class JointSearch:
@@ -161,8 +161,10 @@ class JointSearch:
         """Return the pairings, the cheapest first; what no pair belongs to is left out of it."""
         partial = [Pairing(0.0, [], np.empty((0, 0)), np.empty(0))]
         for options in self._options:
-            sizes = dict.fromkeys(len(one.chosen) for one in partial)
-            groups = [[one for one in partial if len(one.chosen) == size] for size in sizes]
+            sizes = dict.fromkeys(len(pairing.chosen) for pairing in partial)
+            groups = [
+                [pairing for pairing in partial if len(pairing.chosen) == size] for size in sizes
+            ]
             partial = self._cheapest([self._extensions(group, options) for group in groups])
         return partial
 
@@ -173,11 +175,11 @@ class JointSearch:
         """
         if not extensions:
             return []
-        costs = np.concatenate([some.costs.ravel() for some in extensions])
+        costs = np.concatenate([extension.costs.ravel() for extension in extensions])
         order = np.argsort(costs, kind='stable')[:MAX_PARTIAL]
         worst = min(self._budget, costs[order[0]] + self._margin)
         kept = order[np.isfinite(costs[order]) & (costs[order] <= worst)]
-        starts = list(accumulate((some.costs.size for some in extensions), initial=0))
+        starts = list(accumulate((extension.costs.size for extension in extensions), initial=0))
         pairings = []
         for place in kept.tolist():
             group = bisect_right(starts, place) - 1
@@ -188,8 +190,9 @@ class JointSearch:
     def _extensions(self, pairings: list[Pairing], options: IntArray) -> _Extensions:
         """Return how pairings (b,) of one size may go on with the pairs ``options`` (o,)."""
         S, r, k = self._pairs.covariances, self._pairs.residuals, self._pairs.residuals.shape[1]
-        L, z = np.array([one.L for one in pairings]), np.array([one.z for one in pairings])
-        columns = np.array([columns_of(one.chosen, k) for one in pairings])
+        L = np.array([pairing.L for pairing in pairings])
+        z = np.array([pairing.z for pairing in pairings])
+        columns = np.array([columns_of(pairing.chosen, k) for pairing in pairings])
         own = k * options[:, None] + np.arange(k)
         W = L[:, None] @ S[columns[:, None, :, None], own[:, None, :]]  # (b, o, q k, k)
         left = S[own[:, :, None], own[:, None, :]] - transpose(W) @ W
@@ -202,13 +205,14 @@ class JointSearch:
         rises -= self._noise_log_dets[options]
         is_certain = self._certain[options].all() & np.isfinite(rises).any(axis=1)
         without = np.where(is_certain, np.inf, self._unpaired_costs[options[0]])
-        costs = np.array([[one.cost] for one in pairings]) + np.column_stack([rises, without])
+        before = np.array([[pairing.cost] for pairing in pairings])
+        costs = before + np.column_stack([rises, without])
         rows = np.concatenate([-corners @ transpose(W) @ L[:, None], corners], axis=3)
         return _Extensions(pairings, options, costs, rows, tails)
 
     def _are_taken(self, pairings: list[Pairing], options: IntArray) -> BoolArray:
         """Return (b, o) whether the landmark of a pair is already that of another point."""
-        taken = np.array([self._pairs.landmarks[one.chosen] for one in pairings])
+        taken = np.array([self._pairs.landmarks[pairing.chosen] for pairing in pairings])
         same = self._pairs.landmarks[options][:, None] == taken[:, None]
         return np.asarray(same.any(axis=2))
 

@@ -211,14 +211,14 @@ def _named(
     costs no less than with all of them.
     """
     found = find_assignments(slam, gains, event, budget)
-    outliers = [np.isin(event.ids, suspects) & (one.rows < 0) for one in found]
+    outliers = [np.isin(event.ids, suspects) & (assignment.rows < 0) for assignment in found]
     pairs = list(zip(found, outliers, strict=True))
-    trusting = min((one.cost for one, some in pairs if not some.any()), default=0.0)
+    trusting = min((assignment.cost for assignment, out in pairs if not out.any()), default=0.0)
     named = []
-    for one, some in pairs:
-        cost = max(one.cost, trusting) if some.any() else one.cost
-        reading = _with_ids(slam, event, one, new_ids)
-        named.append(replace(reading, event=reading.event.select(~some), cost=cost))
+    for assignment, out in pairs:
+        cost = max(assignment.cost, trusting) if out.any() else assignment.cost
+        reading = _with_ids(slam, event, assignment, new_ids)
+        named.append(replace(reading, event=reading.event.select(~out), cost=cost))
     return named
 
 

@@ -4,10 +4,10 @@ Covariances that were computed around a poor early estimate stay wrong, so after
 stretch a plain filter closes its loop badly. How much its linearisation can have lost shows in
 how far its corrections have turned the robot.
 
-What was linearised anew stays as it is: from then on a summary stands for it, told so that later
-corrections hardly bend it (:meth:`.Prior.least_bent`). After a blind stretch there may be no such
-summary until landmarks seen before are seen again. Else the cost of looking back does not grow
-with the history, of which only :meth:`Hindsight.smooth` needs all.
+What was linearised anew stays as it is: from then on a summary stands for it, in coordinates in
+which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a blind stretch
+there may be no such summary until landmarks seen before are seen again. Else the cost of looking
+back does not grow with the history, of which only :meth:`Hindsight.smooth` needs all.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ by so many that each of them costs no more than an update, O(n²).
 MAX_INTERVAL = 300
 """Observations that are enough to be looked back at, however many there were before."""
 
-MAX_BEND_RAD = 0.2
-"""Angle by which a summary may yet be bent, see :meth:`.Prior.least_bent`; else there is none."""
+MAX_TURN_RAD = 0.2
+"""Angle, see :meth:`.Prior.least_nonlinear`, beyond which there is no summary."""
 
 EARLY_SHARE = 0.1
 """Share of the observations otherwise waited for that will do after a single large correction:
@@ -145,10 +145,10 @@ class Hindsight:
             self._is_owed = True
             return
         self._rest()
-        known, angle_rad = self._known(observer).least_bent(self._axes)
+        known, angle_rad = self._known(observer).least_nonlinear(self._axes)
         if self._window_is_full:
             self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
-        elif is_done and angle_rad < MAX_BEND_RAD:
+        elif is_done and angle_rad < MAX_TURN_RAD:
             self.history.summarise(known)
 
     def smooth(self, observer: Observer) -> Solution:

@@ -57,20 +57,20 @@ class Prior:
             rows[first:] = _turned(rows[first:], R.T) - C @ rows[:d]
         return replace(self, covariance=covariance, is_relative=True)
 
-    def least_bent(self, axes: Axes) -> tuple[Prior, float]:
-        """Return it told so that it is bent less: of the world, or of what is seen from the pose.
+    def least_nonlinear(self, axes: Axes) -> tuple[Prior, float]:
+        """Return it in the coordinates, world's or body's, in which heading changes it least.
 
-        A map that the robot has made may yet be turned as a whole, and the pose with it, by more
-        than the one against the other: told of the world it would be bent, to second order in
-        that angle. In a map that was loaded it is the pose alone that may yet be turned. After a
-        blind stretch it may be that either way bends it far.
+        A map that the robot has made may yet turn as a whole, and the pose with it, by more than
+        the one against the other: in world coordinates that is an error of second order in the
+        angle. In a map that was loaded it is the pose alone that may yet turn. After a blind
+        stretch either may turn far.
 
         Returns
         -------
         prior : Prior
             The same knowledge.
         angle_rad : float
-            By what angle it may yet be bent, a standard deviation.
+            Standard deviation of the angle by which it may yet turn in these coordinates.
 
         """
         turns = self._turns(axes)
