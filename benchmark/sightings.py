@@ -27,6 +27,8 @@ class SightingNoise:
     def add(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
         """Take in an observation; call it once for each, in the order of the stamps.
 
+        All points count as seen, also those that an estimator rejects later.
+
         Returns
         -------
         covariances : FloatArray

@@ -376,9 +376,9 @@ class Estimator:
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
 
-        It is that of the latest observation, in the body frame, of the first k coordinates: 2 in
-        ``two_d_mode``, else 3. ``rows`` (m,) are places in ``landmark_ids``. None where the gains
-        know none.
+        In the body frame, of the first k coordinates: 2 in ``two_d_mode``, else 3. It is that of
+        the state, which is moved on at observations: ask for it in ``on_update``. ``rows`` (m,)
+        are places in ``landmark_ids``. None where the gains know none.
         """
         return self._slam.configuration_covariance(self._slam.confirmed[rows])
 

@@ -207,6 +207,7 @@ class _Run:
         if self._estimator.jumps == self._jumps:
             return
         self._jumps = self._estimator.jumps
+        self._next_nees_ns = 0
         if self._settings.on_time_jump == 'reset':
             self._start()
 

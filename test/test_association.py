@@ -535,6 +535,6 @@ def test_reflectors_that_are_told_one_a_message_are_all_kept():
 
 def test_a_landmark_that_was_placed_anew_has_its_chance_again():
     landmarks = looked_at([4], [39], settled_looks=996, settled_seen=499)
-    landmarks.restart(np.array([1]))
+    landmarks.restart(np.array([1]), 0)
     landmarks.look(np.array([1]), np.array([False]))
     assert landmarks.unsupported(5).tolist() == []

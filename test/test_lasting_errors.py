@@ -12,8 +12,10 @@ from scipy.stats import chi2
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.observation_noise import lasting
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.landmark_table import LandmarkTable
 
 ERROR_TIME_S = 0.5
 RATE_HZ = 10
@@ -90,3 +92,37 @@ def test_hindsight_counts_an_observation_as_the_filter_did():
     again = standing(replace(SETTINGS, hindsight_turn=1e-9, hindsight_interval=5), 0, 5.0)
     variances = np.diag(covariance_of(again))
     np.testing.assert_allclose(variances, np.diag(covariance_of(estimator)), rtol=0.1)
+
+
+@pytest.mark.parametrize('stamp_ns', [0, 10**8, 10**12])
+def test_a_landmark_of_a_loaded_map_counts_fully_when_it_is_first_seen(stamp_ns):
+    covariances, counts = np.tile(1e-6 * np.eye(3), (4, 1, 1)), np.ones(4, dtype=np.int64)
+    known = LandmarkMap(np.arange(len(POINTS)), POINTS, covariances, counts)
+    estimator = Estimator(replace(SETTINGS, localization_mode='fixed'))
+    estimator.load_map(known, np.eye(4), np.eye(6))
+    estimator.add(ObservationEvent(stamp_ns, np.arange(len(POINTS)), POINTS))
+    assert np.sqrt(estimator.pose_covariance[3, 3]) < 0.6 * SETTINGS.point_noise
+
+
+def test_another_sensor_that_sees_at_the_same_instant_counts_like_the_first():
+    one, two = Estimator(SETTINGS), Estimator(SETTINGS)
+    for step in range(20):
+        first = ObservationEvent(step * 10**8, np.arange(len(POINTS)), POINTS)
+        shares = [*two._slam.landmarks.unseen_s(np.arange(len(two._slam.landmarks)), step * 10**8)]
+        assert all(share in (np.inf, 0.1) for share in shares)
+        for estimator in (one, two):
+            estimator.add(first)
+        two.add(replace(first, points=POINTS + 1e-3))
+    ratio = covariance_of(two).trace() / covariance_of(one).trace()
+    assert 0.4 < ratio < 0.8
+
+
+def test_a_landmark_that_was_placed_anew_has_not_been_seen_before():
+    landmarks, row = LandmarkTable(), np.array([0])
+    landmarks.add(np.array([7]), 0)
+    landmarks.see(row, 10**9)
+    assert landmarks.unseen_s(row, 2 * 10**9) == 1.0
+    assert landmarks.unseen_s(row, 10**9) == 1.0, 'by another sensor'
+    landmarks.restart(row, 3 * 10**9)
+    assert landmarks.unseen_s(row, 3 * 10**9) == np.inf
+    assert landmarks.unseen_s(row, 4 * 10**9) == 1.0

@@ -228,7 +228,7 @@ class FakeBuffer:
         return SimpleNamespace(nanoseconds=42 if source == 'camera' else 0)
 
     def all_frames_as_yaml(self):
-        return "camera:\n  parent: 'mast'\n  rate: 10.000\n"
+        return "*eye:\n  parent: 'a: b'\ncamera: \n  broadcaster: 'x'\n  parent: 'mast'\n"
 
     def clear(self):
         """Forget nothing."""
@@ -249,6 +249,7 @@ def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
     assert transforms.newest_ns('base', 'mast') == ALWAYS_NS
     assert transforms.newest_ns('base', 'sonar') is None
     assert transforms.parent_of('camera') == 'mast'
+    assert transforms.parent_of('*eye') == 'a: b'
     assert transforms.parent_of('mast') is None
     transforms.clear()
 

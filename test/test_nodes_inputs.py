@@ -217,6 +217,13 @@ def test_an_odometry_with_poses_alone_is_told_once(velocity, speed, is_told):
     assert all("velocity_source to 'pose_differences'" in text for text in told)
 
 
+def test_an_odometry_without_an_attitude_has_a_velocity():
+    message = odometry(0, 0, np.zeros(6))
+    message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
+    decode = decoders.OdometryDecoder(Mock())
+    assert_allclose(decode(serialize_message(message), 0).event.body_velocity, 0.0)
+
+
 def test_a_velocity_without_poses_has_no_pose_differences():
     settings = ObserverNodeSettings(velocity_source='pose_differences', velocity_type='Twist')
     with pytest.raises(ParameterError, match="'Twist' has no poses"):

@@ -118,6 +118,17 @@ def test_the_base_gets_no_second_parent(robot, parent, is_static):
     assert not robot.broadcaster.trouble
 
 
+def test_a_parent_that_comes_later_ends_the_bases_own_transform(robot):
+    robot.run(DISCOVERY_S + 1.0)
+    assert children(robot.take()) == {'base_link'}
+    robot.buffer.insert('odom_combined', 'base_link', robot.now_ns, ODOMETRY)
+    robot.run(1.0)
+    robot.take()
+    robot.run(1.0)
+    assert not robot.take()
+    assert "'base_link' has the parent 'odom_combined'" in robot.broadcaster.trouble
+
+
 @pytest.mark.parametrize('rate_factor', [1, 10])
 @pytest.mark.parametrize('lag_s', [0.1, 0.7, 3.0])
 def test_odometry_that_is_late_is_waited_for(monkeypatch, rate_factor, lag_s):

@@ -84,6 +84,7 @@ class Problem:
             landmarks,
             seen,
             np.linalg.inv(random_covariances(rng, len(frames), k, 0.1)),
+            rng.uniform(0.1, 1.0, len(frames)),
         )
         eta = self._tangents(0.1 * rng.normal(size=(FRAMES + 1, d)))
         self.start = Solution(poses @ se3.exp(eta), np.zeros(c), points)
@@ -123,8 +124,9 @@ class Problem:
             step = se3.inverse(solution.poses[s]) @ solution.poses[s + 1]
             error = se3.log(se3.inverse(motion) @ step)[pose]
             whitened.append(whiten(np.linalg.inv(frames.motion_covariances[s]), error))
+        counted = frames.information * frames.shares[:, None, None]
         for frame, landmark, point, information in zip(
-            frames.frames, frames.landmarks, frames.points, frames.information, strict=True
+            frames.frames, frames.landmarks, frames.points, counted, strict=True
         ):
             back = se3.inverse(solution.poses[frame + 1])
             error = se3.transform(back, solution.points[None, landmark])[0] - point

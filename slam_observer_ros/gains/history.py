@@ -139,9 +139,13 @@ class History:
     def relocate_landmarks(self, rows: IntArray) -> None:
         """Forget all about the landmarks at ``rows`` but their latest observation."""
         last = len(self.stamps_ns) - 1
-        self._change(
-            lambda frames: frames.only((frames.frames == last) | ~np.isin(frames.landmarks, rows))
-        )
+
+        def anew(frames: Frames) -> Frames:
+            kept = frames.only((frames.frames == last) | ~np.isin(frames.landmarks, rows))
+            is_first = np.isin(kept.landmarks, rows)
+            return replace(kept, shares=np.where(is_first, 1.0, kept.shares))
+
+        self._change(anew)
         self.prior = self.prior.with_unknown(self._axes, rows)
         self.summary = self.summary.with_unknown(self._axes, rows)
 
@@ -189,6 +193,7 @@ class History:
         to_body = se3.adjoint(back)[:, pose][:, :, pose]
         noises = np.array([frame.noise for frame in frames])
         numbers = np.arange(first, first + len(frames))
+        dt_s = np.concatenate([part.dt_s for part in seen])
         return Frames(
             motions=se3.inverse(back @ starts),
             motion_covariances=to_body @ noises @ transpose(to_body),
@@ -197,15 +202,9 @@ class History:
             frames=np.repeat(numbers, [len(part.rows) for part in seen]),
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
-            information=self._information(seen, k),
+            information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
+            shares=np.ones(len(dt_s)) / lasting(dt_s, self._observation_noise.error_time_s),
         )
-
-    def _information(self, seen: list[Seen], k: int) -> FloatArray:
-        """Return the inverse covariances (M, k, k) as which all points count, 1/m²."""
-        dt_s = np.concatenate([part.dt_s for part in seen])
-        share = np.ones(len(dt_s)) / lasting(dt_s, self._observation_noise.error_time_s)
-        information = np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64)
-        return information * share[:, None, None]
 
     def _covariances(self, seen: list[Seen]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""

@@ -7,6 +7,7 @@ import time
 import numpy as np
 from rclpy.node import Node
 
+from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.cloud_ids import missing_ids
@@ -88,10 +89,14 @@ class OdometryDecoder:
         # One that has told a velocity will do so again.
         self._is_told = self._is_told or bool(message.event.body_velocity.any())
         if not self._is_told:
-            self._look(decode_odometry_pose(raw).position)
+            self._look(raw)
         return message
 
-    def _look(self, position: FloatArray) -> None:
+    def _look(self, raw: Buffer) -> None:
+        try:
+            position = decode_odometry_pose(raw).position
+        except MessageError:  # with a quaternion of zeros, say: nobody asked for its pose
+            return
         if self._first is None:
             self._first = position
         if np.linalg.norm(position - self._first) > MOVED_M:

@@ -161,6 +161,6 @@ class Diagnostics:
     def _input_warning(source: Input[Any]) -> str:
         if source.trouble:
             return source.trouble
-        if source.age_s is None or source.age_s > SILENT_S:
+        if (source.age_s or 0.0) > SILENT_S:
             return f"no message on '{source.topic}'"
         return ''

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import re
 
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
-import yaml
 
 from slam_observer_ros.errors import MessageError, TransformError
 from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
@@ -94,9 +94,13 @@ class Tf2Transforms:
 
     def parent_of(self, frame: str) -> str | None:
         """As :meth:`TransformSource.parent_of`."""
-        frames = yaml.safe_load(self._buffer.all_frames_as_yaml())
-        known = frames.get(frame) if isinstance(frames, dict) else None
-        return known['parent'] if known else None
+        # Not by a YAML parser: a frame's name may be what that takes for an alias.
+        entry = re.search(
+            rf"^{re.escape(frame)}: *\n(?: +.*\n)*? +parent: '?([^'\n]*)'?",
+            self._buffer.all_frames_as_yaml(),
+            re.MULTILINE,
+        )
+        return entry[1] if entry else None
 
     def newest_ns(self, target: str, source: str) -> int | None:
         """As :meth:`TransformSource.newest_ns`."""

@@ -104,7 +104,8 @@ class Input(Generic[MessageT]):
         if self._fault:
             return self._fault
         if self.received == 0:
-            return f"no message yet on '{self.topic}' ({self._type_name})"
+            wanted = self._type_name or ' or '.join(self._decoders)
+            return f"no message yet on '{self.topic}' ({wanted})"
         age_s = self.age_s or 0.0
         if age_s > DISCOVERY_S:
             return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"

@@ -26,6 +26,9 @@ MAX_WAITING_NS = 10_000_000_000
 LATE_NS = 500_000_000
 """Odometry that is further behind the poses than this is reported, nanoseconds."""
 
+LOOK_PERIOD_S = 0.5
+"""Time between two looks for another parent of the base."""
+
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports of odometry that is behind."""
 
@@ -71,6 +74,8 @@ class PoseBroadcaster:
         self._tolerance_ns = to_ns(settings.transform_tolerance)
         self._held_back_ns = to_ns(reorder_window_s)
         self._begin_s: float | None = None
+        self._look_at_s = 0.0
+        self._parent = ''
         self._child = '' if settings.odom_frame else settings.base_frame
         self._waiting: deque[tuple[int, FloatArray]] = deque()
         self._correction: FloatArray | None = None
@@ -96,7 +101,7 @@ class PoseBroadcaster:
         self._look_for_delay(newest_ns)
         if self._child == self._settings.odom_frame:
             self._publish_correction(newest_ns)
-        elif self._child:
+        elif self._child and not self._other_parent():
             stamp_ns, pose = self._waiting.pop()
             self._waiting.clear()
             self._publish(stamp_ns, pose)
@@ -124,18 +129,25 @@ class PoseBroadcaster:
         if newest_ns is not None and self._child != self._settings.odom_frame:
             self._settle(self._settings.odom_frame, '/tf has')
         searched_s = time.monotonic() - (self._begin_s or 0.0)
-        if self._child or searched_s <= DISCOVERY_S:
-            return
-        settings = self._settings
-        parent = self._transforms.parent_of(settings.base_frame)
-        if settings.invert_tf or parent in (None, settings.map_frame):
-            self._settle(settings.base_frame, 'nobody publishes')
-        else:
+        if not self._child and searched_s > DISCOVERY_S and not self._other_parent():
+            self._settle(self._settings.base_frame, 'nobody publishes')
+
+    def _other_parent(self) -> str:
+        """Return who is the base's parent on /tf if that forbids to publish its pose; else ''."""
+        now_s, settings = time.monotonic(), self._settings
+        if now_s >= self._look_at_s:
+            self._look_at_s = now_s + LOOK_PERIOD_S
+            parent = self._transforms.parent_of(settings.base_frame)
+            is_free = settings.invert_tf or parent in (None, settings.map_frame)
+            is_free = is_free or not settings.odom_frame  # asked for, whoever else tells it
+            self._parent = '' if is_free or parent is None else parent
+        if self._parent:
             self._report(
-                f"'{settings.base_frame}' has the parent '{parent}' on /tf, so that no pose is "
-                'published there: set odom_frame to the frame of the odometry, or base_frame to '
-                "the robot's uppermost frame, or publish_tf to false"
+                f"'{settings.base_frame}' has the parent '{self._parent}' on /tf, so that no pose "
+                'is published there: set odom_frame to the frame of the odometry, or base_frame '
+                "to the robot's uppermost frame, or publish_tf to false"
             )
+        return self._parent
 
     def _look_for_delay(self, newest_ns: int | None) -> None:
         """Report odometry that is far behind the poses, or has ended."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.units import to_s
 
 PATIENCE = 4
 """How many times as often others must have been seen before a landmark has had its chance.
@@ -27,6 +28,9 @@ class LandmarkTable:
         (n,) how many observations in a row were rejected at one place, up to now.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
+    gaps_s : FloatArray
+        (n,) seconds from the accepted observation before the latest one to that, of another
+        stamp; infinite if there was none.
     tentative : BoolArray
         (n,) which have no id of their own, and have yet to be seen often enough to stay.
     looks : IntArray
@@ -39,6 +43,7 @@ class LandmarkTable:
         self.counts: IntArray = np.empty(0, dtype=np.int64)
         self.rejections: IntArray = np.empty(0, dtype=np.int64)
         self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
+        self.gaps_s: FloatArray = np.empty(0)
         self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
         self.looks: IntArray = np.empty(0, dtype=np.int64)
         self._settled_looks = 0
@@ -65,6 +70,7 @@ class LandmarkTable:
         self.rejections = np.concatenate([self.rejections, np.zeros(len(ids), dtype=np.int64)])
         self._rejected_at = np.concatenate([self._rejected_at, np.zeros((len(ids), 3))])
         self.last_seen_ns = np.concatenate([self.last_seen_ns, np.full(len(ids), stamp_ns)])
+        self.gaps_s = np.concatenate([self.gaps_s, np.full(len(ids), np.inf)])
         self.tentative = np.concatenate([self.tentative, is_automatic(ids)])
         self.looks = np.concatenate([self.looks, np.zeros(len(ids), dtype=np.int64)])
         self._order = np.argsort(self.ids)
@@ -79,6 +85,7 @@ class LandmarkTable:
     def restart_time(self) -> None:
         """Take all landmarks as last seen before any stamp to come."""
         self.last_seen_ns = np.full(len(self), -1)
+        self.gaps_s = np.full(len(self), np.inf)
 
     def renumber(self, rows: IntArray, ids: IntArray) -> None:
         """Give ``rows`` (m,) other ids (m,)."""
@@ -90,7 +97,19 @@ class LandmarkTable:
         """Count one more accepted observation of ``rows`` (m,)."""
         self.counts[rows] += 1
         self.rejections[rows] = 0
+        self.gaps_s[rows] = self.unseen_s(rows, stamp_ns)
         self.last_seen_ns[rows] = np.maximum(self.last_seen_ns[rows], stamp_ns)
+
+    def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
+        """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
+
+        What is seen again at the stamp at which it was seen is so by another sensor: that has
+        not seen it for as long as the first one had not.
+        """
+        last_ns = self.last_seen_ns[rows]
+        unseen_s = np.where(last_ns < 0, np.inf, to_s(stamp_ns - last_ns))
+        again: FloatArray = np.where(unseen_s == 0.0, self.gaps_s[rows], unseen_s)
+        return again
 
     def reject(self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray) -> None:
         """Count one more rejected observation of ``rows`` (m,).
@@ -152,8 +171,10 @@ class LandmarkTable:
         unseen = np.flatnonzero(self.last_seen_ns < stamp_ns)
         return unseen[np.lexsort((self.last_seen_ns[unseen], self.counts[unseen]))]
 
-    def restart(self, rows: IntArray) -> None:
-        """Take ``rows`` as seen for the first time."""
+    def restart(self, rows: IntArray, stamp_ns: int) -> None:
+        """Take ``rows`` as seen for the first time, at a stamp."""
+        self.last_seen_ns[rows] = stamp_ns
+        self.gaps_s[rows] = np.inf
         self.counts[rows] = 1
         self.rejections[rows] = 0
         self.tentative[rows] = is_automatic(self.ids[rows])
@@ -166,6 +187,7 @@ class LandmarkTable:
         self.rejections = np.delete(self.rejections, rows)
         self._rejected_at = np.delete(self._rejected_at, rows, axis=0)
         self.last_seen_ns = np.delete(self.last_seen_ns, rows)
+        self.gaps_s = np.delete(self.gaps_s, rows)
         self.tentative = np.delete(self.tentative, rows)
         self.looks = np.delete(self.looks, rows)
         self._order = np.argsort(self.ids)

@@ -13,7 +13,6 @@ from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.landmark_table import LandmarkTable
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.units import to_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,14 +113,13 @@ class Outlook:
         """Return what landmarks ``rows`` (m,) tell that were seen with ``covariances``, m²."""
         observer = self._observer
         e, r = observer.errors(rows, event.points)
-        unseen_ns = event.stamp_ns - self._landmarks.last_seen_ns[rows]
         return Residuals(
             rows,
             e,
             r,
             observer.a[rows],
             observer.turned(covariances),
-            to_s(unseen_ns),
+            self._landmarks.unseen_s(rows, event.stamp_ns),
         )
 
     def seen(self, event: ObservationEvent, rows: IntArray, dt_s: FloatArray) -> Seen:

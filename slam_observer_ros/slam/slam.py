@@ -118,7 +118,8 @@ class Slam:
         if P is None:
             return None
         m, k, p = len(rows), self.axes.point, len(self.axes.pose)
-        C = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, p)
+        points = self.observer.points + self.gains.postponed_shifts()
+        C = self.axes.output_matrix(points[rows]).reshape(-1, p)
         CP = C @ P[:p] - P[p:]
         blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
         R = self.observer.A[:k, :k]
@@ -343,7 +344,7 @@ class Slam:
                 self.observer.u[rows[far]] = 0.0
             y_ref = self.observer.y_ref[rows[far]]
             self.gains.relocate_landmarks(rows[far], y_ref, residuals.covariances[far])
-            self.landmarks.restart(rows[far])
+            self.landmarks.restart(rows[far], event.stamp_ns)
         return event.ids[moved]
 
     def _in_the_way(self, sighting: Sighting) -> IntArray:

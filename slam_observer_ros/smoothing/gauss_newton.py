@@ -48,6 +48,8 @@ class Frames:
         (M, 3) where it was seen, metres, body frame.
     information : FloatArray
         (M, k, k) inverse covariance of it, body frame, 1/m².
+    shares : FloatArray
+        (M,) how much of it counts: less than 1 where its error is partly that of a point before.
 
     """
 
@@ -59,6 +61,7 @@ class Frames:
     landmarks: IntArray
     points: FloatArray
     information: FloatArray
+    shares: FloatArray
 
     def only(self, kept: BoolArray) -> Frames:
         """Return the frames with only some of the points (M,)."""
@@ -68,6 +71,7 @@ class Frames:
             landmarks=self.landmarks[kept],
             points=self.points[kept],
             information=self.information[kept],
+            shares=self.shares[kept],
         )
 
 
@@ -89,6 +93,7 @@ def no_frames(d: int, c: int, k: int) -> Frames:
         landmarks=none,
         points=np.empty((0, 3)),
         information=np.empty((0, k, k)),
+        shares=np.empty(0),
     )
 
 
@@ -271,7 +276,8 @@ class Smoother:
         error = (predicted - frames.points)[:, :k]
         J_point = transpose(R)[:, :k, :k]
         J = np.concatenate([-self._axes.output_matrix(predicted), J_point], axis=2)
-        return _normal(J, frames.information * self._weights(error)[:, None, None], error)
+        counted = frames.shares * self._weights(error)
+        return _normal(J, frames.information * counted[:, None, None], error)
 
     def _weights(self, error: FloatArray) -> FloatArray:
         """Return Huber's weights (M,), which fall off faster where a filter would reject."""
