@@ -441,12 +441,7 @@ class Estimator:
             self._catch_up()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        if self.settings.two_d_mode:
-            event = flatten(event)
-        self._counts['observed_point'] += len(event.ids)
-        event = self._without_repeated(event)
-        if self.settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
-            self._warnings.unknown_ids(self.settings.gains)
+        event = self._usable(event)
         timeline = self._timeline
         timeline.begin(event.stamp_ns)
         if event.stamp_ns < (timeline.state_ns or 0):
@@ -470,6 +465,16 @@ class Estimator:
         )
         if self._on_update is not None:
             self._on_update(self._last)
+
+    def _usable(self, event: ObservationEvent) -> ObservationEvent:
+        """Return an observation as the states use it, and count its points."""
+        if self.settings.two_d_mode:
+            event = flatten(event)
+        self._counts['observed_point'] += len(event.ids)
+        event = self._without_repeated(event)
+        if self.settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
+            self._warnings.unknown_ids(self.settings.gains)
+        return event
 
     def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:
         """Leave out points with one id: nobody knows which of them is right."""
