@@ -8,6 +8,7 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observation_noise import lasting, ObservationNoise
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_s
 
 
 class SightingNoise:
@@ -41,7 +42,6 @@ class SightingNoise:
         before_ns = [self._last_seen_ns.get(landmark_id) for landmark_id in ids]
         self._last_seen_ns.update(dict.fromkeys(ids, event.stamp_ns))
         dt_s = np.array(
-            [np.inf if last is None else (event.stamp_ns - last) * 1e-9 for last in before_ns]
+            [np.inf if last is None else to_s(event.stamp_ns - last) for last in before_ns]
         )
-        factors = np.ones(len(ids)) * lasting(dt_s, self._noise.error_time_s)
-        return self._noise.covariances(event), factors
+        return self._noise.covariances(event), lasting(dt_s, self._noise.error_time_s)

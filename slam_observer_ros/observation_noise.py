@@ -82,7 +82,7 @@ class ObservationNoise(Immutable):
         return _invertible(_along_and_across(sights, range_squared, along, across))
 
 
-def lasting(dt_s: FloatArray, error_time_s: float) -> FloatArray | float:
+def lasting(dt_s: FloatArray, error_time_s: float) -> FloatArray:
     """Return by how much less observations (m,) tell if their errors last.
 
     An error with the correlation time τ is ρ = e^(−dt/τ) times what it was ``dt_s`` before, and
@@ -98,7 +98,7 @@ def lasting(dt_s: FloatArray, error_time_s: float) -> FloatArray | float:
 
     """
     if error_time_s == 0.0:
-        return 1.0
+        return np.ones(len(dt_s))
     new = -np.expm1(-np.maximum(dt_s, MIN_INTERVAL_S) / error_time_s)  # 1 − ρ
     factors: FloatArray = (2.0 - new) / new
     return factors

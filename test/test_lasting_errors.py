@@ -39,7 +39,7 @@ def test_observations_tell_together_what_their_joint_covariance_says(n, dt_s, er
 
 
 def test_errors_that_do_not_last_make_nothing_larger():
-    assert lasting(np.array([0.0, 1.0, np.inf]), 0.0) == 1.0
+    assert (lasting(np.array([0.0, 1.0, np.inf]), 0.0) == 1.0).all()
 
 
 def standing(settings, seed, duration_s=20.0):

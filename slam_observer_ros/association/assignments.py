@@ -77,7 +77,7 @@ def find_assignments(
 
     """
     axes, m = slam.axes, len(event.ids)
-    seen = _Seen(slam, event)
+    seen = _Points(slam, event)
     at, rows = _candidates(slam, gains, seen)
     residuals = _as_residuals(slam.observer, seen, at, rows)
     PC, CPC = gains.predicted(residuals)
@@ -104,7 +104,7 @@ def find_assignments(
     return assignments
 
 
-class _Seen:
+class _Points:
     """The points of an observation in the reference frame, and what their ids say.
 
     Attributes
@@ -127,7 +127,7 @@ class _Seen:
         self.is_new_id = (event.ids != UNKNOWN_ID) & (self.known_rows < 0)
 
 
-def _candidates(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray, IntArray]:
+def _candidates(slam: Slam, gains: RiccatiGains, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate.
 
     Each passes it alone: those of one point are the :data:`MAX_CANDIDATES` nearest at most.
@@ -143,7 +143,7 @@ def _candidates(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray,
     return at[near], rows[near]
 
 
-def _pairs_near(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray, IntArray]:
+def _pairs_near(slam: Slam, gains: RiccatiGains, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
     C = SPATIAL.output_matrix(seen.points)
     covariances = C @ gains.pose_covariance @ transpose(C) + seen.noise
@@ -152,7 +152,7 @@ def _pairs_near(slam: Slam, gains: RiccatiGains, seen: _Seen) -> tuple[IntArray,
     return slam.index.near(slam.observer.points, seen.points, reach_m)
 
 
-def _may_be(slam: Slam, seen: _Seen, at: IntArray, rows: IntArray) -> BoolArray:
+def _may_be(slam: Slam, seen: _Points, at: IntArray, rows: IntArray) -> BoolArray:
     """Return which pairs (q,) of a point and a landmark the ids of the points allow."""
     is_automatic_id = is_automatic(slam.landmarks.ids)
     others = ~np.isin(rows, seen.known_rows) & (~seen.is_new_id[at] | is_automatic_id[rows])
@@ -160,7 +160,7 @@ def _may_be(slam: Slam, seen: _Seen, at: IntArray, rows: IntArray) -> BoolArray:
     return np.asarray(np.where(known_rows >= 0, rows == known_rows, others))
 
 
-def _as_residuals(observer: Observer, seen: _Seen, at: IntArray, rows: IntArray) -> Residuals:
+def _as_residuals(observer: Observer, seen: _Points, at: IntArray, rows: IntArray) -> Residuals:
     """Return what it would be if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
     a = observer.a[rows]
     e = seen.points[at] - a

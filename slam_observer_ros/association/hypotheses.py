@@ -98,7 +98,7 @@ class Hypotheses:
         likelihoods = np.exp(-0.5 * np.array(self._costs))
         weights, spread = likelihoods / likelihoods.sum(), np.zeros((6, 6))
         own = self.best.state_covariance
-        for slam, weight in zip(self._states, weights.tolist(), strict=True):
+        for slam, weight in zip(self._states[1:], weights[1:].tolist(), strict=True):
             covariance = slam.state_covariance
             if own is None or covariance is None:
                 return None

@@ -31,7 +31,7 @@ class Residuals:
     covariances : FloatArray
         (m, 3, 3) covariances of the points seen, rotated into the reference frame, m².
     dt_s : FloatArray
-        (m,) seconds since each of them was seen before.
+        (m,) seconds since each of them was seen before, in this run; else infinite.
 
     """
 

@@ -203,7 +203,7 @@ class History:
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
-            shares=np.ones(len(dt_s)) / lasting(dt_s, self._observation_noise.error_time_s),
+            shares=1.0 / lasting(dt_s, self._observation_noise.error_time_s),
         )
 
     def _covariances(self, seen: list[Seen]) -> FloatArray:

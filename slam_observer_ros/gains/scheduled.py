@@ -55,11 +55,6 @@ class ScheduledGains(GainDesign):
     settings : Settings
         Noise, calibration, robustness and ``two_d_mode``.
 
-    Attributes
-    ----------
-    calibration : Calibration
-        Scale, bias and delay of the velocity, as far as they are known.
-
     """
 
     def __init__(self, settings: Settings) -> None:

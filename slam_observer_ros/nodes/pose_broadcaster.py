@@ -137,10 +137,10 @@ class PoseBroadcaster:
         now_s, settings = time.monotonic(), self._settings
         if now_s >= self._look_at_s:
             self._look_at_s = now_s + LOOK_PERIOD_S
-            parent = self._transforms.parent_of(settings.base_frame)
-            is_free = settings.invert_tf or parent in (None, settings.map_frame)
-            is_free = is_free or not settings.odom_frame  # asked for, whoever else tells it
-            self._parent = '' if is_free or parent is None else parent
+            parent = self._transforms.parent_of(settings.base_frame) or ''
+            # Without odom_frame it was asked for, whoever else tells the base.
+            is_told = settings.odom_frame and not settings.invert_tf
+            self._parent = parent if is_told and parent != settings.map_frame else ''
         if self._parent:
             self._report(
                 f"'{settings.base_frame}' has the parent '{self._parent}' on /tf, so that no pose "

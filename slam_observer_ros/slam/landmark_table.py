@@ -28,9 +28,8 @@ class LandmarkTable:
         (n,) how many observations in a row were rejected at one place, up to now.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
-    gaps_s : FloatArray
-        (n,) seconds from the accepted observation before the latest one to that, of another
-        stamp; infinite if there was none.
+    seen_before_ns : IntArray
+        (n,) stamp of the latest one before that, nanoseconds; −1 if there was none.
     tentative : BoolArray
         (n,) which have no id of their own, and have yet to be seen often enough to stay.
     looks : IntArray
@@ -43,7 +42,7 @@ class LandmarkTable:
         self.counts: IntArray = np.empty(0, dtype=np.int64)
         self.rejections: IntArray = np.empty(0, dtype=np.int64)
         self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
-        self.gaps_s: FloatArray = np.empty(0)
+        self.seen_before_ns: IntArray = np.empty(0, dtype=np.int64)
         self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
         self.looks: IntArray = np.empty(0, dtype=np.int64)
         self._settled_looks = 0
@@ -70,7 +69,7 @@ class LandmarkTable:
         self.rejections = np.concatenate([self.rejections, np.zeros(len(ids), dtype=np.int64)])
         self._rejected_at = np.concatenate([self._rejected_at, np.zeros((len(ids), 3))])
         self.last_seen_ns = np.concatenate([self.last_seen_ns, np.full(len(ids), stamp_ns)])
-        self.gaps_s = np.concatenate([self.gaps_s, np.full(len(ids), np.inf)])
+        self.seen_before_ns = np.concatenate([self.seen_before_ns, np.full(len(ids), -1)])
         self.tentative = np.concatenate([self.tentative, is_automatic(ids)])
         self.looks = np.concatenate([self.looks, np.zeros(len(ids), dtype=np.int64)])
         self._order = np.argsort(self.ids)
@@ -85,7 +84,7 @@ class LandmarkTable:
     def restart_time(self) -> None:
         """Take all landmarks as last seen before any stamp to come."""
         self.last_seen_ns = np.full(len(self), -1)
-        self.gaps_s = np.full(len(self), np.inf)
+        self.seen_before_ns = np.full(len(self), -1)
 
     def renumber(self, rows: IntArray, ids: IntArray) -> None:
         """Give ``rows`` (m,) other ids (m,)."""
@@ -97,8 +96,11 @@ class LandmarkTable:
         """Count one more accepted observation of ``rows`` (m,)."""
         self.counts[rows] += 1
         self.rejections[rows] = 0
-        self.gaps_s[rows] = self.unseen_s(rows, stamp_ns)
-        self.last_seen_ns[rows] = np.maximum(self.last_seen_ns[rows], stamp_ns)
+        last_ns = self.last_seen_ns[rows]
+        self.seen_before_ns[rows] = np.where(
+            last_ns < stamp_ns, last_ns, self.seen_before_ns[rows]
+        )
+        self.last_seen_ns[rows] = np.maximum(last_ns, stamp_ns)
 
     def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
         """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
@@ -107,9 +109,9 @@ class LandmarkTable:
         not seen it for as long as the first one had not.
         """
         last_ns = self.last_seen_ns[rows]
-        unseen_s = np.where(last_ns < 0, np.inf, to_s(stamp_ns - last_ns))
-        again: FloatArray = np.where(unseen_s == 0.0, self.gaps_s[rows], unseen_s)
-        return again
+        since_ns = np.where(last_ns == stamp_ns, self.seen_before_ns[rows], last_ns)
+        unseen_s: FloatArray = np.where(since_ns < 0, np.inf, to_s(stamp_ns - since_ns))
+        return unseen_s
 
     def reject(self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray) -> None:
         """Count one more rejected observation of ``rows`` (m,).
@@ -174,7 +176,7 @@ class LandmarkTable:
     def restart(self, rows: IntArray, stamp_ns: int) -> None:
         """Take ``rows`` as seen for the first time, at a stamp."""
         self.last_seen_ns[rows] = stamp_ns
-        self.gaps_s[rows] = np.inf
+        self.seen_before_ns[rows] = -1
         self.counts[rows] = 1
         self.rejections[rows] = 0
         self.tentative[rows] = is_automatic(self.ids[rows])
@@ -187,7 +189,7 @@ class LandmarkTable:
         self.rejections = np.delete(self.rejections, rows)
         self._rejected_at = np.delete(self._rejected_at, rows, axis=0)
         self.last_seen_ns = np.delete(self.last_seen_ns, rows)
-        self.gaps_s = np.delete(self.gaps_s, rows)
+        self.seen_before_ns = np.delete(self.seen_before_ns, rows)
         self.tentative = np.delete(self.tentative, rows)
         self.looks = np.delete(self.looks, rows)
         self._order = np.argsort(self.ids)
