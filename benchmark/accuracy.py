@@ -46,7 +46,7 @@ def main() -> None:
             'no recordings in %s (SLAM_OBSERVER_DATA names their folder): simulation only',
             worlds.data_folder(),
         )
-    chosen = [name for name in worlds.names() if args.only.lower() in name.lower()]
+    chosen = chosen_worlds(args.only)
     loops = [] if args.only else list(monte_carlo.LOOPS)
     seeds = range(args.seed, args.seed + (QUICK_RUNS if args.quick else RUNS))
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
@@ -78,7 +78,17 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         '--write-docs', action='store_true', help='write docs/benchmark.md and its figure anew'
     )
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.write_docs and (args.only or args.quick):
+        parser.error('--write-docs takes the whole benchmark, without --only or --quick')
+    if not chosen_worlds(args.only):
+        parser.error(f"--only '{args.only}' fits no data set: {', '.join(worlds.names())}")
+    return args
+
+
+def chosen_worlds(part: str) -> list[str]:
+    """Return the names of the data sets that contain ``part``."""
+    return [name for name in worlds.names() if part.lower() in name.lower()]
 
 
 def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:

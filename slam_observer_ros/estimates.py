@@ -11,6 +11,7 @@ UNUSED_POINTS = {
     'rejected_landmark': 'rejected',
     'unknown_id': 'without id',
     'repeated_id': 'of a repeated id',
+    'reserved_id': 'of a reserved id',
     'unmapped_landmark': 'not mapped',
 }
 """Names under which points are counted that were observed and are not used, and what they are."""

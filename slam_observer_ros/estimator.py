@@ -15,9 +15,7 @@ from slam_observer_ros.event_warnings import EventWarnings
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
-    flatten,
     ObservationEvent,
-    UNKNOWN_ID,
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
@@ -30,6 +28,7 @@ from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_ns, to_s
+from slam_observer_ros.usable_points import usable_points
 from slam_observer_ros.validation import check_event, check_map, check_pose
 
 logger = logging.getLogger(__name__)
@@ -67,8 +66,8 @@ class Estimator:
         not where odometry had it (``'slip'``) or nothing in view, without ids, where the map has
         it (``'strange_place'``), and what became of landmarks
         (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'`` and
-        ``'repeated_id'``, which are not used).
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``,
+        ``'repeated_id'`` and ``'reserved_id'``, which are not used).
     dropped : Counter
         Events refused, by reason.
     jumps : int
@@ -364,8 +363,10 @@ class Estimator:
 
     @property
     def world_points(self) -> FloatArray:
-        """(n, 3) estimated landmarks, metres, world."""
-        return self._slam.world_points[self._slam.confirmed]
+        """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
+        timeline, points = self._timeline, self._slam.world_points[self._slam.confirmed]
+        lead_s = to_s((timeline.stamp_ns or 0) - (timeline.state_ns or 0))
+        return points + lead_s * self.landmark_velocities
 
     @property
     def landmark_covariances(self) -> FloatArray | None:
@@ -441,7 +442,7 @@ class Estimator:
             self._catch_up()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        event = self._usable(event)
+        event = usable_points(event, self.settings, self._counts, self._warnings)
         timeline = self._timeline
         timeline.begin(event.stamp_ns)
         if event.stamp_ns < (timeline.state_ns or 0):
@@ -465,26 +466,6 @@ class Estimator:
         )
         if self._on_update is not None:
             self._on_update(self._last)
-
-    def _usable(self, event: ObservationEvent) -> ObservationEvent:
-        """Return an observation as the states use it, and count its points."""
-        if self.settings.two_d_mode:
-            event = flatten(event)
-        self._counts['observed_point'] += len(event.ids)
-        event = self._without_repeated(event)
-        if self.settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
-            self._warnings.unknown_ids(self.settings.gains)
-        return event
-
-    def _without_repeated(self, event: ObservationEvent) -> ObservationEvent:
-        """Leave out points with one id: nobody knows which of them is right."""
-        repeated = event.repeated_ids()
-        if not repeated:
-            return event
-        left = event.select(~np.isin(event.ids, repeated))
-        self._counts['repeated_id'] += len(event.ids) - len(left.ids)
-        self._warnings.repeated_ids(repeated)
-        return left
 
     def _catch_up(self) -> None:
         """Move the states on to the last event that was used."""

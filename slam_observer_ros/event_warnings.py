@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import logging
 
 from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID, LAST_AUTOMATIC_ID
 from slam_observer_ros.types import IntArray
 
 logger = logging.getLogger(__name__)
@@ -40,10 +41,16 @@ class EventWarnings:
 
     def repeated_ids(self, ids: Sequence[int]) -> None:
         """Tell that an observation has several points of each of these ids."""
-        named = ', '.join(str(landmark_id) for landmark_id in ids[:MAX_NAMED])
-        more = ' and others' if len(ids) > MAX_NAMED else ''
-        text = f'Not used: an observation has several points of the ids {named}{more}'
+        text = f'Not used: an observation has several points of the ids {_list(ids)}'
         self._warn('repeated_id', text)
+
+    def reserved_ids(self, ids: Sequence[int]) -> None:
+        """Tell that a sensor has ids which landmarks without one are given."""
+        text = (
+            f'Not used: points with the ids {_list(ids)}; those from {FIRST_AUTOMATIC_ID} to '
+            f'{LAST_AUTOMATIC_ID} number landmarks without an id: give these others'
+        )
+        self._warn('reserved_id', text)
 
     def unknown_ids(self, gains: str) -> None:
         """Tell that these gains can't use points without an id."""
@@ -67,3 +74,9 @@ class EventWarnings:
         count = self._counts[kind]
         if str(count).rstrip('0') == '1':
             logger.warning('%s (%d so far).', text, count)
+
+
+def _list(ids: Sequence[int]) -> str:
+    """Return the first few ids, as a sentence names them."""
+    named = ', '.join(str(landmark_id) for landmark_id in ids[:MAX_NAMED])
+    return named + (' and others' if len(ids) > MAX_NAMED else '')

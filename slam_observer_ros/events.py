@@ -20,7 +20,10 @@ MAX_ID = 2**32 - 2
 """Largest landmark id: those that go out are uint32, whose last one says that it is unknown."""
 
 FIRST_AUTOMATIC_ID = 10_000_000
-"""Landmarks whose sensor gives no ids are numbered from here on, up to 2²⁴, exact in float32."""
+"""Landmarks whose sensor gives no ids are numbered from here on."""
+
+LAST_AUTOMATIC_ID = 2**24 - 1
+"""They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +177,7 @@ class LandmarkTruth:
 
 def is_automatic(ids: IntArray) -> BoolArray:
     """Return which ids (m,) were given to landmarks whose sensor gives none."""
-    automatic: BoolArray = (ids >= FIRST_AUTOMATIC_ID) & (ids < 2**24)
+    automatic: BoolArray = (ids >= FIRST_AUTOMATIC_ID) & (ids <= LAST_AUTOMATIC_ID)
     return automatic
 
 

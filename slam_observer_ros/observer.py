@@ -127,9 +127,15 @@ class Observer:
         self.u = np.concatenate([self.u, np.zeros_like(y_ref)])
 
     def relocate_landmarks(self, rows: IntArray, points: FloatArray) -> None:
-        """Give landmarks a new reference y_i° = Â y_i where seen now, ``points`` (m, 3)."""
+        """Put landmarks, at rest, where seen now: y_i° = Â y_i with ``points`` y_i (m, 3)."""
         self.y_ref[rows] = se3.transform(self.A, points)
-        self.a[rows] = 0.0
+        self.a[rows] = self.u[rows] = 0.0
+
+    def hold_landmarks(self, y_ref: FloatArray) -> None:
+        """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest."""
+        self.rebase(self.A, y_ref)
+        self.u = np.zeros_like(y_ref)
+        self.have_moved = False
 
     def rebase(self, A: FloatArray, y_ref: FloatArray) -> None:
         """Take Â (4, 4) and the landmarks (n, 3) as they are for the reference, with â_i = 0."""
@@ -194,7 +200,7 @@ class Observer:
         self.A[:3, :3] = so3.normalise(self.A[:3, :3])
 
     def set_landmark_velocities(self, rows: IntArray, velocities: FloatArray) -> None:
-        """Let landmarks move from now on.
+        """Let landmarks move from now on, or rest.
 
         Parameters
         ----------

@@ -51,7 +51,7 @@ def read_parameter_file(path: Path) -> dict[str, object]:
         content = yaml.load(path.read_bytes(), _RosLoader)
     except OSError as error:
         raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = str(error).splitlines()[0]
         raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
     values: dict[str, object] = {}

@@ -103,7 +103,10 @@ class Parameter:
     def _number(self, value: object) -> float:
         is_number = isinstance(value, Real) and not isinstance(value, bool)
         self._expect(value, is_number, 'a number')
-        number = float(cast('float', value))
+        try:
+            number = float(cast('float', value))
+        except OverflowError:
+            number = math.inf
         self._expect(value, math.isfinite(number), 'a finite number')
         return number
 

@@ -114,6 +114,7 @@ class Settings(Immutable):
         'deviation after 1 s',
         unit='rad/√s',
         minimum=0.0,
+        maximum=100.0,
     )
     unknown_linear_motion: float = parameter(
         0.5,
@@ -121,6 +122,7 @@ class Settings(Immutable):
         'deviation after 1 s',
         unit='m/√s',
         minimum=0.0,
+        maximum=1000.0,
     )
     observation_model: str = parameter(
         'range_bearing',
@@ -151,38 +153,43 @@ class Settings(Immutable):
     )
     observation_error_time: float = parameter(
         0.0,
-        'How long the error of an observed landmark lasts, as its correlation time, where it is '
-        'not new in each observation: that of a calibration, or of a tag seen from one side',
+        'Scheduled and Riccati gains: how long the error of an observed landmark lasts, as its '
+        'correlation time, where it is not new in each observation: that of a calibration, or of '
+        'a tag seen from one side',
         unit='s',
         minimum=0.0,
         maximum=60.0,
     )
     angular_scale_error: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Scale error of the angular velocity x y z to be estimated: its standard deviation',
+        'Scheduled and Riccati gains: scale error of the angular velocity x y z to be estimated: '
+        'its standard deviation',
         minimum=0.0,
     )
     linear_scale_error: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Scale error of the linear velocity x y z to be estimated: its standard deviation',
+        'Scheduled and Riccati gains: scale error of the linear velocity x y z to be estimated: '
+        'its standard deviation',
         minimum=0.0,
     )
     angular_bias_error: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Bias of the angular velocity x y z to be estimated: its standard deviation',
+        'Scheduled and Riccati gains: bias of the angular velocity x y z to be estimated: its '
+        'standard deviation',
         unit='rad/s',
         minimum=0.0,
     )
     linear_bias_error: Vector3 = parameter(
         (0.0, 0.0, 0.0),
-        'Bias of the linear velocity x y z to be estimated: its standard deviation',
+        'Scheduled and Riccati gains: bias of the linear velocity x y z to be estimated: its '
+        'standard deviation',
         unit='m/s',
         minimum=0.0,
     )
     velocity_delay_error: float = parameter(
         0.0,
-        'How much later than its stamp a velocity shows in observations, to be estimated: its '
-        'standard deviation',
+        'Scheduled and Riccati gains: how much later than its stamp a velocity shows in '
+        'observations, to be estimated: its standard deviation',
         unit='s',
         minimum=0.0,
         maximum=MAX_DELAY_S,
@@ -205,13 +212,15 @@ class Settings(Immutable):
     )
     huber_threshold: float = parameter(
         1.345,
-        'Standard deviations of noise beyond which an observation loses weight; 0 for never',
+        'Scheduled and Riccati gains: standard deviations of noise beyond which an observation '
+        'loses weight; 0 for never',
         minimum=0.0,
         read_only=False,
     )
     rejection_distance: float = parameter(
         6.0,
-        'Standard deviations of the residual beyond which an observation is rejected',
+        'Scheduled and Riccati gains: standard deviations of the residual beyond which an '
+        'observation is rejected',
         unit='σ',
         minimum=1.0,
         read_only=False,
@@ -223,8 +232,8 @@ class Settings(Immutable):
     )
     max_rejections: int = parameter(
         5,
-        'Rejections in a row, all at one place, after which a landmark is taken to have moved; '
-        'one more than it was seen, if that is fewer',
+        'Scheduled and Riccati gains: rejections in a row, all at one place, after which a '
+        'landmark is taken to have moved; one more than it was seen, if that is fewer',
         minimum=1,
     )
     max_landmarks: int = parameter(
@@ -234,14 +243,14 @@ class Settings(Immutable):
     )
     min_support: int = parameter(
         5,
-        'Points without id: how often a landmark must be seen to be in the map; it is forgotten '
-        'if it has been in view four times as long as others take for that',
+        'Riccati gains, points without id: how often a landmark must be seen to be in the map; it '
+        'is forgotten if it has been in view four times as long as others take for that',
         minimum=1,
     )
     max_hypotheses: int = parameter(
         8,
-        'Points without id, or with one that may be wrong, or a robot that may have slipped: most '
-        'states that are followed until it is clear which one is right',
+        'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
+        'have slipped: most states that are followed until it is clear which one is right',
         minimum=1,
     )
     hindsight_interval: int = parameter(
@@ -266,7 +275,8 @@ class Settings(Immutable):
     localization_mode: str = parameter(
         'off',
         'What a loaded map is: off, a start from which mapping goes on; uncertain, landmarks that '
-        'are refined within their covariance, with no new ones added; fixed, exact',
+        'are refined within their covariance (constant gains know none), with no new ones added; '
+        'fixed, exact and at rest',
         choices=('off', 'uncertain', 'fixed'),
     )
     set_initial_pose: bool = parameter(

@@ -42,8 +42,8 @@ def check_event(event: Event) -> None:
     """
     if not isinstance(event, Event):
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
-    if not isinstance(event.stamp_ns, int | np.integer):
-        reason = f'stamp {event.stamp_ns!r} is no integer: stamps are in nanoseconds'
+    if not isinstance(event.stamp_ns, int | np.signedinteger):
+        reason = f'stamp {event.stamp_ns!r} is no signed integer: stamps are in nanoseconds'
         raise InvalidEventError('wrong_type', reason)
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
@@ -118,6 +118,8 @@ def _check_observation(event: ObservationEvent) -> None:
     m = len(event.points) if is_stack else 0
     if not isinstance(event.ids, np.ndarray) or event.ids.dtype.kind not in 'iu':
         raise InvalidEventError('wrong_type', 'landmark ids are not an array of integers')
+    if event.ids.dtype == np.uint64:  # which NumPy joins with int64 as float64
+        raise InvalidEventError('wrong_type', 'landmark ids are uint64: make them int64')
     _check_coordinates('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'ids {event.ids.shape} for {m} landmark points')

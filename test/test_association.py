@@ -538,3 +538,25 @@ def test_a_landmark_that_was_placed_anew_has_its_chance_again():
     landmarks.restart(np.array([1]), 0)
     landmarks.look(np.array([1]), np.array([False]))
     assert landmarks.unsupported(5).tolist() == []
+
+
+def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
+    def run(is_asked):
+        """Two rows of look-alikes, a blind stretch, and then one of them."""
+        rng, estimator = np.random.default_rng(0), Estimator(PLANAR)
+        points = np.array([[2.0 * i, 2.0 * (i % 2) - 1.0, 0.0] for i in range(6)])
+        time_s = 1.0
+        for step in range(25):
+            time_s += 6.0 if step == 20 else 0.1
+            stand(estimator, time_s)
+            seen = points if step < 20 else points[:1]
+            observe(estimator, time_s, seen + rng.normal(scale=0.02, size=seen.shape) * [1, 1, 0])
+        assert len(estimator._frame.states) > 1
+        first = estimator.pose_covariance if is_asked else None
+        for step in range(1, 201):
+            stand(estimator, time_s + 0.01 * step, (0, 0, 0.5, 1, 0, 0))
+        return first, estimator.pose_covariance
+
+    (before, after), (_, unasked) = run(True), run(False)
+    assert_array_equal(after, unasked)
+    assert before[2, 2] < after[2, 2]

@@ -19,13 +19,21 @@ from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.event_queue import CONFIRMATIONS
-from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.events import (
+    FIRST_AUTOMATIC_ID,
+    LAST_AUTOMATIC_ID,
+    ObservationEvent,
+    PoseTruth,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
 
+GAINS = ('constant', 'scheduled', 'riccati')
 START_NS = 1_700_000_000_000_000_000
 LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 1], [0, 4, 0.5], [1, -4, 0], [2, 2, 2]])
 BODY_VELOCITY = np.array([0.05, -0.1, 0.3, 1.0, 0.1, -0.05])
@@ -272,6 +280,8 @@ def bad_events():
         ('wrong_type', VelocityEvent(stamp_ns, BODY_VELOCITY.tolist())),
         ('wrong_type', ObservationEvent(stamp_ns, np.array([1.5, 2.0]), points)),
         ('wrong_type', ObservationEvent(stamp_ns, [1, 2], points)),
+        ('wrong_type', ObservationEvent(stamp_ns, good.ids.astype(np.uint64), points)),
+        ('wrong_type', VelocityEvent(np.uint64(stamp_ns), BODY_VELOCITY)),
         ('wrong_type', None),
         ('wrong_type', PoseTruth(stamp_ns, np.eye(4))),
         ('too_large', VelocityEvent(2**70, BODY_VELOCITY)),
@@ -310,6 +320,24 @@ def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason,
     estimator.flush()
     untouched.flush()
     assert_same_state(estimator, untouched)
+
+
+@pytest.mark.parametrize('gains', GAINS)
+def test_points_with_ids_that_are_kept_for_others_are_left_out_counted_and_named(caplog, gains):
+    estimator, without = Estimator(Settings(gains=gains)), Estimator(Settings(gains=gains))
+    for step in range(5):
+        event = observation(0.1 * step, [4, 0, 1, 2])
+        ids = np.array([4, FIRST_AUTOMATIC_ID, LAST_AUTOMATIC_ID, LAST_AUTOMATIC_ID + 1])
+        assert estimator.add(replace(event, ids=ids))
+        without.add(replace(event, ids=ids[[0, 3]], points=event.points[[0, 3]]))
+    estimator.flush()
+    without.flush()
+    assert_same_state(estimator, without)
+    assert estimator.landmark_ids.tolist() == [4, LAST_AUTOMATIC_ID + 1]
+    assert estimator.counts['reserved_id'] == 10
+    assert used_points(estimator.counts) == 10
+    assert 'points with the ids 10000000, 16777215;' in caplog.text
+    assert len(caplog.records) == 1
 
 
 @pytest.mark.parametrize('repeated', [[1, 1], [1, 1, 1], [1, 3, 3, 1]])
@@ -408,7 +436,7 @@ def test_landmarks_that_move_again_and_again_are_told_of_ever_more_seldom(caplog
     assert told == [f'Landmarks [2] have moved ({times} so far).' for times in (1, 10)]
 
 
-@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('gains', GAINS)
 def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains):
     speed = np.array(
         [[0.2, 0.0, 0.0], [0.0, -0.3, 0.1], [0.0, 0.0, 0.0], [0.1, 0.1, 0.0], [0, 0, 0.2]]
@@ -430,6 +458,62 @@ def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains)
     np.testing.assert_allclose(estimator.pose, true_pose(9.95), atol=1e-6)
 
 
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_landmark_stops_where_its_sensor_says_nothing_of_a_velocity_any_more(gains):
+    estimator = Estimator(Settings(gains=gains, confirmations=1, reorder_window=0.0))
+    for step in range(60):
+        points, speed = LANDMARKS.copy(), np.zeros_like(LANDMARKS)
+        points[0, 0] += 0.1 * min(step, 10)
+        speed[0, 0] = 1.0
+        estimator.add(velocity(0.1 * step, np.zeros(6)))
+        seen = ObservationEvent(START_NS + step * 10**8, np.arange(5), points)
+        estimator.add(replace(seen, velocities=speed) if step < 10 else seen)
+    np.testing.assert_allclose(estimator.world_points, points, atol=1e-6)
+    np.testing.assert_array_equal(estimator.landmark_velocities, 0.0)
+    assert estimator.counts['rejected_landmark'] == 0
+
+
+@pytest.mark.parametrize('gains', GAINS)
+def test_moving_landmarks_are_where_they_are_at_the_stamp_of_the_pose(gains):
+    estimator = Estimator(Settings(gains=gains, confirmations=1, reorder_window=0.0))
+    speed = np.zeros_like(LANDMARKS)
+    speed[:, 1] = 2.0
+    estimator.add(velocity(0.0, np.zeros(6)))
+    estimator.add(ObservationEvent(START_NS, np.arange(5), LANDMARKS, None, speed))
+    for step in range(1, 51):
+        estimator.add(velocity(0.02 * step, np.zeros(6)))
+        expected = LANDMARKS + 0.02 * step * speed
+        np.testing.assert_allclose(estimator.world_points, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize('gap_s', [1e2, 1e4, 1e7])
+@pytest.mark.parametrize(('gains', 'has_ids'), [*((g, True) for g in GAINS), ('riccati', False)])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_after_any_gap_an_accurate_sensor_finds_the_robot_again(gap_s, gains, has_ids, two_d_mode):
+    """However uncertain the pose has become, sensors are 0.1 mm accurate at 50 m.
+
+    Without ids it may be lost, and goes on from there.
+    """
+    random, sigma_m = np.random.default_rng(0), 1e-4
+    points = 50.0 * random.standard_normal((8, 3)) * [1, 1, not two_d_mode]
+    settings = Settings(gains=gains, two_d_mode=two_d_mode, max_stamp_jump=1e9)
+    estimator, stamp_ns = Estimator(settings), START_NS
+    ids = np.arange(8) if has_ids else np.full(8, UNKNOWN_ID)
+    for step in range(30):
+        stamp_ns += round(gap_s * 1e9) if step == 15 else 10**8
+        if step % 5 == 0:
+            estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        seen = points + sigma_m * random.standard_normal((8, 3)) * [1, 1, not two_d_mode]
+        covariances = np.tile(sigma_m**2 * np.eye(3), (8, 1, 1))
+        estimator.add(ObservationEvent(stamp_ns, ids, seen, covariances))
+    estimator.flush()
+    assert estimator.counts['observation'] == 30
+    assert np.isfinite(estimator.pose).all()
+    if has_ids:
+        assert len(estimator.landmark_ids) == 8
+        np.testing.assert_allclose(estimator.pose, np.eye(4), atol=2e-3)
+
+
 def with_velocities(event, noise):
     if not isinstance(event, ObservationEvent):
         return event
@@ -445,7 +529,7 @@ def test_where_landmarks_move_what_was_seen_is_not_looked_back_at():
         often.smooth()
 
 
-@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('gains', GAINS)
 def test_a_pose_set_far_from_the_origin_serves_as_well_as_one_that_is_near(gains):
     far = np.eye(4)
     far[:3, 3] = [5e5, 4e6, 100.0]  # a UTM grid's
@@ -476,7 +560,7 @@ def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():
     np.testing.assert_allclose(estimator.landmark_velocities, speed, atol=0.03)
 
 
-@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('gains', GAINS)
 def test_after_a_jump_back_in_time_pose_and_map_are_held_if_asked(gains):
     events = drive()
     estimator = run(events, on_time_jump='hold', gains=gains)

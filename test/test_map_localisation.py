@@ -561,7 +561,7 @@ def test_far_from_the_origin_as_in_a_national_grid_nothing_is_lost_to_rounding()
 def test_a_map_can_be_saved_where_some_landmarks_are_exact_and_others_hardly_known(seed):
     """Their variances differ by more than double precision can hold in one matrix."""
     rng = np.random.default_rng(seed)
-    estimator = Estimator(Settings(reorder_window=0.0, confirmations=1, unknown_linear_motion=3e3))
+    estimator = Estimator(Settings(reorder_window=0.0, confirmations=1, unknown_linear_motion=1e3))
     points = rng.uniform(-50.0, 50.0, (8, 3))
     for step in range(12):
         seen = np.sort(rng.choice(8, 4, replace=False))
@@ -681,3 +681,29 @@ class TestInitialPoseOfTheSettings:
         estimator = Estimator(Settings(initial_yaw=0.5))
         assert_array_equal(estimator.pose, np.eye(4))
         assert 'use set_initial_pose: true' in caplog.text
+
+
+@pytest.mark.parametrize('gains', GAINS)
+@pytest.mark.parametrize('velocity_error', [0.0, 0.5])
+def test_landmarks_of_an_exact_map_stay_where_it_has_them(gains, velocity_error):
+    """Whatever they seemed to do before, and whatever velocity a sensor claims."""
+    if velocity_error and gains != 'riccati':
+        return
+    points = np.array([[5.0, 0, 0], [0, 5, 0], [0, 0, 5], [-5, 0, 1], [3, 3, 3]])
+    place, random = se3.exp(np.array([0.0, 0.0, 1.0, 3.0, 2.0, 1.0])), np.random.default_rng(0)
+    known = LandmarkMap(np.arange(5), se3.transform(place, points), None, np.full(5, 10))
+    settings = Settings(gains=gains, localization_mode='fixed', reorder_window=0.0)
+    estimator = Estimator(replace(settings, landmark_velocity_error=velocity_error))
+    estimator.load_map(known)
+    for step in range(100):
+        stamp_ns = 10**9 + step * 10**8
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        m = 2 if step < 5 else 4
+        seen = points[:m] + random.normal(scale=0.02, size=(m, 3))
+        speed = np.tile([0.5, 0.0, 0.0], (m, 1)) if step == 50 else None
+        if step < 60:
+            estimator.add(ObservationEvent(stamp_ns, np.arange(m), seen, None, speed))
+    assert estimator.is_localised
+    assert_allclose(estimator.world_points, known.world_points, atol=1e-12)
+    assert_array_equal(estimator.landmark_velocities, 0.0)
+    assert_allclose(estimator.pose, place, atol=0.1)

@@ -250,6 +250,9 @@ def test_later_sections_win(tmp_path):
         ('/**: {ros__parameters: {a: 1\n', 'not valid YAML'),
         ('/**:\n\tros__parameters:\n', 'not valid YAML'),
         ('a: !!python/object:os.system x\n', 'not valid YAML'),
+        ('a: 2020-13-45\n', 'not valid YAML'),
+        ('a: ' + '7' * 5000, 'not valid YAML'),
+        ('[' * 5000, 'not valid YAML'),
     ],
 )
 def test_a_file_without_parameters_is_refused_in_one_line(tmp_path, text, expected):

@@ -86,7 +86,7 @@ class Hypotheses:
     def doubt(self) -> FloatArray | None:
         """(6, 6) what the pose's covariance lacks if the most likely state may be wrong.
 
-        Σ w_i (P_i + d_i d_iᵀ) − P_1 at the last observation, with w_i the likelihoods of the
+        Σ w_i (P_i + d_i d_iᵀ) − P_1 at the states' instant, with w_i the likelihoods of the
         states and d_i how far their poses are from that of the first, in its coordinates. None
         if there is one state.
         """
@@ -108,6 +108,7 @@ class Hypotheses:
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all states, which are those of ``start_ns``, on to ``end_ns``."""
+        self._doubt = None
         for slam in self._states:
             slam.advance(velocities, start_ns, end_ns)
 

@@ -161,7 +161,7 @@ def _parse_assignment(text: str) -> tuple[str, object]:
 
 def _parse_value(text: str) -> object:
     """Read a number, true, false or a [list]; anything else is a string."""
-    with suppress(json.JSONDecodeError):
+    with suppress(ValueError, RecursionError):  # of what is no JSON, has too many digits or levels
         return json.loads(text)
     with suppress(ValueError):
         return float(text)

@@ -103,7 +103,7 @@ def read_inputs(args: argparse.Namespace) -> InputSettings:
         'use_imu': None if args.imu is None else True,
     }
     values |= {name: value for name, value in options.items() if value is not None}
-    return from_parameters(InputSettings, values)
+    return from_parameters(InputSettings, values).with_plain_frames()
 
 
 def warn_of_unused(args: argparse.Namespace, settings: Settings) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import parameter
 
 AUTO = 'auto'
@@ -16,6 +18,8 @@ Pose6 = tuple[float, float, float, float, float, float]
 
 POSE_DIFFERENCES = 'pose_differences'
 """Velocity source: the differences of an odometry's poses."""
+
+InputSettingsT = TypeVar('InputSettingsT', bound='InputSettings')
 
 
 @dataclass(frozen=True)
@@ -66,3 +70,22 @@ class InputSettings:
     transform_timeout: float = parameter(
         0.5, 'How long a message waits for a transform', unit='s', minimum=0.0, maximum=60.0
     )
+
+    def with_plain_frames(self: InputSettingsT) -> InputSettingsT:
+        """Return the settings with frames as tf2 has them, without a leading slash.
+
+        Raises
+        ------
+        ParameterError
+            If the map's frame has no name.
+
+        """
+        names = ('map_frame', 'odom_frame', 'base_frame', 'sensor_frame')
+        plain = replace(self, **{name: getattr(self, name).lstrip('/') for name in names})
+        plain.check_named('map_frame')
+        return plain
+
+    def check_named(self, parameter_name: str) -> None:
+        """Raise a ParameterError, which says what to do, if the name of a frame is empty."""
+        if not getattr(self, parameter_name):
+            raise ParameterError(f"'{parameter_name}' is empty: give it the name of a frame")

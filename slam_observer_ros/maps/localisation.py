@@ -16,7 +16,7 @@ from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.alignment import find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
-from slam_observer_ros.matrices import transpose
+from slam_observer_ros.matrices import block_diagonal, transpose
 from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -149,12 +149,22 @@ def _find_frame(
     axes = slam.axes
     covariance = slam.gains.joint_covariance(rows)
     if covariance is None:
-        variance = slam.settings.point_noise**2
-        pose = np.zeros(len(axes.pose))
-        covariance = np.diag(np.append(pose, np.full(axes.point * len(rows), variance)))
+        covariance = _of_constant_gains(slam, rows)
     covariances = known.covariances_or(slam.settings.map_noise)
     points = slam.observer.points[rows]
     return find_transform(points, covariance, known.world_points, covariances, axes)
+
+
+def _of_constant_gains(slam: Slam, rows: IntArray) -> FloatArray:
+    """Return a covariance (p + m k, p + m k) of ε and m landmarks for gains that know none.
+
+    The pose is exact; a landmark is as uncertain as it would be if it was seen from here once.
+    """
+    p, k = len(slam.axes.pose), slam.axes.point
+    noise = slam.observation_noise.at(slam.observer.body_points(rows))
+    covariance = np.zeros((p + k * len(rows),) * 2)
+    covariance[p:, p:] = block_diagonal(slam.observer.turned(noise)[:, :k, :k])
+    return covariance
 
 
 def _with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArray:
@@ -205,8 +215,9 @@ def _hold(slam: Slam, known: LandmarkMap) -> None:
     order = np.argsort(known.ids)
     rows = order[np.searchsorted(known.ids, slam.landmarks.ids, sorter=order)]
     y_ref, covariances = _in_reference_frame(slam, known.select(rows))
-    slam.observer.rebase(slam.observer.A, y_ref)
+    slam.observer.hold_landmarks(y_ref)
     slam.gains = slam.gains.held(covariances)
+    slam.is_held = True
 
 
 def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:

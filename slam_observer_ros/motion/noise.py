@@ -13,6 +13,11 @@ MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
 'unknown': no robot turns or moves as fast.
 """
 
+MAX_GAP_ERRORS = np.repeat([np.pi, 1000.0], 3)
+"""Standard deviations of a motion in one gap, rad and m, beyond which it is as unknown as it can
+be: more would only drown all else that is known in rounding.
+"""
+
 SPEED_WINDOW_S = 1.0
 """Time over which a velocity is averaged to tell how large an error in proportion to it is."""
 
@@ -50,14 +55,15 @@ class MotionNoise(Immutable):
         however many motions that was cut into. Its angular and its linear part may be of two
         messages, one of them without a covariance.
 
-        *In a gap* the robot may do anything that ``unknown_*_motion`` allows.
+        *In a gap* the robot may do anything that ``unknown_*_motion`` allows, within
+        :data:`MAX_GAP_ERRORS`.
         """
         rates = self._density_squared
         if self._has_scale:
             rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
         dt_s = held.dt_s[:, None]
         white = rates * dt_s * np.repeat(~held.is_stated, 3, axis=1)
-        in_gaps = self._unknown_squared * held.gap_s[:, None]
+        in_gaps = np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
         covariances: FloatArray = (white + in_gaps)[:, :, None] * _IDENTITY_6
         if held.is_stated.any():
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²

@@ -25,7 +25,7 @@ RECENT = 30
 MIN_POINTS = 50
 """Points that it takes to tell how large a share of them is rejected."""
 
-LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id')
+LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id', 'reserved_id')
 """Points not used for something that is wrong; those that a known map lacks may well be there."""
 
 
@@ -150,9 +150,10 @@ class Diagnostics:
 
     @staticmethod
     def _points_warning(new: Counter[str]) -> str:
-        """Tell of points left out since the last time: most of them, or such with one id."""
+        """Tell of points left out since the last time: most of them, or for their ids."""
         left_out = {name: new[name] for name in LEFT_OUT if new[name]}
-        if not (new['repeated_id'] or 2 * sum(left_out.values()) > new['observed_point']):
+        of_wrong_ids = new['repeated_id'] + new['reserved_id']
+        if not (of_wrong_ids or 2 * sum(left_out.values()) > new['observed_point']):
             return ''
         told = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())
         return f'of {new["observed_point"]} points seen {told}'

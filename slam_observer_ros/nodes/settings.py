@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 from slam_observer_ros.errors import ParameterError
@@ -74,20 +74,17 @@ class ObserverNodeSettings(InputSettings):
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
 
     def with_checked_frames(self) -> ObserverNodeSettings:
-        """Return the settings with frames as tf2 has them, without a leading slash.
+        """Return the settings with plain frames that can be told apart.
 
         Raises
         ------
         ParameterError
-            If map or base has none, or two of map, odometry and base have the same; it says what
-            to do.
+            If map or base has no name, or two of map, odometry and base have the same; it says
+            what to do.
 
         """
-        names = ('map_frame', 'odom_frame', 'base_frame', 'sensor_frame')
-        plain = replace(self, **{name: getattr(self, name).lstrip('/') for name in names})
-        for name in ('map_frame', 'base_frame'):
-            if not getattr(plain, name):
-                raise ParameterError(f"'{name}' is empty: give it the name of a frame")
+        plain = self.with_plain_frames()
+        plain.check_named('base_frame')
         plain._check_frames_differ()
         return plain
 

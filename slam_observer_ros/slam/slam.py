@@ -51,6 +51,8 @@ class Slam:
         Ids and counts of the n known landmarks.
     is_mapping : bool
         Whether landmarks are added, and taken to have moved if they are rejected too often.
+    is_held : bool
+        Whether the landmarks are those of a map that is exact, and at rest.
     motion_noise : MotionNoise
         Noise of velocities.
     observation_noise : ObservationNoise
@@ -71,6 +73,7 @@ class Slam:
         self.gains = make_gains(settings)
         self.landmarks = LandmarkTable()
         self.is_mapping = True
+        self.is_held = False
         self.counts: Counter[str] = Counter()
         self.rejected_in_a_row = 0
         self.motion_noise = MotionNoise(settings)
@@ -232,9 +235,7 @@ class Slam:
             self._initialise(event.select(~known), sighting.covariances[~known])
             rows = self.landmarks.rows_of(event.ids)
             event, rows, dt_s = event.select(rows >= 0), rows[rows >= 0], dt_s[rows >= 0]
-        if event.velocities is not None:
-            used = ~np.isin(event.ids, seen_before.ids[rejected])
-            self.observer.set_landmark_velocities(rows[used], event.velocities[used])
+        self._note_velocities(event, rows, seen_before.ids[rejected])
         moved_ids = self._look_back(event, rows, dt_s)
         return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
 
@@ -308,6 +309,16 @@ class Slam:
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return rejected
 
+    def _note_velocities(
+        self, event: ObservationEvent, rows: IntArray, rejected_ids: IntArray
+    ) -> None:
+        """Let landmarks move as the sensor says; by one that says nothing they are static."""
+        if event.velocities is not None and not self.is_held:
+            used = ~np.isin(event.ids, rejected_ids)
+            self.observer.set_landmark_velocities(rows[used], event.velocities[used])
+        elif self.observer.have_moved and self.settings.landmark_velocity_error == 0.0:
+            self.observer.set_landmark_velocities(rows, np.zeros((len(rows), 3)))
+
     def _places(
         self, event: ObservationEvent, residuals: Residuals
     ) -> tuple[FloatArray, FloatArray]:
@@ -340,8 +351,6 @@ class Slam:
         self.counts['moved_landmark'] += int(np.sum(moved))
         if far.any():
             self.observer.relocate_landmarks(rows[far], event.points[far])
-            if self.settings.landmark_velocity_error > 0.0:
-                self.observer.u[rows[far]] = 0.0
             y_ref = self.observer.y_ref[rows[far]]
             self.gains.relocate_landmarks(rows[far], y_ref, residuals.covariances[far])
             self.landmarks.restart(rows[far], event.stamp_ns)
