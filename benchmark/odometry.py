@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import accumulate
 from typing import TypeAlias
 
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
@@ -52,8 +51,7 @@ class Odometry:
         """
         start_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
         held = self._velocities.held(start_ns, stamp_ns)
-        steps = se3.exp(held.body_velocities * (held.dt_s)[:, None])
-        path = np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
+        path = paths.path(np.eye(4), held.body_velocities * held.dt_s[:, None])
         Ad = se3.adjoint(se3.inverse(path[-1]) @ path[:-1])
         covariances = Ad @ self._noise.covariances(held) @ Ad.swapaxes(1, 2)
         self._velocities.forget_before(stamp_ns)

@@ -170,32 +170,8 @@ class Observer:
         e = se3.transform(self.A, points) - self.a[rows]  # (29)
         return e, e - self.y_ref[rows]
 
-    def path(self, body_velocities: FloatArray, dt_s: FloatArray) -> FloatArray:
-        """Return Â along k held velocities, exactly: Â exp(V_1 dt_1) … exp(V_k dt_k) (27).
-
-        Parameters
-        ----------
-        body_velocities : FloatArray
-            (k, 6) velocities (Ω, v), rad/s and m/s, body frame.
-        dt_s : FloatArray
-            (k,) how long each is held, seconds.
-
-        Returns
-        -------
-        FloatArray
-            (k + 1, 4, 4) Â before, between and after the k motions.
-
-        """
-        motions = se3.exp(body_velocities * dt_s[:, None])
-        path = np.concatenate([self.A[None], motions])
-        reach = 1
-        while reach < len(path):  # log k products of stacks cost less than k of matrices
-            path[reach:] = path[:-reach] @ path[reach:]
-            reach *= 2
-        return path
-
     def propagate(self, path: FloatArray) -> None:
-        """Advance Â to the end of a ``path`` (k + 1, 4, 4)."""
+        """Advance Â to the end of a ``path`` (k + 1, 4, 4), along which it is Â exp(V dt) (27)."""
         self.A = path[-1].copy()
         self.A[:3, :3] = so3.normalise(self.A[:3, :3])
 

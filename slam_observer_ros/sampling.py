@@ -6,8 +6,8 @@ import numpy as np
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.geometry import paths, se3, so3
 from slam_observer_ros.motion.velocity_history import VelocityHistory
-from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
@@ -88,7 +88,7 @@ class DeadReckoning:
     """Collects the poses that the velocities alone lead through, from the first one on."""
 
     def __init__(self) -> None:
-        self._observer = Observer(np.eye(4))
+        self._pose = np.eye(4)
         self._samples = Samples()
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
@@ -96,13 +96,13 @@ class DeadReckoning:
         held = velocities.held(start_ns, end_ns)
         if not (self._samples.stamps_ns or held.dt_s.any()):
             return
-        path = self._observer.path(held.body_velocities, held.dt_s)
+        path = paths.path(self._pose, held.body_velocities * held.dt_s[:, None])
         elapsed_s = np.append(0.0, np.cumsum(held.dt_s + held.gap_s))
         stamps_ns = start_ns + np.rint(elapsed_s * NANOSECONDS_PER_SECOND).astype(np.int64)
         for stamp_ns, pose in zip(stamps_ns.tolist(), path, strict=True):
             if self._samples.lack(stamp_ns):
                 self._samples.add(stamp_ns, pose.copy())
-        self._observer.propagate(path)
+        self._pose = se3.pose(so3.normalise(path[-1, :3, :3]), path[-1, :3, 3])
 
     @property
     def trajectory(self) -> Trajectory:

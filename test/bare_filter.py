@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
@@ -22,7 +22,8 @@ class Filter:
         self.gains = gains
 
     def move(self, body_velocities, dt_s, covariances):
-        path = self.observer.path(self.gains.calibration.apply(body_velocities), dt_s)
+        V = self.gains.calibration.apply(body_velocities)
+        path = paths.path(self.observer.A, V * dt_s[:, None])
         self.observer.propagate(path)
         self.observer.move_landmarks(float(np.sum(dt_s)))
         no_gaps = np.zeros(len(dt_s))

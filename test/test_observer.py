@@ -16,7 +16,7 @@ from slam_observer_ros.gains.constant import (
     safe_step,
 )
 from slam_observer_ros.gains.paper import lyapunov_rate, paper_innovation
-from slam_observer_ros.geometry import se3, slam_group
+from slam_observer_ros.geometry import paths, se3, slam_group
 from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
 from slam_observer_ros.observer import lyapunov, Observer
 from slam_observer_ros.settings import Settings
@@ -58,7 +58,7 @@ def integrate_paper_ode(sign_of_landmarks, sign_of_pose, duration_s, dt_s=1e-3):
         Delta, _ = paper_innovation(gain_k, gain_l, e, r, observer.a)
         Delta = sign_of_pose * Delta
         delta = observer.a @ Delta[:3, :3].T + sign_of_landmarks * 0.25 * r
-        observer.propagate(observer.path(PAPER_VELOCITY[None], np.array([dt_s])))
+        observer.propagate(paths.path(observer.A, PAPER_VELOCITY[None] * dt_s))
         observer.A = se3.exp(se3.vee(Delta) * dt_s) @ observer.A
         observer.a = observer.a + delta * dt_s
     return level
@@ -97,7 +97,7 @@ def test_residual_vanishes_exactly_where_the_output_fits_for_any_reference_pose(
     observer.A = se3.exp(rng.normal(size=6))
     points = rng.normal(size=(3, 3))
     observer.add_landmarks(points)
-    observer.propagate(observer.path(rng.normal(size=(2, 6)), np.array([0.1, 0.7])))
+    observer.propagate(paths.path(observer.A, 0.4 * rng.normal(size=(2, 6))))
     predicted = se3.transform(se3.inverse(observer.pose), observer.world_points)
     _, r = observer.errors(slice(None), predicted)
     np.testing.assert_allclose(r, 0.0, atol=1e-10)
@@ -105,7 +105,7 @@ def test_residual_vanishes_exactly_where_the_output_fits_for_any_reference_pose(
 
 def test_a_path_that_was_moved_along_stays_as_it_was():
     observer = Observer(np.eye(4))
-    path = observer.path(np.array([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]]), np.array([0.5]))
+    path = paths.path(observer.A, 0.5 * np.array([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]]))
     before = path.copy()
     observer.propagate(path)
     observer.A[:3, 3] += 1.0
@@ -159,7 +159,7 @@ def test_any_reference_pose_gives_the_same_configuration(reference_pose):
                 np.arange(4), e, r, observer.a, np.zeros((4, 3, 3)), np.full(4, 0.1)
             )
             observer.correct(gains.correct(residuals)[0])
-            observer.propagate(observer.path(PAPER_VELOCITY[None], np.array([0.1])))
+            observer.propagate(paths.path(observer.A, 0.1 * PAPER_VELOCITY[None]))
         return se3.transform(se3.inverse(observer.pose), observer.world_points)
 
     np.testing.assert_allclose(final_output(reference_pose), final_output(np.eye(4)), atol=1e-8)

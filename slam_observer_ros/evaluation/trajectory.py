@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.evaluation.errors import EvaluationError
-from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.matrices import transpose
+from slam_observer_ros.geometry import paths, so3
 from slam_observer_ros.output_files import unfinished_file
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
@@ -137,18 +136,10 @@ def interpolate(
     usable = (elapsed_ns == 0) | ((gap_ns > 0) & (gap_ns <= max_gap_ns))
     covered[covered] = usable
     fraction = elapsed_ns[usable] / np.maximum(gap_ns[usable], 1)
-    poses[covered] = _between(
+    poses[covered] = paths.interpolate(
         trajectory.poses[before[usable]], trajectory.poses[after[usable]], fraction
     )
     return poses, covered
-
-
-def _between(start: FloatArray, end: FloatArray, fraction: FloatArray) -> FloatArray:
-    R = start[:, :3, :3]
-    turn = so3.log(transpose(R) @ end[:, :3, :3])
-    rotations = R @ so3.exp(fraction[:, None] * turn)
-    shift = end[:, :3, 3] - start[:, :3, 3]
-    return se3.pose(rotations, start[:, :3, 3] + fraction[:, None] * shift)
 
 
 def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory, BoolArray]:

@@ -13,7 +13,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 
@@ -53,7 +53,7 @@ class _Track:
         if self.stamps_ns[after] == stamp_ns:
             return self.poses[after]
         start_ns, end_ns = self.stamps_ns[after - 1 : after + 1]
-        return _interpolate(
+        return paths.interpolate(
             self.poses[after - 1], self.poses[after], (stamp_ns - start_ns) / (end_ns - start_ns)
         )
 
@@ -166,11 +166,3 @@ class TransformBuffer:
                 )
             pose = step @ pose
         return pose
-
-
-def _interpolate(start: FloatArray, end: FloatArray, share: float) -> FloatArray:
-    """Return the pose between two: position in a line, rotation about one axis, as tf2 does."""
-    R = start[:3, :3]
-    turn = so3.log(R.T @ end[:3, :3])
-    position = (1.0 - share) * start[:3, 3] + share * end[:3, 3]
-    return se3.pose(R @ so3.exp(share * turn), position)

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from itertools import accumulate
-
 import numpy as np
 
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import HeldVelocities, VelocityHistory
-from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray
 
 
@@ -22,8 +18,8 @@ def transition(
 ) -> FloatArray:
     """Return exp(V_1 dt_1) … exp(V_k dt_k) (4, 4), how the body moves from stamp to stamp."""
     held = _held(velocities, calibration, start_ns, end_ns)
-    V = calibration.apply(held.body_velocities)
-    return reduce(np.matmul, se3.exp(V * held.dt_s[:, None]), np.eye(4))
+    transition: FloatArray = _path(np.eye(4), held, calibration)[-1]
+    return transition
 
 
 def transition_covariance(
@@ -33,11 +29,12 @@ def transition_covariance(
     start_ns: int,
     end_ns: int,
 ) -> FloatArray:
-    """Return that (6, 6) of w in exp(w) Φ, Φ the :func:`transition`: body frame at its start."""
+    """Return the covariance (6, 6) of w in exp(w) Φ, with Φ the :func:`transition`.
+
+    Along the body's axes at the start.
+    """
     held = _held(velocities, calibration, start_ns, end_ns)
-    motions = se3.exp(calibration.apply(held.body_velocities) * held.dt_s[:, None])
-    starts = list(accumulate(motions[:-1], np.matmul, initial=np.eye(4)))
-    Ad = se3.adjoint(np.array(starts))
+    Ad = se3.adjoint(_path(np.eye(4), held, calibration)[:-1])
     covariance: FloatArray = (Ad @ noise.covariances(held) @ transpose(Ad)).sum(axis=0)
     return covariance
 
@@ -46,12 +43,12 @@ def motion(
     velocities: VelocityHistory,
     calibration: Calibration,
     noise: MotionNoise,
-    observer: Observer,
+    A: FloatArray,
     start_ns: int,
     end_ns: int,
     at_start: FloatArray | None,
 ) -> Motion:
-    """Return how the observer's Â moves on from ``start_ns``, the stamp that it belongs to.
+    """Return how Â, ``A`` (4, 4) at ``start_ns``, moves on to ``end_ns``.
 
     ``at_start`` (6,) is the mean velocity around that stamp which the motion before this one
     ended with, or None if there was none. As each motion begins like the last one ended, what the
@@ -61,7 +58,7 @@ def motion(
     if at_start is None:
         at_start = _around(velocities, calibration, start_ns)
     return Motion(
-        path=observer.path(calibration.apply(held.body_velocities), held.dt_s),
+        path=_path(A, held, calibration),
         measured_velocities=held.body_velocities,
         dt_s=held.dt_s,
         gap_s=held.gap_s,
@@ -75,6 +72,11 @@ def _held(
 ) -> HeldVelocities:
     delay_ns = calibration.delay_ns
     return velocities.held(start_ns - delay_ns, end_ns - delay_ns)
+
+
+def _path(start: FloatArray, held: HeldVelocities, calibration: Calibration) -> FloatArray:
+    """Return the poses (k + 1, 4, 4) that velocities lead to, from ``start`` (4, 4) on."""
+    return paths.path(start, calibration.apply(held.body_velocities) * held.dt_s[:, None])
 
 
 def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int) -> FloatArray:

@@ -198,7 +198,7 @@ class Slam:
             velocities,
             self.gains.calibration,
             self.motion_noise,
-            self.observer,
+            self.observer.A,
             start_ns,
             end_ns,
             self._end_velocity,
