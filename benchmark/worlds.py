@@ -13,7 +13,7 @@ import numpy as np
 from odometry import Event
 
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import LandmarkTruth, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import HeldVelocities
@@ -25,6 +25,7 @@ from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import load_starry_night
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
+from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray
 
 CHECKOUT = Path(__file__).resolve().parent.parent

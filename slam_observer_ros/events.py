@@ -1,4 +1,4 @@
-"""Time-stamped events: what the estimator takes in, and the truth that it is compared with.
+"""Time-stamped events: what the estimator takes in.
 
 Their arrays are not copied: who has added an event must not change them any more.
 """
@@ -139,40 +139,6 @@ class ObservationEvent:
 
 Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
 """Anything that :meth:`slam_observer_ros.estimator.Estimator.add` takes."""
-
-
-@dataclass(frozen=True, slots=True)
-class PoseTruth:
-    """True pose of the robot.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Time of validity, nanoseconds.
-    pose : FloatArray
-        (4, 4) transform from the base frame to the world.
-
-    """
-
-    stamp_ns: int
-    pose: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class LandmarkTruth:
-    """True landmark positions.
-
-    Attributes
-    ----------
-    ids : IntArray
-        (n,) landmark ids.
-    world_points : FloatArray
-        (n, 3) positions in the world, metres.
-
-    """
-
-    ids: IntArray
-    world_points: FloatArray
 
 
 def is_automatic(ids: IntArray) -> BoolArray:

@@ -13,7 +13,8 @@ import time
 
 import numpy as np
 
-from slam_observer_ros.estimates import Update, used_points
+from slam_observer_ros.counts import used_points
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory

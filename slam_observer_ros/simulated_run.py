@@ -10,11 +10,11 @@ import numpy as np
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import PoseTruth
 from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.sampling import SAMPLE_PERIOD_NS
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation
+from slam_observer_ros.truth import PoseTruth
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 

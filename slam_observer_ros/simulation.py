@@ -14,14 +14,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.events import (
-    LandmarkTruth,
-    ObservationEvent,
-    PoseTruth,
-    VelocityEvent,
-)
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.parameters import parameter
+from slam_observer_ros.truth import LandmarkTruth, PoseTruth
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND, to_ns, to_s
 

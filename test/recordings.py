@@ -11,15 +11,10 @@ from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import get_typestore, Stores
 
-from slam_observer_ros.events import (
-    Event,
-    LandmarkTruth,
-    ObservationEvent,
-    PoseTruth,
-    VelocityEvent,
-)
+from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.truth import LandmarkTruth, PoseTruth
 
 STEP_NS = 20_000_000
 LANDMARKS = LandmarkTruth(np.array([3, 5, 9]), np.arange(9.0).reshape(3, 3))

@@ -18,9 +18,10 @@ from tum_files import read_tum
 import yaml
 
 from slam_observer_ros.cli import main
-from slam_observer_ros.events import ObservationEvent, PoseTruth, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.simulation import Scenario, Simulation
+from slam_observer_ros.truth import PoseTruth
 
 REPORT_KEYS = {
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',

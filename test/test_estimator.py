@@ -13,8 +13,8 @@ from numpy.testing import assert_array_equal
 import pytest
 
 from slam_observer_ros.association.hypotheses import Hypotheses
+from slam_observer_ros.counts import used_points
 from slam_observer_ros.errors import MapError, ParameterError
-from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
@@ -23,7 +23,6 @@ from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     LAST_AUTOMATIC_ID,
     ObservationEvent,
-    PoseTruth,
     UNKNOWN_ID,
     VelocityEvent,
 )
@@ -32,6 +31,7 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
+from slam_observer_ros.truth import PoseTruth
 
 GAINS = ('constant', 'scheduled', 'riccati')
 START_NS = 1_700_000_000_000_000_000

@@ -12,8 +12,8 @@ from slam_observer_ros.evaluation import consistency, metrics
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import LandmarkTruth
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray
 
 STAMPS_NS = np.arange(40) * 100_000_000

@@ -19,8 +19,9 @@ from slam_observer_ros.evaluation.drawing import BLUE, GREEN, GREY, RED
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import FIRST_AUTOMATIC_ID, LandmarkTruth
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.truth import LandmarkTruth
 
 LANDMARKS = np.array([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, -4.0, 0.0]])
 IDS = np.arange(4)

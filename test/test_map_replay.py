@@ -10,12 +10,13 @@ from numpy.testing import assert_allclose
 import pytest
 from tum_files import read_tum
 
-from slam_observer_ros.events import ObservationEvent, PoseTruth, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.truth import PoseTruth
 
 BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
 LANDMARKS = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))

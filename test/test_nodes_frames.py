@@ -20,7 +20,7 @@ from robots import own_topics, pose_of, Robot, stamp_ns, TransformSender
 from tf2_msgs.msg import TFMessage
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
@@ -30,6 +30,7 @@ from slam_observer_ros.nodes import frames
 from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.simulation import Scenario, Simulation
+from slam_observer_ros.truth import PoseTruth
 
 pytestmark = pytest.mark.ros
 

@@ -15,12 +15,13 @@ import ros_messages as ros
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.events import Event, LandmarkTruth, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import ObservationMessage
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.truth import LandmarkTracks
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.truth import LandmarkTruth
 
 FORMATS = [
     'mcap file',

@@ -9,12 +9,13 @@ import pytest
 import ros_messages as ros
 from tum_files import read_tum
 
-from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.truth import LandmarkTruth, PoseTruth
 
 MS = 1_000_000
 STEP_NS = 50 * MS

@@ -12,10 +12,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.parameters import from_parameters
 from slam_observer_ros.simulation import Delivery, LAP_S, Scenario, SimulatedEvent, Simulation
+from slam_observer_ros.truth import PoseTruth
 
 EXACT = Scenario(initial_bias=0.0, duration=1.0)
 

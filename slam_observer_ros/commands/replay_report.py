@@ -10,7 +10,7 @@ from pathlib import Path
 from slam_observer_ros.commands.console import print_table
 from slam_observer_ros.commands.replay_checks import list_dropped
 from slam_observer_ros.commands.replay_outcome import Outcome
-from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
+from slam_observer_ros.counts import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.replay import Replay
 

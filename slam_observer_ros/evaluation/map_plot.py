@@ -25,8 +25,9 @@ from slam_observer_ros.evaluation.drawing import (
 )
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.events import is_automatic, LandmarkTruth
+from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray, IntArray
 
 _MAX_LABELS = 80

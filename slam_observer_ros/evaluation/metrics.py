@@ -9,9 +9,9 @@ import numpy as np
 from slam_observer_ros.evaluation.alignment import align
 from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
-from slam_observer_ros.events import LandmarkTruth
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.matrices import transpose
+from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_s
 

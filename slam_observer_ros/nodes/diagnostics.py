@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.counts import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake

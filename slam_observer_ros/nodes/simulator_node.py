@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
 
-from slam_observer_ros.events import ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.nodes.conversions import (
     header_message,
@@ -29,6 +29,7 @@ from slam_observer_ros.nodes.runner import run
 from slam_observer_ros.nodes.settings import SimulatorNodeSettings
 from slam_observer_ros.nodes.transforms import TransformPublisher
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
+from slam_observer_ros.truth import PoseTruth
 from slam_observer_ros.units import to_ns
 
 QUEUE_DEPTH = 1000

@@ -12,10 +12,11 @@ from typing import TypeAlias
 import numpy as np
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.events import LandmarkTruth, UNKNOWN_ID
+from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.messages.point_clouds import ObservationMessage
 from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
+from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)

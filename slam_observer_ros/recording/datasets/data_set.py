@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.events import LandmarkTruth, ObservationEvent, PoseTruth, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.truth import LandmarkTruth, PoseTruth
 from slam_observer_ros.types import FloatArray, IntArray
 
 

@@ -12,9 +12,10 @@ import numpy as np
 import scipy.io
 
 from slam_observer_ros.errors import DataSetError
-from slam_observer_ros.events import LandmarkTruth, ObservationEvent
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.datasets.data_set import DataSet
+from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
