@@ -10,7 +10,7 @@ from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
@@ -19,6 +19,7 @@ from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam import covariances
 from slam_observer_ros.slam.landmark_index import LandmarkIndex
 from slam_observer_ros.slam.landmark_table import LandmarkTable
 from slam_observer_ros.slam.sighting import Outcome, Outlook, Sighting
@@ -104,54 +105,31 @@ class Slam:
     @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
-        covariances = self.gains.landmark_covariances
-        if covariances is None:
-            return None
-        R = self.observer.reference_pose[:3, :3]
-        world: FloatArray = R @ covariances @ R.T
-        return world
+        return covariances.of_landmarks(self.observer, self.gains)
 
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
-        """Return the covariance (m k, m k) of where landmarks are seen from the robot, m².
+        """Return the joint covariance (m k, m k) of where landmarks are seen from the robot, m².
 
-        Joint, along the axes of the body that are estimated; None where the gains know none. The
-        choice of the world's frame has no part in it.
+        Along the axes of the body that are estimated; None where the gains know none.
         """
-        P = self.gains.joint_covariance(rows)
-        if P is None:
-            return None
-        m, k, p = len(rows), self.axes.point, len(self.axes.pose)
-        points = self.observer.points + self.gains.postponed_shifts()
-        C = self.axes.output_matrix(points[rows]).reshape(-1, p)
-        CP = C @ P[:p] - P[p:]
-        blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
-        R = self.observer.A[:k, :k]
-        seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
-        return seen
+        return covariances.of_configuration(self.observer, self.gains, self.axes, rows)
 
     def pose_covariance(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
     ) -> FloatArray | None:
         """Return the covariance (6, 6) that the pose will have at ``end_ns``.
 
-        Of its rotation vector and its position along the world's axes, rad² and m²; the gains
-        know that of ε in Â = exp(ε) A. None where they know none.
+        Of its rotation vector and its position along the world's axes, rad² and m². None where
+        the gains know none.
         """
         moved = self._motion(velocities, start_ns, end_ns)
-        return self._in_world(self.gains.pose_covariance_after(moved), moved.path[-1])
+        after = self.gains.pose_covariance_after(moved)
+        return covariances.of_pose(self.observer, after, moved.path[-1])
 
     @property
     def state_covariance(self) -> FloatArray | None:
         """(6, 6) the same of the pose as it is."""
-        return self._in_world(self.gains.pose_covariance, self.observer.A)
-
-    def _in_world(self, covariance: FloatArray | None, A: FloatArray) -> FloatArray | None:
-        """Return that of the pose from that of ε (6, 6), at Â (4, 4)."""
-        if covariance is None:
-            return None
-        turn = self._turn_to_world(A)
-        world: FloatArray = turn @ covariance @ turn.T
-        return world
+        return covariances.of_pose(self.observer, self.gains.pose_covariance, self.observer.A)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot and keep the map; what they have to do with each other is forgotten.
@@ -169,9 +147,8 @@ class Slam:
             # Else ε would turn about an origin that may be kilometres away.
             observer.reference_pose = pose
         observer.A = se3.inverse(observer.reference_pose) @ pose
-        back = np.linalg.inv(self._turn_to_world(observer.A))
         given = np.zeros((6, 6)) if covariance is None else covariance
-        self.gains.set_pose_covariance(back @ given @ back.T)
+        self.gains.set_pose_covariance(covariances.of_pose_error(observer, given))
         self.gains.restart(observer, 'the pose was set')
 
     def restart_time(self) -> None:
@@ -284,14 +261,6 @@ class Slam:
             self.remove(forgotten)
             self.counts['unsupported_landmark'] += len(forgotten)
 
-    def _turn_to_world(self, A: FloatArray) -> FloatArray:
-        """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
-        R = self.observer.reference_pose[:3, :3]
-        turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = R
-        turn[3:, :3] = -R @ so3.hat(A[:3, 3])
-        return turn
-
     def _correct(self, event: ObservationEvent, residuals: Residuals) -> BoolArray:
         """Correct the state by the landmarks of ``event``; return which (m,) were rejected."""
         rows = residuals.rows
@@ -373,7 +342,7 @@ class Slam:
             self.remove(rows)
             self.counts['forgotten_landmark'] += len(rows)
 
-    def _initialise(self, event: ObservationEvent, covariances: FloatArray) -> None:
+    def _initialise(self, event: ObservationEvent, noise: FloatArray) -> None:
         """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
         limit, new = self.settings.max_landmarks, len(event.ids)
         m = min(new, max(limit - len(self.landmarks), 0)) if limit else new
@@ -382,5 +351,5 @@ class Slam:
             return
         event = event.select(np.arange(new) < m)
         self.observer.add_landmarks(event.points)
-        self.gains.add_landmarks(self.observer.y_ref[-m:], self.observer.turned(covariances[:m]))
+        self.gains.add_landmarks(self.observer.y_ref[-m:], self.observer.turned(noise[:m]))
         self.landmarks.add(event.ids, event.stamp_ns)
