@@ -294,7 +294,7 @@ class Estimator:
 
     @property
     def landmark_map(self) -> LandmarkMap:
-        """The present map, as it can be saved and loaded.
+        """The present map, as it can be saved and loaded: without landmarks known to move.
 
         Its covariances are those in its own frame: without the error of how it lies to where
         the robot started, unless the frame is that of a map that was loaded.

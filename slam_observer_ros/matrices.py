@@ -62,3 +62,22 @@ def diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
     m = len(matrix) // k
     blocks: FloatArray = np.einsum('ijik->ijk', matrix.reshape(m, k, m, k))
     return blocks
+
+
+def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
+    """Return covariances (..., d, d) without variances that would drown all others in rounding.
+
+    Standard deviations are at most ``largest`` (d,); the correlations stay.
+    """
+    # Rounding may have left a variance a hair below zero.
+    deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
+    scales = largest / np.maximum(deviations, largest)
+    scaled: FloatArray = covariances * scales[..., :, None] * scales[..., None, :]
+    return scaled
+
+
+def with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArray:
+    """Return covariances (…, k, k) whose variances rounding has made neither too small nor < 0."""
+    variances, U = np.linalg.eigh(symmetric(covariances))
+    clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ transpose(U)
+    return clipped

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.matrices import limited
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, Immutable
 
@@ -13,6 +14,9 @@ RESOLUTION_M = 1e-6
 
 RELATIVE_RESOLUTION = 1e-6
 """The same as a share of the distance, for messages with points in single precision or better."""
+
+MAX_ERROR_M = 1e4
+"""Standard deviation of an observed point beyond which a message only says 'unknown', metres."""
 
 MIN_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
@@ -56,7 +60,8 @@ class ObservationNoise(Immutable):
         # Else far points that are said to be exact are lost beside an uncertain heading.
         squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
         least = RELATIVE_RESOLUTION**2 * squared_m2
-        covariances = _invertible(event.covariances + least[:, None, None] * _IDENTITY)
+        stated = limited(event.covariances, np.full(3, MAX_ERROR_M))
+        covariances = _invertible(stated + least[:, None, None] * _IDENTITY)
         unknown = ~event.covariances.any(axis=(1, 2))
         if unknown.any():
             covariances[unknown] = self.at(sights[unknown])

@@ -223,13 +223,14 @@ class _Run:
             return
         true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
         if covered[0]:
-            is_due = update.stamp_ns >= self._next_nees_ns
+            ids = self._estimator.landmark_ids
+            is_due = len(ids) > 0 and update.stamp_ns >= self._next_nees_ns
             if is_due:
                 self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
             self._configuration.add(
                 update.stamp_ns,
                 update.pose,
-                self._estimator.landmark_ids,
+                ids,
                 self._estimator.world_points,
                 true_poses[0],
                 self._landmark_tracks.at(update.stamp_ns),

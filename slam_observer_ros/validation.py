@@ -42,8 +42,8 @@ def check_event(event: Event) -> None:
     """
     if not isinstance(event, Event):
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
-    if not isinstance(event.stamp_ns, int | np.signedinteger):
-        reason = f'stamp {event.stamp_ns!r} is no signed integer: stamps are in nanoseconds'
+    if not isinstance(event.stamp_ns, int | np.int64):
+        reason = f'stamp {event.stamp_ns!r} is no int: stamps are in nanoseconds'
         raise InvalidEventError('wrong_type', reason)
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
@@ -88,6 +88,9 @@ def check_map(landmark_map: LandmarkMap) -> None:
         If an array does not fit, a value can't be right, or an id is there twice.
 
     """
+    if not isinstance(landmark_map, LandmarkMap):
+        kind = type(landmark_map).__name__
+        raise MapError(f'a {kind} is no LandmarkMap; maps.map_file.read_map makes one of a file')
     try:
         ids, n = landmark_map.ids, len(landmark_map.ids)
         _check_array('map ids', ids, (n,))
@@ -116,16 +119,18 @@ def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: i
 def _check_observation(event: ObservationEvent) -> None:
     is_stack = isinstance(event.points, np.ndarray) and event.points.ndim > 0
     m = len(event.points) if is_stack else 0
-    if not isinstance(event.ids, np.ndarray) or event.ids.dtype.kind not in 'iu':
+    if type(event.ids) is not np.ndarray or event.ids.dtype.kind not in 'iu':
         raise InvalidEventError('wrong_type', 'landmark ids are not an array of integers')
     if event.ids.dtype == np.uint64:  # which NumPy joins with int64 as float64
         raise InvalidEventError('wrong_type', 'landmark ids are uint64: make them int64')
     _check_coordinates('landmark points', event.points, (m, 3))
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'ids {event.ids.shape} for {m} landmark points')
-    negative = [i for i in event.ids.tolist() if i < 0 and i != UNKNOWN_ID]
-    if negative:
-        raise InvalidEventError('negative_id', f'landmark id {negative[0]} is negative')
+    for landmark_id in event.ids.tolist():
+        if landmark_id < 0 and landmark_id != UNKNOWN_ID:
+            raise InvalidEventError('negative_id', f'landmark id {landmark_id} is negative')
+        if landmark_id > MAX_ID:
+            raise InvalidEventError('too_large', f'landmark id {landmark_id} is beyond {MAX_ID}')
     if event.covariances is not None:
         _check_array('landmark covariances', event.covariances, (m, 3, 3))
         _check_definite('landmark covariances', event.covariances)
@@ -136,7 +141,7 @@ def _check_observation(event: ObservationEvent) -> None:
 
 
 def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    if isinstance(array, np.ndarray) and array.shape == shape and array.dtype.kind == 'f':
+    if type(array) is np.ndarray and array.shape == shape and array.dtype == np.float64:
         # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
         entries = array.ravel()
         if entries.dot(entries) <= MAX_MEASURED**2:
@@ -147,8 +152,9 @@ def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> 
 
 
 def _check_array(name: str, array: FloatArray | IntArray, shape: tuple[int, ...]) -> None:
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in 'fiu':
-        raise InvalidEventError('wrong_type', f'{name}: no numpy array of numbers')
+    # Masked arrays and np.matrix are arrays, too, but not all operations mean the same.
+    if type(array) is not np.ndarray or array.dtype.kind not in 'fiu' or array.itemsize > 8:
+        raise InvalidEventError('wrong_type', f'{name}: no plain numpy array of numbers')
     if array.shape != shape:
         raise InvalidEventError('wrong_shape', f'{name}: shape {array.shape}, not {shape}')
     if not np.isfinite(array).all():

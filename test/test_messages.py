@@ -387,6 +387,8 @@ class TestPointCloud2:
             ({'height': 2, 'row_step': 16}, 'row_step 16 is shorter'),
             ({'height': 2}, 'data too short'),
             ({'point_step': 10}, 'beyond point_step 10'),
+            ({'point_step': 2**31}, 'data too short'),
+            ({'point_step': 2**32 - 1}, 'data too short'),
             ({'width': 2**32 - 1, 'height': 2**32 - 1}, 'row_step'),
         ],
     )

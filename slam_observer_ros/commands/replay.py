@@ -41,7 +41,6 @@ from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.map_plot import plot_map
 from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
-from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
@@ -160,6 +159,9 @@ def _write_files(
     """Write what was asked for; return what was written, and why something was not."""
     estimator, smoothed = outcome.result.estimator, outcome.smoothed
     landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=map_frame)
+    moving = len(estimator.landmark_ids) - len(landmark_map.ids)
+    if moving and args.map is not None:
+        logger.warning('%d landmarks that move are left out of the map.', moving)
     trajectory = outcome.result.trajectory
     if smoothed is not None:
         # The covariances stay: what the filter knows of the map in the end is hindsight, too.
@@ -168,7 +170,7 @@ def _write_files(
     outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
         ('trajectory', args.tum, lambda path: write_tum(trajectory, path)),
         ('map', args.map, lambda path: write_map(path, landmark_map, estimator.settings)),
-        ('figures', args.plot, lambda path: _draw(outcome, trajectory, landmark_map, path)),
+        ('figures', args.plot, lambda path: _draw(outcome, trajectory, path)),
     )
     written: dict[str, Path] = {}
     errors: list[str] = []
@@ -183,23 +185,20 @@ def _write_files(
     return written, errors
 
 
-def _draw(
-    outcome: Outcome, trajectory: Trajectory, landmark_map: LandmarkMap, directory: Path
-) -> None:
+def _draw(outcome: Outcome, trajectory: Trajectory, directory: Path) -> None:
     with filled_directory(directory, FIGURES) as unfinished:
-        _draw_figures(outcome, trajectory, landmark_map, unfinished)
+        _draw_figures(outcome, trajectory, unfinished)
 
 
-def _draw_figures(
-    outcome: Outcome, trajectory: Trajectory, landmark_map: LandmarkMap, directory: Path
-) -> None:
-    result, truth = outcome.result, outcome.truth
-    errors = outcome.accuracy.pose_errors if outcome.smoothed is None else outcome.smoothed_errors
+def _draw_figures(outcome: Outcome, trajectory: Trajectory, directory: Path) -> None:
+    result, truth, estimator = outcome.result, outcome.truth, outcome.result.estimator
+    smoothed = outcome.smoothed
+    errors = outcome.accuracy.pose_errors if smoothed is None else outcome.smoothed_errors
     plot_map(
         directory / 'map.png',
-        trajectory if outcome.smoothed is None else fill_gaps(trajectory, result.dead_reckoning),
-        landmark_map.ids,
-        landmark_map.world_points,
+        trajectory if smoothed is None else fill_gaps(trajectory, result.dead_reckoning),
+        estimator.landmark_ids if smoothed is None else smoothed.ids,
+        estimator.world_points if smoothed is None else smoothed.world_points,
         Trajectory(truth.stamps_ns, truth.poses) if errors is not None else None,
         truth.landmarks,
     )

@@ -16,7 +16,7 @@ from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.alignment import find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
-from slam_observer_ros.matrices import block_diagonal, transpose
+from slam_observer_ros.matrices import block_diagonal, transpose, with_variances_above
 from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -133,13 +133,14 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     P = joint[len(axes.pose) :, len(axes.pose) :]
     G = axes.output_matrix(observer.y_ref - observer.y_ref.mean(axis=0)).reshape(n * k, -1)
     least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
-    information = gauge_information(G, _with_variances_above(least_m2, P))
+    information = gauge_information(G, with_variances_above(least_m2, P))
     G_each = G.reshape(n, k, -1)
     common = G_each @ np.linalg.pinv(information, hermitian=True) @ transpose(G_each)
     own = np.zeros((n, 3, 3))
     i = np.arange(n)
     own[:, :k, :k] = P.reshape(n, k, n, k)[i, :, i] - common
-    return _with_variances_above(0.0, R @ own @ R.T)
+    world: FloatArray = R @ own @ R.T
+    return world
 
 
 def _find_frame(
@@ -165,13 +166,6 @@ def _of_constant_gains(slam: Slam, rows: IntArray) -> FloatArray:
     covariance = np.zeros((p + k * len(rows),) * 2)
     covariance[p:, p:] = block_diagonal(slam.observer.turned(noise)[:, :k, :k])
     return covariance
-
-
-def _with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArray:
-    """Return covariances (…, k, k) whose variances rounding has made neither too small nor < 0."""
-    variances, U = np.linalg.eigh(0.5 * (covariances + transpose(covariances)))
-    clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ transpose(U)
-    return clipped
 
 
 def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:

@@ -17,6 +17,7 @@ from slam_observer_ros.maps.localisation import (
     shape_covariances,
     start_in_map,
 )
+from slam_observer_ros.matrices import with_variances_above
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
@@ -29,7 +30,7 @@ GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 
 NEWS = 0.1
 """Share of the observations that is new when the same landmarks are compared with a map again:
-with many of them that takes long, and one observation more seldom decides it.
+with many of them that takes long, and a single further observation seldom decides it.
 """
 
 
@@ -82,11 +83,13 @@ class MapFrame:
     def landmark_map(self) -> LandmarkMap:
         """The present map; see :attr:`slam_observer_ros.estimator.Estimator.landmark_map`."""
         slam, rows = self.slam, self.slam.confirmed
+        if self.settings.landmark_velocity_error == 0.0:
+            rows = rows[~slam.observer.u[rows].any(axis=1)]
         covariances = shape_covariances(slam) if self.loaded is None else slam.landmark_covariances
         return LandmarkMap(
             slam.landmarks.ids[rows],
             slam.world_points[rows],
-            None if covariances is None else covariances[rows],
+            None if covariances is None else with_variances_above(0.0, covariances[rows]),
             slam.landmarks.counts[rows],
         )
 

@@ -126,8 +126,10 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationM
     if height * width == 0:
         nothing = ObservationEvent(stamp_ns, np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
         return ObservationMessage(frame_id, nothing)
+    _check_size(len(data), height, width, point_step, row_step)
     dtype = _record_type(fields, byte_order, point_step)
-    records = _records(data, dtype, height, width, row_step)
+    strides = (row_step if height > 1 else len(data), point_step)
+    records: Records = np.ndarray((height, width), dtype, data, strides=strides)
     return ObservationMessage(frame_id, measured(_observation(stamp_ns, records)))
 
 
@@ -235,19 +237,15 @@ def _require_whole_groups(names: set[str]) -> None:
             raise MessageError(f'missing field {" ".join(missing)}')
 
 
-def _records(
-    data: memoryview, dtype: np.dtype[np.void], height: int, width: int, row_step: int
-) -> Records:
-    if height > 1 and row_step < width * dtype.itemsize:
+def _check_size(size: int, height: int, width: int, point_step: int, row_step: int) -> None:
+    """Refuse rows that overlap, and more points than there are in ``size`` bytes."""
+    if height > 1 and row_step < width * point_step:
         raise MessageError(f'row_step {row_step} is shorter than {width} points')
-    needed = (height - 1) * row_step + width * dtype.itemsize
-    if len(data) < needed:
+    needed = (height - 1) * row_step + width * point_step
+    if size < needed:
         raise MessageError(
-            f'data too short: {height} x {width} points need {needed} bytes, not {len(data)}'
+            f'data too short: {height} x {width} points need {needed} bytes, not {size}'
         )
-    strides = (row_step if height > 1 else needed, dtype.itemsize)
-    records: Records = np.ndarray((height, width), dtype, data, strides=strides)
-    return records
 
 
 def _observation(stamp_ns: int, records: Records) -> ObservationEvent:

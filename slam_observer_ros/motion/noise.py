@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.matrices import limited
 from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, Immutable
@@ -71,15 +72,3 @@ class MotionNoise(Immutable):
             stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
-
-
-def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
-    """Return covariances (..., d, d) without variances that would drown all others in rounding.
-
-    Standard deviations are at most ``largest`` (d,); the correlations stay.
-    """
-    # Rounding may have left a variance a hair below zero.
-    deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
-    scales = largest / np.maximum(deviations, largest)
-    scaled: FloatArray = covariances * scales[..., :, None] * scales[..., None, :]
-    return scaled

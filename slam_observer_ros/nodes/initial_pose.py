@@ -11,20 +11,18 @@ from rclpy.node import Node
 from slam_observer_ros.errors import MessageError, ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.maps.map_frame import GIVEN_POSE_STD
+from slam_observer_ros.matrices import limited
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_pose_with_covariance_stamped,
     PoseMessage,
 )
-from slam_observer_ros.motion.noise import limited
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
 from slam_observer_ros.parameters import table
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.covariances import MAX_POSE_ERRORS
 from slam_observer_ros.types import FloatArray
 
 TOPICS = ('initialpose', '~/set_pose')
-
-MAX_ERRORS = np.repeat([np.pi, 1e4], 3)
-"""Standard deviations of a pose, rad and m, beyond which a message only says 'unknown'."""
 
 _MAX_POSITION_M = next(row.maximum for row in table(Settings) if row.name == 'initial_position')
 
@@ -94,7 +92,7 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
     """
     given = np.zeros((6, 6)) if covariance is None else covariance
     if np.isfinite(given).all():
-        given = limited(given, MAX_ERRORS)
+        given = limited(given, MAX_POSE_ERRORS)
     rounding = 1e-9 + 1e-12 * np.trace(given)
     if not (np.isfinite(given).all() and np.linalg.eigvalsh(given).min() > -rounding):
         raise MessageError('its covariance is not finite, or negative in some direction')

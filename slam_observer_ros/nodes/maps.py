@@ -105,7 +105,10 @@ class Maps:
             raise MapError('the place in the loaded map is not known yet: nothing is saved')
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
         write_map(path, landmark_map, estimator.settings)
-        return f"saved {len(landmark_map.ids)} landmarks in frame '{self._map_frame}' to {path}"
+        moving = len(estimator.landmark_ids) - len(landmark_map.ids)
+        without = f' (without {moving} that move)' if moving else ''
+        count = len(landmark_map.ids)
+        return f"saved {count} landmarks{without} in frame '{self._map_frame}' to {path}"
 
     def _load(self, path: Path) -> str:
         landmark_map = read_map(path)

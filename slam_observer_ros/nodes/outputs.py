@@ -166,6 +166,7 @@ class Outputs:
 
     def _publish_landmarks(self, stamp_ns: int) -> None:
         estimator, map_frame = self._estimator, self._settings.map_frame
+        velocities = estimator.landmark_velocities
         self._map.publish(
             point_cloud2_message(
                 stamp_ns,
@@ -173,6 +174,7 @@ class Outputs:
                 estimator.landmark_ids,
                 estimator.world_points,
                 estimator.landmark_covariances,
+                velocities if velocities.any() else None,
             )
         )
         if self._markers.get_subscription_count() > 0:

@@ -11,8 +11,12 @@ import numpy as np
 from slam_observer_ros.gains.base import GainDesign
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.matrices import limited
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray, IntArray
+
+MAX_POSE_ERRORS = np.repeat([np.pi, 1e4], 3)
+"""Standard deviations of a pose that is told, rad and m, beyond which it is only 'unknown'."""
 
 
 def of_landmarks(observer: Observer, gains: GainDesign) -> FloatArray | None:
@@ -59,9 +63,12 @@ def of_pose(observer: Observer, covariance: FloatArray | None, A: FloatArray) ->
 
 
 def of_pose_error(observer: Observer, world: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of ε, given that of the pose as :func:`of_pose` returns it."""
+    """Return the covariance (6, 6) of ε, given that of the pose as :func:`of_pose` returns it.
+
+    What is beyond :data:`MAX_POSE_ERRORS` is made less.
+    """
     back = np.linalg.inv(_turn_to_world(observer, observer.A))
-    covariance: FloatArray = back @ world @ back.T
+    covariance: FloatArray = back @ limited(world, MAX_POSE_ERRORS) @ back.T
     return covariance
 
 
