@@ -124,11 +124,12 @@ def call(ros, service):
     return ros.call(Trigger, f'/observer_node/{service}', Trigger.Request())
 
 
-def name_file(ros, path):
+def name_file(ros, path, must_succeed=True):
     value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(path))
     request = SetParameters.Request(parameters=[Parameter(name='map_path', value=value)])
     (result,) = ros.call(SetParameters, '/observer_node/set_parameters', request).results
-    assert result.successful, result.reason
+    assert result.successful == must_succeed, result.reason
+    return result
 
 
 def initial_pose(pose, frame_id='map', variances=(0.01,) * 6):
@@ -183,6 +184,46 @@ def test_a_fixed_surveyed_map_is_saved_at_the_end_as_it_was(ros, robot, tmp_path
     order = np.argsort(after.ids)
     assert after.ids[order].tolist() == before.ids.tolist()
     assert_allclose(after.world_points[order], before.world_points, atol=1e-9)
+
+
+def test_a_map_that_is_not_the_nodes_own_is_kept_when_another_one_takes_its_place(
+    ros, robot, tmp_path
+):
+    path = robot.surveyed_file(tmp_path / 'hall.yaml')
+    before = path.read_text()
+    node = NodeProcess(
+        'observer_node', tmp_path / 'log', map_path=path, autosave_map=True, **PARAMETERS
+    )
+    try:
+        node.wait_for_output("'autosave_map' will replace .*hall.yaml, which is not loaded")
+        robot.connect()
+        for _ in range(3):
+            robot.see_until_published(np.eye(4), range(4))
+        assert call(ros, 'save_map').message.endswith('; what it held before is in hall.yaml~')
+        assert len(read_map(path).ids) == 4
+        assert call(ros, 'save_map').message.endswith('hall.yaml')
+    finally:
+        assert node.stop() == 0
+    assert (tmp_path / 'hall.yaml~').read_text() == before
+
+
+def test_a_map_that_can_not_be_saved_at_the_end_is_told_by_the_exit_code(ros, robot, tmp_path):
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    maps = {'map_path': folder / 'map.yaml', 'autosave_map': True}
+    node = NodeProcess('observer_node', tmp_path / 'log', **maps, **PARAMETERS)
+    try:
+        robot.connect()
+        for _ in range(3):
+            robot.see_until_published(np.eye(4), range(4))
+        refused = name_file(ros, '/no/such/map.yaml', must_succeed=False)
+        assert 'the directory /no/such takes no file' in refused.reason
+        folder.rmdir()
+    finally:
+        exit_code = node.stop()
+    assert exit_code == 1
+    assert 'the map is not saved: ' in node.output
+    assert 'Traceback' not in node.output
 
 
 def test_a_map_loaded_while_running_moves_the_estimate_into_its_frame(ros, robot, tmp_path):

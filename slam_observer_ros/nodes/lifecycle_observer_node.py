@@ -57,18 +57,20 @@ class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Save the map if that was asked for, and forget all."""
-        self._close()
+        self._close_and_tell()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Save the map if that was asked for, and end for good."""
-        self._close()
+        self._close_and_tell()
         return TransitionCallbackReturn.SUCCESS
 
     def destroy_node(self) -> None:
-        """End, whatever the state."""
-        self._close()
-        super().destroy_node()
+        """End, whatever the state; raise a MapError if the map can't be saved."""
+        try:
+            self._close()
+        finally:
+            super().destroy_node()
 
     def _refuse_impossible_transitions(self) -> None:
         """Answer no to what the state does not allow; rclpy would end with a traceback."""
@@ -84,6 +86,13 @@ class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes
                 return response
 
         service.callback = change_if_possible
+
+    def _close_and_tell(self) -> None:
+        """Close the core; a map that can't be saved keeps no transition from being made."""
+        try:
+            self._close()
+        except SlamObserverError as error:
+            self.get_logger().error(str(error))
 
     def _close(self) -> None:
         core, self._core = self._core, None

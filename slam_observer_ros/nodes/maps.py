@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 import dataclasses
 from pathlib import Path
+import shutil
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.errors import MapError, ParameterError, SlamObserverError
@@ -50,26 +53,71 @@ class Maps:
         self._autosave = settings.autosave_map
         self._estimator = estimator
         self._on_load = on_load
-        if settings.autosave_map:
-            if not settings.map_path:
-                raise ParameterError("'autosave_map' needs a file in 'map_path'")
-            check_writable(_absolute(settings.map_path))
+        # Files that hold what this node has loaded or saved, and that it may write again.
+        self._own_files: set[Path] = set()
+        if self._autosave:
+            self._check_autosave(settings.map_path)
         if settings.map_file:
             node.get_logger().info(self._load(_absolute(settings.map_file)))
         elif estimator.settings.localization_mode != 'off':
             node.get_logger().warning("no 'map_file': mapping until a map comes by ~/load_map")
+        self._warn_of_another(settings.map_path)
+        node.add_on_set_parameters_callback(self._check_changes)
         node.create_service(Trigger, '~/save_map', self._answer_save)
         node.create_service(Trigger, '~/load_map', self._answer_load)
 
     def save_at_end(self) -> None:
-        """Save the map if that was asked for and there is one."""
-        if not self._autosave:
+        """Save the map if that was asked for and there is one.
+
+        Raises
+        ------
+        MapError
+            If it can't be saved.
+
+        """
+        self._node.remove_on_set_parameters_callback(self._check_changes)
+        if not self._autosave or not len(self._estimator.landmark_ids):
             return
         try:
-            if len(self._estimator.landmark_ids):
-                self._node.get_logger().info(self._save(self._path()))
+            self._node.get_logger().info(self._save(self._path()))
         except SlamObserverError as error:
-            self._node.get_logger().error(f'the map is not saved: {error}')
+            raise MapError(f'the map is not saved: {error}') from error
+
+    def _check_changes(self, changes: list[Parameter]) -> SetParametersResult:
+        """Refuse a file that the map could not be saved to at the end."""
+        try:
+            for change in changes:
+                if change.name == 'map_path' and self._autosave:
+                    self._check_autosave(change.value)
+        except SlamObserverError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    @staticmethod
+    def _check_autosave(map_path: str) -> None:
+        if not map_path:
+            raise ParameterError("'autosave_map' needs a file in 'map_path'")
+        check_writable(_absolute(map_path))
+
+    def _warn_of_another(self, map_path: str) -> None:
+        """Warn that the map of the end will take the place of one that is not loaded."""
+        path = _absolute(map_path)
+        if self._autosave and path.exists() and path not in self._own_files:
+            self._node.get_logger().warning(
+                f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
+                f'holds will be kept in {_backup(path).name}'
+            )
+
+    def _keep(self, path: Path) -> str:
+        """Keep a copy of a map that is not this node's own; return how to tell of it."""
+        if path in self._own_files or not path.exists():
+            return ''
+        backup = _backup(path)
+        try:
+            shutil.copy2(path, backup)
+        except OSError as error:
+            raise MapError(f"can't keep a copy of {path} in {backup}: {error.strerror}") from error
+        return f'; what it held before is in {backup.name}'
 
     def _answer_save(
         self, _request: Trigger.Request, response: Trigger.Response
@@ -104,11 +152,13 @@ class Maps:
         if not estimator.is_localised:
             raise MapError('the place in the loaded map is not known yet: nothing is saved')
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
+        kept = self._keep(path)
         write_map(path, landmark_map, estimator.settings)
+        self._own_files.add(path)
         moving = len(estimator.landmark_ids) - len(landmark_map.ids)
         without = f' (without {moving} that move)' if moving else ''
         count = len(landmark_map.ids)
-        return f"saved {count} landmarks{without} in frame '{self._map_frame}' to {path}"
+        return f"saved {count} landmarks{without} in frame '{self._map_frame}' to {path}{kept}"
 
     def _load(self, path: Path) -> str:
         landmark_map = read_map(path)
@@ -119,6 +169,7 @@ class Maps:
             )
         self._estimator.release()  # what has come before belongs to the old frame
         self._estimator.load_map(landmark_map)
+        self._own_files.add(path)
         self._on_load()
         return f'loaded {len(landmark_map.ids)} landmarks from {path}; {self._place()}'
 
@@ -131,6 +182,10 @@ class Maps:
             x, y, z = estimator.pose[:3, 3].tolist()
             return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
         return 'the robot has found its place in it'
+
+
+def _backup(path: Path) -> Path:
+    return path.with_name(f'{path.name}~')
 
 
 def _absolute(path: str) -> Path:

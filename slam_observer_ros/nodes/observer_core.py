@@ -97,11 +97,20 @@ class ObserverCore:
             timer.cancel()
 
     def close(self) -> None:
-        """Save the map if that was asked for, and take all away from the node again."""
-        self._maps.save_at_end()
-        self._jump_handle.unregister()
-        self._node.remove_post_set_parameters_callback(self._apply_parameters)
-        self._entities.remove_new()
+        """Save the map if that was asked for, and take all away from the node again.
+
+        Raises
+        ------
+        MapError
+            If the map can't be saved; all is taken away nevertheless.
+
+        """
+        try:
+            self._maps.save_at_end()
+        finally:
+            self._jump_handle.unregister()
+            self._node.remove_post_set_parameters_callback(self._apply_parameters)
+            self._entities.remove_new()
 
     def _create_timers(self, publish_rate_hz: float) -> list[Timer]:
         # A steady clock: with use_sim_time the ROS clock may stand still or jump back.

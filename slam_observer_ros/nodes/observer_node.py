@@ -25,9 +25,11 @@ class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._core.start()
 
     def destroy_node(self) -> None:
-        """Save the map if that was asked for, and end."""
-        self._core.close()
-        super().destroy_node()
+        """Save the map if that was asked for, and end; raise a MapError if it can't be saved."""
+        try:
+            self._core.close()
+        finally:
+            super().destroy_node()
 
 
 def main() -> int:

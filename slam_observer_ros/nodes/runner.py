@@ -49,7 +49,8 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int
     Returns
     -------
     int
-        Exit code: 0 after a clean stop, 2 where ROS or the node refused to start.
+        Exit code: 0 after a clean stop, 1 if something could not be saved at the end, 2 where ROS
+        or the node refused to start.
 
     """
     use_one_thread()
@@ -84,5 +85,15 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
         node.get_logger().debug('context was shut down')
     finally:
         executor.shutdown()
+        exit_code = _destroy(node)
+    return exit_code
+
+
+def _destroy(node: Node) -> int:
+    """End a node; return the exit code."""
+    try:
         node.destroy_node()
+    except SlamObserverError as error:
+        get_logger('slam_observer_ros').error(str(error))
+        return 1
     return 0
