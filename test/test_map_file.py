@@ -193,15 +193,25 @@ BAD_FILES = [
     (changed('-2', 'x'), "landmark 7: 'position' has 'x'"),
     (changed('sigma: 0.01', 'sigma: -1'), "landmark 7: 'sigma' is negative"),
     (changed('sigma: 0.01', 'sigma: .nan'), "landmark 7: 'sigma' has nan"),
-    (changed(', sigma: 0.01', ''), "landmark 7 has none of 'sigma' and 'covariance'"),
+    (changed('id: 7', 'id: 010'), "entry 0 of landmarks: 'id' is '010'"),
+    (changed('id: 7', 'id: 1:30'), "'id' is '1:30'"),
+    (changed('sigma: 0.01', 'position: [0, 0, 0]'), "'position' is there 2 times in one entry"),
+    (changed(', sigma: 0.01', ''), "landmark 7 has no 'sigma' or 'covariance', as others have"),
     (changed('sigma: 0.01', 'variance: 0.01'), "has 'variance', which is not known"),
-    (changed('sigma: 0.01', 'sigma: 0.01, covariance: []'), "landmark 7 has 2 of 'sigma'"),
+    (changed('sigma: 0.01', 'sigma: 0.01, covariance: []'), "landmark 7 has both 'sigma' and"),
     (changed('sigma: 0.01', 'covariance: 3'), "landmark 7: 'covariance' is not 3 × 3"),
     (changed('sigma: 0.01', 'covariance: [[1, 0, 0], [0, 1], [0, 0, 1]]'), 'list of 3 numbers'),
     (changed('sigma: 0.01', 'covariance: [[1, 9, 0], [0, 1, 0], [0, 0, 1]]'), 'not symmetric'),
     (changed('sigma: 0.01', 'covariance: [[1, 9, 0], [9, 1, 0], [0, 0, 1]]'), 'negative in some'),
     (changed('sigma: 0.01', 'sigma: 0.01, observations: 1.5'), "'observations' is 1.5"),
 ]
+
+
+@pytest.mark.parametrize('number', ['1.5', '+1.5', '15e-1', '0.15e1', '1.5E0', '15.e-1'])
+def test_a_number_is_read_however_it_is_written(tmp_path, number):
+    path = tmp_path / 'map.yaml'
+    path.write_text(changed('[1.5, -2', f'[{number}, -.2e1'))
+    np.testing.assert_array_equal(read_map(path).world_points[0, :2], [1.5, -2.0])
 
 
 @pytest.mark.parametrize(('text', 'reason'), BAD_FILES)

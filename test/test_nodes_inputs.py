@@ -313,6 +313,30 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
     assert_allclose(seen(nameless_maps)[FIRST_AUTOMATIC_ID], [1.0, 1.0, 1.0], atol=1e-6)
 
 
+def test_the_map_tells_the_velocities_that_landmarks_came_with(ros, tmp_path):
+    maps = ros.collect(PointCloud2, '/moving/map', LATCHED_QOS)
+    points, speed = np.array([[2.0, 0, 0], [0, 3.0, 1.0]]), np.array([[0, 0.5, 0], [0, 0, 0]])
+    with (
+        running('observer_node', tmp_path / 'log', *own_topics('/moving'), odom_frame="''"),
+        Robot(ros, namespace='/moving') as robot,
+    ):
+        start_ns = time.time_ns()
+        for step in range(20):
+            stamp = start_ns + step * STEP_NS
+            robot.send(VelocityEvent(stamp, np.zeros(6)))
+            moved = points + speed * step * STEP_NS * 1e-9
+            robot.send(ObservationEvent(stamp, np.array([3, 4]), moved, None, speed))
+            ros.spin_for(0.05)
+        ros.spin_until(lambda: len(seen(maps)) == 2, 'two landmarks')
+        ros.spin_until(
+            lambda: stamp_ns(maps[-1]) >= start_ns + 15 * STEP_NS, 'a map of the last stamps'
+        )
+    event = decode_point_cloud2(serialize_message(maps[-1])).event
+    assert_allclose(event.velocities, speed, atol=1e-6)
+    elapsed_s = (stamp_ns(maps[-1]) - start_ns) * 1e-9
+    assert_allclose(event.points, points + speed * elapsed_s, atol=1e-3)
+
+
 def seen(maps):
     if not maps:
         return {}

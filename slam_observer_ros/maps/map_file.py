@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 import dataclasses
 import os
 from pathlib import Path
+import re
 import tempfile
 from typing import Any
 
@@ -37,6 +38,8 @@ from slam_observer_ros.types import FloatArray
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
 
+_INT, _FLOAT = 'tag:yaml.org,2002:int', 'tag:yaml.org,2002:float'
+
 _MAX_INT64 = 2**63 - 1
 
 _MAX_NUMBER = 1e12
@@ -46,8 +49,37 @@ _ROUNDING = 1e-6
 """Part of a covariance's largest entry by which it may miss being one."""
 
 # Faster by far, where libyaml is.
-_Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_FastLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+class _StrictLoader(_FastLoader):  # type: ignore[misc]  # one of two classes
+    """Reads the numbers of YAML 1.2, and no key twice: by 1.1, 010 is 8 and 1:30 is 90."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own)
+        first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT)]
+        for first, resolvers in _FastLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
+        """Return a mapping; raise a YAMLError if it has a key twice."""
+        for key, count in Counter(key.value for key, _ in node.value).items():
+            if count > 1:
+                raise yaml.YAMLError(f"'{key}' is there {count} times in one entry")
+        return super().construct_mapping(node, deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    _INT, re.compile(r'^[-+]?(?:0|[1-9][0-9]*)$'), list('-+0123456789')
+)
+_StrictLoader.add_implicit_resolver(
+    _FLOAT,
+    re.compile(
+        r'^[-+]?(?:\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?$'
+        r'|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$'
+    ),
+    list('-+.0123456789'),
+)
 
 
 def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
@@ -127,7 +159,7 @@ def read_map(path: Path) -> LandmarkMap:
 
     """
     try:
-        content = yaml.load(path.read_text(encoding='utf-8'), _Loader)
+        content = yaml.load(path.read_text(encoding='utf-8'), _StrictLoader)
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -213,8 +245,8 @@ def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:
 def _covariance(row: Mapping[str, Any]) -> FloatArray:
     who = f'landmark {row["id"]}'
     given = [name for name in ('sigma', 'covariance') if name in row]
-    if len(given) != 1:
-        raise MapError(f"{who} has {len(given) or 'none'} of 'sigma' and 'covariance', not one")
+    _expect(len(given) < 2, f"{who} has both 'sigma' and 'covariance': leave one")
+    _expect(bool(given), f"{who} has no 'sigma' or 'covariance', as others have: give all one")
     if 'sigma' in row:
         (sigma_m,) = _numbers([row['sigma']], 1, f"{who}: 'sigma'")
         _expect(sigma_m >= 0.0, f"{who}: 'sigma' is negative")

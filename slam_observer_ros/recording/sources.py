@@ -111,7 +111,8 @@ class BagSource:
         wanted = [c for c in self._reader.connections if self._topic(c) in topics]
         if not wanted:  # rosbags would take this for all connections.
             return
-        with _damage_reported(self._path):
+        remedy = "; 'mcap recover' may save the rest" if self._path.suffix == '.mcap' else ''
+        with _damage_reported(self._path, remedy):
             for connection, stamp_ns, data in self._reader.messages(wanted):
                 yield RawMessage(self._topic(connection), stamp_ns, self._cdr(connection, data))
 
@@ -214,7 +215,7 @@ class SplitSource:
 
 
 @contextmanager
-def _damage_reported(path: Path) -> Iterator[None]:
+def _damage_reported(path: Path, remedy: str = '') -> Iterator[None]:
     """Turn whatever the reading libraries raise into one line about the file.
 
     Fed with damaged files they pass on AssertionError, OverflowError, MemoryError, and the errors
@@ -226,7 +227,7 @@ def _damage_reported(path: Path) -> Iterator[None]:
         reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
         if isinstance(error, UnicodeError):  # bytes where text should be
             reason = f'it is damaged, or no {path.suffix} file'
-        raise RecordingError(f'{path}: can not be read: {reason}') from error
+        raise RecordingError(f'{path}: can not be read: {reason}{remedy}') from error
 
 
 def _next_whole(records: Iterator[object]) -> object | None:
