@@ -33,6 +33,9 @@ from slam_observer_ros.validation import check_event, check_map, check_pose
 
 logger = logging.getLogger(__name__)
 
+MANY_LANDMARKS = 1000
+"""Landmarks from which on Riccati gains take too long for most sensors."""
+
 
 class Estimator:
     """Pose and landmark map from time-stamped velocities and observations.
@@ -96,6 +99,9 @@ class Estimator:
         self._on_update, self._on_stamp, self._on_motion = on_update, on_stamp, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
+        unused = [name for name in self._slam.gains.ignores if np.any(getattr(settings, name))]
+        if unused:
+            logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
 
     def reset(self, pose: FloatArray | None = None) -> None:
         """Forget the motion, what was mapped and events held back, and start again.
@@ -454,6 +460,8 @@ class Estimator:
             self._warnings.moved_landmarks(outcome.moved_ids)
         self._warnings.lost_places(self._frame.counts)
         self._counts['observation'] += 1
+        if len(self._slam.landmarks) >= MANY_LANDMARKS and self.settings.gains == 'riccati':
+            self._warnings.large_map(len(self._slam.landmarks))
         self._frame.find_place(outcome)
         observer = self._slam.observer
         self._last = Update(

@@ -15,6 +15,9 @@ logger = logging.getLogger(__name__)
 MAX_NAMED = 10
 """Ids that a warning lists at most."""
 
+MANY_MOVED = 5
+"""Landmarks that seem to have moved from which on the odometry may be at fault."""
+
 LOST_PLACES = {
     'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
     'strange_place': 'Nothing that is seen is where the map has it: if the robot slipped or was '
@@ -29,6 +32,7 @@ class EventWarnings:
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._places: Counter[str] = Counter()
+        self._moved_ids: set[int] = set()
 
     def dropped(self, error: InvalidEventError) -> None:
         """Tell that an event is not used, and why."""
@@ -57,9 +61,31 @@ class EventWarnings:
         text = f'Points without an id are not used by {gains} gains, only by riccati'
         self._warn('unknown_id', text)
 
+    def large_map(self, count: int) -> None:
+        """Tell once that Riccati gains are slow on a map of so many landmarks."""
+        if not self._counts['large_map']:
+            self._counts['large_map'] = 1
+            logger.warning(
+                'The map has %d landmarks, and the time that riccati gains take grows with their '
+                'square: scheduled gains take many more, and max_landmarks limits them.',
+                count,
+            )
+
+    def more_than_max(self, count: int, limit: int) -> None:
+        """Tell that one observation has more landmarks than may be kept."""
+        text = f'{count} points in one message, and max_landmarks is {limit}: some are always new'
+        self._warn('more_than_max', text)
+
     def moved_landmarks(self, ids: IntArray) -> None:
         """Tell that landmarks are not any more where they were."""
-        self._warn('moved_landmark', f'Landmarks {ids.tolist()} have moved')
+        text = f'Landmarks {ids.tolist()} have moved'
+        self._moved_ids.update(ids.tolist())
+        if len(self._moved_ids) >= MANY_MOVED:
+            text += (
+                '; as so many seem to, odometry may err by more than its noise allows: let its '
+                'bias and scale be estimated (angular_bias_error and the like)'
+            )
+        self._warn('moved_landmark', text)
 
     def lost_places(self, counts: Mapping[str, int]) -> None:
         """Tell that the robot is not where it was taken to be, if ``counts`` say so once more."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 
+from slam_observer_ros import estimator as estimator_module
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.counts import used_points
 from slam_observer_ros.errors import MapError, ParameterError
@@ -286,7 +287,6 @@ def bad_events():
         ('too_large', ObservationEvent(stamp_ns, np.array([7, 2**32 - 1]), points)),
         ('wrong_type', ObservationEvent(stamp_ns, np.ma.array(good.ids), points)),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, np.ma.array(points))),
-        ('wrong_type', ObservationEvent(stamp_ns, good.ids, np.matrix(points))),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, points.astype(np.longdouble))),
         ('wrong_type', None),
         ('wrong_type', PoseTruth(stamp_ns, np.eye(4))),
@@ -344,6 +344,44 @@ def test_points_with_ids_that_are_kept_for_others_are_left_out_counted_and_named
     assert used_points(estimator.counts) == 10
     assert 'points with the ids 10000000, 16777215;' in caplog.text
     assert len(caplog.records) == 1
+
+
+def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
+    asked = {'landmark_velocity_error': 0.1, 'linear_bias_error': (0.2, 0.0, 0.0)}
+    Estimator(Settings(gains='riccati', **asked))
+    assert not caplog.records
+    Estimator(Settings(gains='scheduled', **asked)).reset()
+    Estimator(Settings(gains='constant', **asked))
+    assert caplog.messages == [
+        'No effect on scheduled gains: landmark_velocity_error.',
+        'No effect on constant gains: linear_bias_error, landmark_velocity_error.',
+    ]
+
+
+def test_where_many_landmarks_seem_to_move_the_odometry_is_named(caplog):
+    estimator = Estimator(Settings(gains='scheduled', reorder_window=0.0, max_rejections=2))
+    for step in range(500):
+        estimator.add(velocity(0.1 * step, np.zeros(6)))
+        times_moved = (step // 8 + 4 - np.arange(5)) // 5  # one after another
+        points = LANDMARKS + 3.0 * np.outer(times_moved, [0.0, 0.0, 1.0])
+        estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), points))
+    told = [message for message in caplog.messages if 'have moved' in message]
+    assert 'angular_bias_error' not in told[0]
+    assert all('angular_bias_error' in message for message in told[1:])
+    assert len(told) > 1
+
+
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_map_too_large_for_riccati_gains_is_told_once(caplog, monkeypatch, gains):
+    monkeypatch.setattr(estimator_module, 'MANY_LANDMARKS', 5)
+    run([observation(0.1 * step) for step in range(5)], gains=gains)
+    told = [message for message in caplog.messages if 'The map has 5 landmarks' in message]
+    assert len(told) == (gains == 'riccati')
+
+
+def test_more_landmarks_at_once_than_may_be_kept_are_told(caplog):
+    run([observation(0.1 * step) for step in range(5)], max_landmarks=3)
+    assert '5 points in one message, and max_landmarks is 3' in caplog.text
 
 
 @pytest.mark.parametrize('repeated', [[1, 1], [1, 1, 1], [1, 3, 3, 1]])

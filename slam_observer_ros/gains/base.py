@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -120,10 +121,13 @@ class GainDesign:
     ----------
     calibration : Calibration
         Scale, bias and delay of the velocity, as far as they are known.
+    ignores : tuple of str
+        Settings above zero that ask for an estimate which the design does not make.
 
     """
 
     calibration: Calibration
+    ignores: ClassVar[tuple[str, ...]] = ()
 
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return the correction and the weights (m,) of the points seen, 0 for a rejected one."""

@@ -47,6 +47,15 @@ class ConstantGains(GainDesign):
 
     """
 
+    ignores = (
+        'angular_scale_error',
+        'linear_scale_error',
+        'angular_bias_error',
+        'linear_bias_error',
+        'velocity_delay_error',
+        'landmark_velocity_error',
+    )
+
     def __init__(self, settings: Settings) -> None:
         self._axes = axes_of(settings.two_d_mode)
         self._is_held = False

@@ -57,6 +57,8 @@ class ScheduledGains(GainDesign):
 
     """
 
+    ignores = ('landmark_velocity_error',)
+
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._axes = axes_of(settings.two_d_mode)
