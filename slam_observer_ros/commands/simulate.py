@@ -20,7 +20,6 @@ from slam_observer_ros.commands.outputs import (
     recording_path,
 )
 from slam_observer_ros.evaluation.simulation_plots import plot_configuration, plot_lyapunov
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings import Settings
@@ -137,12 +136,7 @@ def _record(simulation: Simulation, path: Path, force: bool) -> None:
     with RecordingWriter(path, overwrite=force) as writer:
         writer.write_landmarks(start_ns, simulation.landmark_truth(start_ns))
         for event in _events(simulation, 'recording'):
-            if isinstance(event, VelocityEvent):
-                writer.write_velocity(event)
-            elif isinstance(event, ObservationEvent):
-                writer.write_observation(event)
-            else:
-                writer.write_pose(event)
+            writer.write_event(event)
 
 
 def _draw(simulation: Simulation, result: SimulatedRun, directory: Path) -> None:

@@ -166,6 +166,15 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f'{self.path}: {error.strerror}') from error
 
+    def write_event(self, event: VelocityEvent | ObservationEvent | PoseTruth) -> None:
+        """Write a velocity, an observation or a true pose to its default topic."""
+        if isinstance(event, VelocityEvent):
+            self.write_velocity(event)
+        elif isinstance(event, ObservationEvent):
+            self.write_observation(event)
+        else:
+            self.write_pose(event)
+
     def write_velocity(
         self,
         event: VelocityEvent,

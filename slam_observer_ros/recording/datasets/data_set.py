@@ -85,10 +85,4 @@ def write_data_set(data_set: DataSet, out: Path | str, overwrite: bool = False) 
     with RecordingWriter(out, overwrite) as writer:
         writer.write_landmarks(items[order[0]].stamp_ns, data_set.landmarks)
         for index in order:
-            item = items[index]
-            if isinstance(item, VelocityEvent):
-                writer.write_velocity(item)
-            elif isinstance(item, ObservationEvent):
-                writer.write_observation(item)
-            else:
-                writer.write_pose(item)
+            writer.write_event(items[index])
