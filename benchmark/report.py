@@ -72,7 +72,9 @@ METRICS: dict[str, tuple[str, int]] = {
 OUTLIERS_TITLE = 'Growth of the configuration error with 5 % gross outliers and 1 % swapped ids'
 NO_IDS_TITLE = 'Configuration error and CPU time with and without ids'
 NO_IDS_COLUMNS = tuple(
-    f'{case}, {unit}' for unit in 'ms' for case in ('with', 'without', 'and with 5 % false points')
+    f'{case}, {unit}'
+    for unit in ('m', 's')
+    for case in ('with', 'without', 'and with 5 % false points')
 )
 
 BATCHES_TITLE = f'inside, {BATCH_OF_RUNS} runs at a time'
@@ -89,7 +91,7 @@ that are new in each observation. Where errors last (`observation_error_time`, f
 all are given the same larger covariances.
 
 - **constant, scheduled, riccati**: this project's gain designs. The wheeled configuration also
-  lets `scheduled` and `riccati` estimate the scale and the delay of the odometry, which GTSAM and
+  lets `scheduled` and `riccati` estimate scale, bias and delay of the odometry, which GTSAM and
   the EKF don't do here; `riccati, no calibration` has that switched off, for a comparison on equal
   terms.
 - **textbook EKF**: world-frame errors and absolute landmarks (`benchmark/ekf_slam.py`), with the

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observation_noise import lasting, ObservationNoise
+from slam_observer_ros.observation_noise import ObservationNoise, repetition_factors
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
@@ -44,4 +44,4 @@ class SightingNoise:
         dt_s = np.array(
             [np.inf if last is None else to_s(event.stamp_ns - last) for last in before_ns]
         )
-        return self._noise.covariances(event), lasting(dt_s, self._noise.error_time_s)
+        return self._noise.covariances(event), repetition_factors(dt_s, self._noise.error_time_s)

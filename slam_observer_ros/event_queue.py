@@ -37,9 +37,10 @@ class EventQueue:
     second velocity of one kind and stamp is a duplicate; so is an observation that has the ids
     and points of another one.
 
-    A stamp ahead by more than events may be late would make all that follow too late if it were
-    wrong. Unless events come that seldom, it waits until time has come there, or until others
-    say that there was a pause. How long it may be is not limited by ``max_jump_ns`` if nothing was
+    A stamp that is ahead of all others by more than events may be late is kept, but not believed
+    at once: one wrong stamp would make all other events too late. It is believed when time has
+    got there, or when ``CONFIRMATIONS`` stamps agree that there was a pause; at once where events
+    come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
     received for as long: then it was a silence, not the clock.
 
     Parameters

@@ -39,7 +39,7 @@ class ObservationNoise(Immutable):
     Attributes
     ----------
     error_time_s : float
-        Correlation time of the errors, see :func:`lasting`.
+        Correlation time of the errors, see :func:`repetition_factors`.
 
     """
 
@@ -87,8 +87,8 @@ class ObservationNoise(Immutable):
         return _invertible(_along_and_across(sights, range_squared, along, across))
 
 
-def lasting(dt_s: FloatArray, error_time_s: float) -> FloatArray:
-    """Return by how much less observations (m,) tell if their errors last.
+def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
+    """Return by what factors (m,) the variances of observations grow if their errors last.
 
     An error with the correlation time τ is ρ = e^(−dt/τ) times what it was ``dt_s`` before, and
     noise beside. n observations of one thing then weigh as much as one, and n − 1 whose variance

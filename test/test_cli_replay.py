@@ -509,7 +509,8 @@ class TestSmoothing:
 
     def test_messages_without_any_point_cut_no_history_short(self, slam_observer, tmp_path):
         path = write_events(tmp_path / 'blind.mcap', blinded(recordings.events(), slice(20, 40)))
-        slam_observer.succeed('replay', path, '--smooth', '--gains', 'riccati')
+        ended = slam_observer.succeed('replay', path, '--smooth', '--gains', 'riccati')
+        assert 'history' not in ended.errors
 
     def test_where_no_point_is_seen_nothing_is_smoothed(self, slam_observer, tmp_path):
         path = write_events(tmp_path / 'blind.mcap', blinded(recordings.events(), slice(None)))
@@ -558,13 +559,24 @@ class TestSettings:
         assert 'riccati gains' in wins
 
     def test_file_by_the_name_that_it_is_shipped_under(self, slam_observer, simulated):
-        slam_observer.succeed('replay', simulated, '--config', 'observer')
+        shipped = Path(__file__).resolve().parent.parent / 'config' / 'observer.yaml'
+        named = slam_observer.succeed('replay', simulated, '--config', 'observer', '--json')
+        given = slam_observer.succeed('replay', simulated, '--config', shipped, '--json')
+        assert named.json | {'seconds': 0} == given.json | {'seconds': 0}
 
-    def test_values_of_each_type(self, slam_observer, simulated):
-        slam_observer.succeed(
-            'replay', simulated, '--set', 'gain_k=1e1', '--set', 'gain_l=.5',
-            '--set', 'angular_velocity_noise=[1e-3, 0.01, 1]', '--set', 'step_mode=paper',
+    def test_values_of_each_type(self, slam_observer, simulated, tmp_path):
+        given = (
+            '--set', 'gain_k=1e1', '--set', 'gain_l=.5', '--set', 'step_mode=paper',
+            '--set', 'angular_velocity_noise=[1e-3, 0.01, 1]', '--gains', 'constant',
         )  # fmt: skip
+        config = self.config(
+            tmp_path,
+            'gains: constant, gain_k: 10.0, gain_l: 0.5, step_mode: paper, '
+            'angular_velocity_noise: [0.001, 0.01, 1.0]',
+        )
+        one = slam_observer.succeed('replay', simulated, *given, '--json').json
+        other = slam_observer.succeed('replay', simulated, '--config', config, '--json').json
+        assert one | {'seconds': 0} == other | {'seconds': 0}
 
     def test_names_of_other_nodes_in_the_file_are_ignored(
         self, slam_observer, simulated, tmp_path

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.maps.landmark_map import LandmarkMap
-from slam_observer_ros.observation_noise import lasting
+from slam_observer_ros.observation_noise import repetition_factors
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.landmark_table import LandmarkTable
 
@@ -35,11 +35,13 @@ def test_observations_tell_together_what_their_joint_covariance_says(n, dt_s, er
     joint = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     expected = np.linalg.solve(joint, np.ones(n)).sum()
     since_s = np.array([np.inf, *[dt_s] * (n - 1)])
-    np.testing.assert_allclose((1.0 / lasting(since_s, error_time_s)).sum(), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        (1.0 / repetition_factors(since_s, error_time_s)).sum(), expected, rtol=1e-9
+    )
 
 
 def test_errors_that_do_not_last_make_nothing_larger():
-    assert (lasting(np.array([0.0, 1.0, np.inf]), 0.0) == 1.0).all()
+    assert (repetition_factors(np.array([0.0, 1.0, np.inf]), 0.0) == 1.0).all()
 
 
 def standing(settings, seed, duration_s=20.0):

@@ -161,7 +161,7 @@ def _may_be(slam: Slam, seen: _Points, at: IntArray, rows: IntArray) -> BoolArra
 
 
 def _as_residuals(observer: Observer, seen: _Points, at: IntArray, rows: IntArray) -> Residuals:
-    """Return what it would be if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
+    """Return the residuals if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
     a = observer.a[rows]
     e = seen.points[at] - a
     return Residuals(rows, e, e - observer.y_ref[rows], a, seen.noise[at], np.zeros(len(rows)))

@@ -34,7 +34,7 @@ from slam_observer_ros.commands.replay_inputs import (
     warn_of_unused,
     with_base_frame,
 )
-from slam_observer_ros.commands.replay_outcome import Outcome, outcome_of, with_smoothed
+from slam_observer_ros.commands.replay_outcome import outcome_of, ReplayOutcome, with_smoothed
 from slam_observer_ros.commands.replay_report import as_json, print_summary
 from slam_observer_ros.errors import SlamObserverError
 from slam_observer_ros.evaluation.gaps import fill_gaps
@@ -142,7 +142,7 @@ def _check_files(args: argparse.Namespace) -> None:
     check_plots(args.plot, FIGURES, args.force)
 
 
-def _give_out(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> None:
+def _give_out(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
     """Write and print all that can be, and only then say what could not be written."""
     written, errors = _write_files(args, outcome, map_frame)
     if args.json:
@@ -154,7 +154,7 @@ def _give_out(args: argparse.Namespace, outcome: Outcome, map_frame: str) -> Non
 
 
 def _write_files(
-    args: argparse.Namespace, outcome: Outcome, map_frame: str
+    args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str
 ) -> tuple[dict[str, Path], list[str]]:
     """Write what was asked for; return what was written, and why something was not."""
     estimator, smoothed = outcome.result.estimator, outcome.smoothed
@@ -185,12 +185,12 @@ def _write_files(
     return written, errors
 
 
-def _draw(outcome: Outcome, trajectory: Trajectory, directory: Path) -> None:
+def _draw(outcome: ReplayOutcome, trajectory: Trajectory, directory: Path) -> None:
     with filled_directory(directory, FIGURES) as unfinished:
         _draw_figures(outcome, trajectory, unfinished)
 
 
-def _draw_figures(outcome: Outcome, trajectory: Trajectory, directory: Path) -> None:
+def _draw_figures(outcome: ReplayOutcome, trajectory: Trajectory, directory: Path) -> None:
     result, truth, estimator = outcome.result, outcome.truth, outcome.result.estimator
     smoothed = outcome.smoothed
     errors = outcome.accuracy.pose_errors if smoothed is None else outcome.smoothed_errors

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ReplayOutcome:
     """A replay and all that is told about it.
 
     Attributes
@@ -95,9 +95,9 @@ def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[s
 
 def outcome_of(
     recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
-) -> Outcome:
+) -> ReplayOutcome:
     """Measure a replay of a recording that has been read to its end."""
-    return Outcome(
+    return ReplayOutcome(
         selected,
         result,
         truth,
@@ -108,7 +108,7 @@ def outcome_of(
     )
 
 
-def with_smoothed(outcome: Outcome) -> Outcome:
+def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
     """Add what the whole recording tells in hindsight.
 
     Raises

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from slam_observer_ros.commands.console import print_table
 from slam_observer_ros.commands.replay_checks import list_dropped
-from slam_observer_ros.commands.replay_outcome import Outcome
+from slam_observer_ros.commands.replay_outcome import ReplayOutcome
 from slam_observer_ros.counts import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.replay import Replay
@@ -35,7 +35,7 @@ ACCURACY_ROWS = {
 """Figures of ``--json`` that are in the table, their names there and their units."""
 
 
-def as_json(outcome: Outcome) -> dict[str, object]:
+def as_json(outcome: ReplayOutcome) -> dict[str, object]:
     """Return the figures as ``--json`` prints them; null is what was not measured."""
     estimator, accuracy = outcome.result.estimator, outcome.accuracy
     errors = accuracy.pose_errors
@@ -72,7 +72,7 @@ def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
     return None if errors is None else errors.ate_rmse_m
 
 
-def print_summary(recording: Path, outcome: Outcome, written: Mapping[str, Path]) -> None:
+def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str, Path]) -> None:
     """Print the figures as a table, and what was written where."""
     selected = outcome.selected
     estimator = outcome.result.estimator
@@ -125,7 +125,7 @@ def _told_points(counts: Counter[str]) -> str:
     return ', '.join(told)
 
 
-def _covered_rows(outcome: Outcome) -> dict[str, str]:
+def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
     """Tell of how much of the trajectory the figures are, if not of nearly all."""
     share = outcome.truth_covered
     if share is None or share > NEARLY_ALL:
@@ -133,7 +133,7 @@ def _covered_rows(outcome: Outcome) -> dict[str, str]:
     return {'truth': f'covers {100.0 * share:.1f} % of the trajectory'}
 
 
-def _accuracy_rows(outcome: Outcome) -> dict[str, str]:
+def _accuracy_rows(outcome: ReplayOutcome) -> dict[str, str]:
     figures = as_json(outcome)
     rows = _covered_rows(outcome) | {
         name: f'{figures[key]:.3f} {unit}'

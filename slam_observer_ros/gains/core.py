@@ -28,7 +28,7 @@ NOBODY = -1
 """In place of a landmark where there is none in the core."""
 
 NEVER = 1 << 62
-"""Observations since a landmark was seen that is not there; there will not be so many."""
+"""Age, in observations, of an empty place: older than any landmark's."""
 
 ROUNDING = 1e-12
 """Share of its variances that is added to a covariance that may be singular to invert it."""

@@ -12,7 +12,7 @@ from slam_observer_ros.gains.base import Seen
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.matrices import transpose
-from slam_observer_ros.observation_noise import lasting, ObservationNoise
+from slam_observer_ros.observation_noise import ObservationNoise, repetition_factors
 from slam_observer_ros.smoothing.gauss_newton import Frames, joined, no_frames
 from slam_observer_ros.smoothing.prior import Prior
 from slam_observer_ros.types import FloatArray, IntArray
@@ -168,7 +168,7 @@ class History:
         return joined([*self._summarised, self._with_new()])
 
     def latest_frames(self) -> Frames:
-        """Return those that are not summarised, numbered anew."""
+        """Return the frames that are not summarised, numbered anew."""
         latest = self._with_new()
         return replace(latest, frames=latest.frames - self.summarised)
 
@@ -203,7 +203,7 @@ class History:
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
-            shares=1.0 / lasting(dt_s, self._observation_noise.error_time_s),
+            shares=1.0 / repetition_factors(dt_s, self._observation_noise.error_time_s),
         )
 
     def _covariances(self, seen: list[Seen]) -> FloatArray:

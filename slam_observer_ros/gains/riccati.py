@@ -31,7 +31,7 @@ from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.matrices import mahalanobis, solve, with_blocks
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
-from slam_observer_ros.observation_noise import lasting
+from slam_observer_ros.observation_noise import repetition_factors
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -83,7 +83,7 @@ class RiccatiGains(GainDesign):
         predict(self._joint.P, self._axes, self.calibration, motion)
 
     def pose_covariance_after(self, motion: Motion) -> FloatArray:
-        """Return what it will be after a motion yet to be predicted (6, 6)."""
+        """Return the pose covariance (6, 6) after a motion that is yet to be predicted."""
         first = self._joint.first
         P = self._joint.P[:first, :first].copy()
         predict(P, self._axes, self.calibration, motion)
@@ -102,7 +102,9 @@ class RiccatiGains(GainDesign):
         passed = weights > 0.0
         used = residuals.select(passed)
         CP, CPC = self._project(used)
-        share = weights[passed] / lasting(used.dt_s, self._settings.observation_error_time)
+        share = weights[passed] / repetition_factors(
+            used.dt_s, self._settings.observation_error_time
+        )
         S = with_blocks(CPC, used.covariances[:, :k, :k] / share[:, None, None])
         K = solve(S, CP).T
         half = K @ (0.5 * S @ K.T - CP)

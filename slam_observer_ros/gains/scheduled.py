@@ -41,7 +41,7 @@ from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.matrices import block_diagonal, mahalanobis, symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
-from slam_observer_ros.observation_noise import lasting
+from slam_observer_ros.observation_noise import repetition_factors
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, IntArray
@@ -175,7 +175,7 @@ class ScheduledGains(GainDesign):
         H = self._output_matrix(residuals.e + residuals.a - residuals.r) - F
         weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
         error_time_s = self._settings.observation_error_time
-        repeated = lasting(residuals.dt_s[passed], error_time_s)
+        repeated = repetition_factors(residuals.dt_s[passed], error_time_s)
         for _ in range(1 + REWEIGHTINGS):
             share = weights[passed] / repeated
             noise = R[passed] / share[:, None, None]
@@ -202,7 +202,10 @@ class ScheduledGains(GainDesign):
         return self._distances(residuals, F, N)
 
     def _distances(self, residuals: Residuals, F: FloatArray, N: FloatArray) -> FloatArray:
-        """Return them with C_i at the middle of the chord, for the reason Riccati gains have."""
+        """Return the Mahalanobis distances (m,), with C_i at the middle of the chord.
+
+        For the reason that Riccati gains have.
+        """
         H = self._output_matrix(residuals.e + residuals.a - 0.5 * residuals.r) - F
         S = H @ self._core.P @ transpose(H) + N + self._noise(residuals.covariances)
         return mahalanobis(residuals.r[:, : self._axes.point], S)

@@ -46,7 +46,7 @@ class Axes(Immutable):
         return full
 
     def full_pose_covariance(self, covariance: FloatArray) -> FloatArray:
-        """Return that of ε (6, 6) with zeros on the axes that are not estimated."""
+        """Return the covariance (6, 6) of ε with zeros on the axes that are not estimated."""
         full = np.zeros((6, 6))
         full[np.ix_(self.pose, self.pose)] = covariance
         return full

@@ -102,7 +102,7 @@ class VelocityHistory:
         self._angular: AngularVelocityEvent | None = None
 
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
-        """Add an event whose stamp is behind none of the others; return whether it leads on.
+        """Add an event that is not earlier than any other; return whether it leads on.
 
         An angular velocity does not before the first linear one is known: it waits for that.
         """

@@ -10,7 +10,7 @@ LASTING_S = 2.0
 
 
 class Backlog:
-    """Tells a program that does not keep up with a topic from one that was busy for a moment.
+    """Distinguishes a program that can't keep up with a topic from one busy for a moment.
 
     Attributes
     ----------

@@ -196,7 +196,7 @@ class Recording:
     def frames(
         self, selected: SelectedTopics, inputs: InputSettings = InputSettings()
     ) -> tuple[str, str]:
-        """Give the frames of the first velocity and of the first observation.
+        """Return the frames of the first velocity and of the first observation.
 
         A frame is empty if the message names none, as a Twist.
         """
@@ -205,7 +205,7 @@ class Recording:
         return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
 
     def places(self, frame: str, selected: SelectedTopics) -> bool:
-        """Tell whether /tf_static or /tf has a frame."""
+        """Return whether /tf_static or /tf has a frame."""
         transforms = selected.transforms
         for raw in self._source.messages((*transforms.static, *transforms.moving)):
             with suppress(MessageError):
@@ -216,7 +216,7 @@ class Recording:
         return False
 
     def missing_ids(self, topic: Topic) -> str:
-        """Tell whether a landmark topic's points have no ids, and what they have; else empty."""
+        """Return what a landmark topic's points have in place of ids; empty if they have ids."""
         if topic.message_type == POSE_ARRAY:
             return 'without ids'
         if topic.message_type not in CLOUD_DECODERS:
@@ -224,7 +224,7 @@ class Recording:
         return missing_ids(self._field_names(topic), topic.message_type)
 
     def missing_tags(self, topic: Topic, tag_frame_prefix: str) -> str:
-        """Tell that no frame on /tf is that of a fiducial, if they are looked for there."""
+        """Return why no frame on /tf is that of a fiducial; empty if one is, or none is wanted."""
         if topic.message_type != TRANSFORMS:
             return ''
         messages = self._all_decoded(topic, decode_transform_message)
@@ -232,7 +232,7 @@ class Recording:
         return no_tags(tag_frame_prefix, frames)
 
     def poses_move(self, topic: Topic) -> bool:
-        """Tell whether a topic holds an odometry's poses, and they are not all the same."""
+        """Return whether a topic holds an odometry's poses, and they are not all the same."""
         if topic.message_type != ODOMETRY:
             return False
         poses = (message.pose for message in self._all_decoded(topic, decode_pose))

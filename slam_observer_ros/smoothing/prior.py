@@ -58,7 +58,7 @@ class Prior:
         return replace(self, covariance=covariance, is_relative=True)
 
     def least_nonlinear(self, axes: Axes) -> tuple[Prior, float]:
-        """Return it in the coordinates, world's or body's, in which heading changes it least.
+        """Return the prior in the coordinates, world's or body's, that heading changes least.
 
         A map that the robot has made may yet turn as a whole, and the pose with it, by more than
         the one against the other: in world coordinates that is an error of second order in the
@@ -90,7 +90,7 @@ class Prior:
         return max(float(np.trace(shared @ np.linalg.solve(regular, shared.T))), 0.0)
 
     def without(self, axes: Axes, rows: IntArray) -> Prior:
-        """Return it without the landmarks at ``rows``; those behind move up."""
+        """Return the prior without the landmarks at ``rows``; those behind move up."""
         known, columns = self._known(axes, rows)
         return replace(
             self,
@@ -99,7 +99,7 @@ class Prior:
         )
 
     def with_unknown(self, axes: Axes, rows: IntArray) -> Prior:
-        """Return it with landmarks at ``rows`` that may be anywhere."""
+        """Return the prior with landmarks at ``rows`` that may be anywhere."""
         _, columns = self._known(axes, rows)
         covariance = self.covariance.copy()
         covariance[columns] = covariance[:, columns] = 0.0
