@@ -23,6 +23,7 @@ import numpy as np
 import report
 from rich.console import Console
 from rich.progress import track
+import variants
 import worlds
 
 from slam_observer_ros.types import FloatArray
@@ -94,22 +95,22 @@ def chosen_worlds(part: str) -> list[str]:
 def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:
     """Yield all jobs on the worlds of these names, the longest first."""
     for name in names:
-        yield Job(report.CLEAN, name, GTSAM_JOB, first_s)
-        yield Job(report.FALSE_POINTS, name, 'riccati', first_s)
-        yield Job(report.NO_IDS, name, 'riccati', first_s)
+        yield Job(variants.CLEAN, name, GTSAM_JOB, first_s)
+        yield Job(variants.FALSE_POINTS, name, 'riccati', first_s)
+        yield Job(variants.NO_IDS, name, 'riccati', first_s)
     for name in names:
         for column in (*estimators.ONLINE, estimators.SMOOTHED):
-            yield Job(report.CLEAN, name, column, first_s)
-        for column in report.OUTLIER_COLUMNS:
-            yield Job(report.OUTLIERS, name, column, first_s)
-        yield Job(report.LEFT_OUT, name, 'riccati', first_s)
+            yield Job(variants.CLEAN, name, column, first_s)
+        for column in variants.OUTLIER_COLUMNS:
+            yield Job(variants.OUTLIERS, name, column, first_s)
+        yield Job(variants.LEFT_OUT, name, 'riccati', first_s)
 
 
 def run_jobs(pool: ProcessPoolExecutor, jobs: list[Job]) -> report.Tables:
     """Run jobs side by side; return table → world → column → scores."""
     tables: report.Tables = {
         variant: {job.world: {} for job in jobs if job.variant == variant}
-        for variant in report.VARIANTS
+        for variant in variants.VARIANTS
     }
     futures = {pool.submit(run_job, job): job for job in jobs}
     for future in show_progress('data sets', futures):

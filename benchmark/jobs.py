@@ -12,8 +12,8 @@ from estimators import BATCH, ISAM2, Run
 from gtsam_baselines import IndeterminateError
 import monte_carlo
 import outliers
-import report
 from scores import FAILED, mean_scores, score, Scores
+import variants
 import worlds
 from worlds import World
 
@@ -65,13 +65,13 @@ def run_job(job: Job) -> dict[str, Scores]:
     """Return the scores by column."""
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
     world = _load(job.world) if job.first_s is None else _load(job.world).first(job.first_s)
-    if job.variant == report.NO_IDS:
+    if job.variant == variants.NO_IDS:
         return {job.column: _score_without_ids(outliers.without_ids(world))}
-    if job.variant == report.FALSE_POINTS:
+    if job.variant == variants.FALSE_POINTS:
         return {job.column: _score_without_ids(outliers.with_false_points(world, seed=1))}
-    if job.variant == report.OUTLIERS:
+    if job.variant == variants.OUTLIERS:
         return _score_draws(job, world, outliers.with_outliers)
-    if job.variant == report.LEFT_OUT:
+    if job.variant == variants.LEFT_OUT:
         return _score_draws(job, world, outliers.without_outliers)
     try:
         runs = _with_least_cpu_time(job.column, world)
@@ -110,7 +110,7 @@ def _score_draws(
         logger.warning('%s: %s failed with outliers %s', job.world, job.column, error)
         scores = [FAILED]
     worst = max(scores, key=lambda one: one.configuration_rmse_m)
-    return {job.column: mean_scores(scores), job.column + report.WORST: worst}
+    return {job.column: mean_scores(scores), job.column + variants.WORST: worst}
 
 
 def _with_least_cpu_time(column: str, world: World) -> dict[str, Run]:

@@ -16,15 +16,11 @@ from monte_carlo import BATCH as BATCH_OF_RUNS
 from monte_carlo import Consistency
 import numpy as np
 from scores import Scores
+from variants import CLEAN, FALSE_POINTS, LEFT_OUT, NO_IDS, OUTLIER_COLUMNS, OUTLIERS, WORST
 
 from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.types import FloatArray
 
-CLEAN, OUTLIERS, LEFT_OUT, NO_IDS = 'accuracy', 'with_outliers', 'left_out', 'without_ids'
-FALSE_POINTS = 'false_points'
-VARIANTS = (CLEAN, OUTLIERS, LEFT_OUT, NO_IDS, FALSE_POINTS)
-OUTLIER_COLUMNS = (*DESIGNS, EKF, ISAM2_DEFAULT)
-WORST = ', worst draw'
 LEFT_OUT_COLUMN = 'riccati, these points left out'
 GROWTH_COLUMNS = (*OUTLIER_COLUMNS, 'riccati' + WORST, LEFT_OUT_COLUMN)
 
