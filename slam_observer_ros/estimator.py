@@ -96,6 +96,7 @@ class Estimator:
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
         self._warnings = EventWarnings()
+        self._last: Update | None = None
         self._on_update, self._on_stamp, self._on_motion = on_update, on_stamp, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
@@ -120,12 +121,8 @@ class Estimator:
         """
         if pose is not None:
             check_pose(pose)
-        self._start_pose = pose
-        # By somebody, so that the settings don't say any more where it is.
-        self._is_placed = pose is not None
         self._frame.start_run(pose)
-        self._forget_time()
-        self._last: Update | None = None
+        self._begin()
 
     def restart_time(self) -> None:
         """Begin anew in time, after a jump of the clock, as ``on_time_jump`` says.
@@ -140,15 +137,15 @@ class Estimator:
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
                 after,
             )
-            self.reset(None if self._frame.loaded else self._start_pose)
+            self._frame.restart_run()
+            self._begin()
         else:
             logger.warning('The clock has jumped%s; pose and map are held.', after)
             self.release()
             self._catch_up()
             self._tell_stamp()
-            self._frame.states.restart_time()
+            self._frame.restart_time()
             self._forget_time()
-            self._is_placed = True
         self.jumps += 1
 
     def load_map(
@@ -181,15 +178,8 @@ class Estimator:
         check_map(landmark_map)
         if pose is not None:
             check_pose(pose, pose_covariance)
-        self._frame.load(landmark_map)
-        if pose is not None:
-            self.set_pose(pose, pose_covariance)
-        elif self.settings.set_initial_pose and self.stamp_ns is None and not self._is_placed:
-            self._frame.start_run(None)
-        elif self._slam.is_mapping:
-            self._frame.enter()
-        else:  # in a map that does not grow there is nothing to carry into another one
-            self._frame.start(None)
+            self._catch_up()
+        self._frame.load(landmark_map, pose, pose_covariance, self.stamp_ns is not None)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
         """Move the robot as of ``stamp_ns``; the map stays.
@@ -209,7 +199,6 @@ class Estimator:
         """
         check_pose(pose, covariance)
         self._catch_up()
-        self._is_placed = True
         self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
@@ -479,6 +468,11 @@ class Estimator:
         """Move the states on to the last event that was used."""
         if self.stamp_ns is not None:
             self._timeline.advance(self._frame.states, self.stamp_ns)
+
+    def _begin(self) -> None:
+        """Wait for the first event."""
+        self._forget_time()
+        self._last = None
 
     def _forget_time(self) -> None:
         """Forget all that has a stamp but the map."""

@@ -62,6 +62,9 @@ class MapFrame:
         self.states = Hypotheses(Slam(settings, np.eye(4)), settings)
         self._counts: Counter[str] = Counter()
         self._trial: PoseTrial | None = None
+        self._start_pose: FloatArray | None = None
+        # By somebody, so that the settings don't say any more where it is.
+        self._is_placed = False
         self._begin_search()
         is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
         if is_given and not settings.set_initial_pose:
@@ -100,13 +103,28 @@ class MapFrame:
 
     def start_run(self, pose: FloatArray | None) -> None:
         """Start a run at ``pose`` (4, 4), exactly; by default where the settings have it start."""
-        settings, covariance = self.settings, None
-        if pose is None and settings.set_initial_pose:
-            pose = se3.from_rpy((*settings.initial_position, 0.0, 0.0, settings.initial_yaw))
-            covariance = np.diag(GIVEN_POSE_STD**2)
-        self.start(pose, covariance)
+        self._start_pose = pose
+        self._is_placed = pose is not None
+        if pose is None and self.settings.set_initial_pose:
+            self._start_where_settings_say()
+        else:
+            self._start(pose)
 
-    def start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
+    def restart_run(self) -> None:
+        """Start again where the run began; in a loaded map where the settings say, or anywhere."""
+        self.start_run(None if self.loaded else self._start_pose)
+
+    def restart_time(self) -> None:
+        """Go on from here at any other time."""
+        self.states.restart_time()
+        self._is_placed = True
+
+    def _start_where_settings_say(self) -> None:
+        settings = self.settings
+        pose = se3.from_rpy((*settings.initial_position, 0.0, 0.0, settings.initial_yaw))
+        self._start(pose, np.diag(GIVEN_POSE_STD**2))
+
+    def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
         """Start again with an empty map, or with the one that was loaded.
 
         Parameters
@@ -127,20 +145,39 @@ class MapFrame:
             start_in_map(self.slam, self.loaded, covariance)
             self._trial = PoseTrial(self.loaded)
 
-    def load(self, landmark_map: LandmarkMap) -> None:
-        """Take a map in the place of one loaded before; the place in it is not known yet."""
+    def load(
+        self,
+        landmark_map: LandmarkMap,
+        pose: FloatArray | None,
+        covariance: FloatArray | None,
+        has_begun: bool,
+    ) -> None:
+        """Take a map in the place of one loaded before, with the robot at ``pose`` (4, 4) in it.
+
+        If that is None the robot is where the settings say, unless the run ``has_begun`` or
+        someone has placed it elsewhere; else its place follows from what it sees, or has seen.
+        """
         self.loaded = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
         self.is_localised = False
         self._trial = None
         self._begin_search()
+        if pose is not None:
+            self.set_pose(pose, covariance)
+        elif self.settings.set_initial_pose and not (has_begun or self._is_placed):
+            self._start_where_settings_say()
+        elif self.slam.is_mapping:
+            self._enter()
+        else:  # in a map that does not grow there is nothing to carry into another one
+            self._start(None)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the place in a loaded map was not known, it is now."""
+        self._is_placed = True
         if self.is_localised:
             self.states.decide().set_pose(self._allowed(pose), covariance)
             self._trial = None if self.loaded is None else PoseTrial(self.loaded)
         else:
-            self.start(pose, covariance)
+            self._start(pose, covariance)
 
     def find_place(self, outcome: Outcome) -> None:
         """Find the place in the loaded map if it is not known, or not any more.
@@ -156,13 +193,13 @@ class MapFrame:
             self._search_anew('All landmarks are far from where they should be')
         if not self.is_localised:
             if self._is_news(self.loaded):
-                self.enter()
+                self._enter()
             self._counts['not_localised'] += not self.is_localised
 
     def _search_anew(self, why: str) -> None:
         logger.warning('%s; localising anew.', why)
         self._counts['lost'] += 1
-        self.start(None)
+        self._start(None)
 
     def _begin_search(self) -> None:
         self._shared = self._searched = self._compared = 0
@@ -176,7 +213,7 @@ class MapFrame:
         self._shared, self._compared = shared, self._searched
         return True
 
-    def enter(self) -> None:
+    def _enter(self) -> None:
         """Move the states into the frame of the loaded map, if the landmarks seen suffice."""
         if self.loaded is not None and enter_map(self.slam, self.loaded):
             self.states.decide()
