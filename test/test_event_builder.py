@@ -17,8 +17,8 @@ from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.point_clouds import ObservationMessage
-from slam_observer_ros.messages.poses_and_velocities import PoseMessage, VelocityMessage
+from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 
 MS = 1_000_000
 V = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])
@@ -40,7 +40,7 @@ class Wheel:
         for _ in range(count):
             self.now_ns += 20 * MS
             events += self.builder.retry(self.now_ns)
-            message = VelocityMessage('wheel', VelocityEvent(self.now_ns, V))
+            message = Measurement('wheel', VelocityEvent(self.now_ns, V))
             events += self.builder.add(message, self.now_ns)
         return events
 
@@ -104,7 +104,7 @@ def test_what_too_many_wait_behind_is_dropped_and_told():
     for k in range(MAX_WAITING + 3):
         observation = ObservationEvent(k * MS, np.array([1]), np.ones((1, 3)))
         frame = 'lidar' if k == MAX_WAITING else 'camera'
-        assert not builder.add(ObservationMessage(frame, observation), k * MS)
+        assert not builder.add(Measurement(frame, observation), k * MS)
     assert not builder.retry(MAX_WAITING * MS)
     assert len(drops) == 3
     assert f'more than {MAX_WAITING} measurements wait' in str(drops[0])
@@ -131,27 +131,27 @@ def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
     reason = "told in 'map', which is estimated from these very landmarks: publish them in the"
     base_frame = BaseFrame(InputSettings(), everything_placed())
     with pytest.raises(TransformError, match=reason):
-        base_frame.observation(ObservationMessage(frame, event))
+        base_frame.observation(event, frame)
     with pytest.raises(TransformError, match=reason):
         base_frame.tags(TagDetections(0, frame, (3,), ('tag36h11',)))
     with pytest.raises(TransformError, match=reason):
         settings = InputSettings(sensor_frame=frame)
-        BaseFrame(settings, everything_placed()).observation(ObservationMessage('camera', event))
+        BaseFrame(settings, everything_placed()).observation(event, 'camera')
 
 
 def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used():
     event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
     base_frame = BaseFrame(InputSettings(), everything_placed())
-    moved = base_frame.observation(ObservationMessage('odom', event))
+    moved = base_frame.observation(event, 'odom')
     assert_allclose(moved.points, se3.transform(se3.inverse(WHEEL), event.points))
     settings = InputSettings(sensor_pose=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
-    placed = BaseFrame(settings, TransformBuffer()).observation(ObservationMessage('map', event))
+    placed = BaseFrame(settings, TransformBuffer()).observation(event, 'map')
     assert_allclose(placed.points, [[1.0, 1.0, 2.0]])
 
 
 def test_without_an_odometry_frame_velocities_may_name_none():
-    message = VelocityMessage('', VelocityEvent(0, V))
-    assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(message)
+    event = VelocityEvent(0, V)
+    assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(event, '')
 
 
 def test_a_jump_of_the_odometrys_pose_is_dropped_by_a_reason_of_its_own():

@@ -106,9 +106,9 @@ class TestVelocities:
         covariance = np.arange(1.0, 10.0).reshape(3, 3)
         message = messages.decode_imu(self.imu(covariance))
         assert (message.stamp_ns, message.frame_id) == (ros.STAMP_NS, 'imu')
-        assert message.angular_velocity.tolist() == [1.0, 2.0, 3.0]
-        np.testing.assert_array_equal(message.covariance, covariance)
-        assert messages.decode_imu(self.imu(np.zeros((3, 3)))).covariance is None
+        assert message.event.angular_velocity.tolist() == [1.0, 2.0, 3.0]
+        np.testing.assert_array_equal(message.event.covariance, covariance)
+        assert messages.decode_imu(self.imu(np.zeros((3, 3)))).event.covariance is None
 
     def test_imu_without_a_gyroscope_is_refused(self):
         covariance = np.zeros((3, 3))

@@ -25,8 +25,8 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.point_clouds import decode_point_cloud2, ObservationMessage
-from slam_observer_ros.messages.poses_and_velocities import VelocityMessage
+from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.conversions import time_message
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.qos import LATCHED_QOS
@@ -200,10 +200,10 @@ class AnotherClock:
         for child, pose in (('turret', se3.exp(angle * TURN)), ('tag_9', np.eye(4))):
             parent = 'base_link' if child == 'turret' else 'turret'
             self.transforms.insert(parent, child, stamp_ns, pose)
-        self.intake.add_velocity(VelocityMessage('', VelocityEvent(stamp_ns, STILL)), received_ns)
+        self.intake.add_velocity(Measurement('', VelocityEvent(stamp_ns, STILL)), received_ns)
         seen = se3.transform(se3.exp(-angle * TURN), np.array([[3.0, 1.0, 0.0]]))
         event = ObservationEvent(stamp_ns, np.array([4]), seen)
-        self.intake.add_observation(ObservationMessage('turret', event), received_ns)
+        self.intake.add_observation(Measurement('turret', event), received_ns)
         self.intake.add_tags(TagDetections(stamp_ns, 'turret', (9,), ('none',)), received_ns + 1)
 
     def send_all(self):

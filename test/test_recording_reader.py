@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.messages.point_clouds import ObservationMessage
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.truth import LandmarkTracks
@@ -435,7 +435,7 @@ def test_last_position_of_a_true_landmark_counts(tmp_path):
 def landmark_messages(*told):
     """Messages of (second, ids, x of all of them)."""
     return [
-        ObservationMessage(
+        Measurement(
             'world',
             ObservationEvent(s * 1_000_000_000, np.array(ids), np.full((len(ids), 3), float(x))),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import logging
 from typing import TypeAlias
 
@@ -13,12 +13,8 @@ from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityEvent
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.velocity_sources import PoseDifferences
 from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.point_clouds import ObservationMessage
-from slam_observer_ros.messages.poses_and_velocities import (
-    ImuMessage,
-    PoseMessage,
-    VelocityMessage,
-)
+from slam_observer_ros.messages.measurement import AnyMeasurement, Measurement
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.units import to_ns
 
 MAX_WAITING = 1000
@@ -27,7 +23,7 @@ MAX_WAITING = 1000
 NO_TRANSFORM = 'no_transform'
 """Reason under which measurements are dropped that can't be brought into the base frame."""
 
-_InFrame: TypeAlias = VelocityMessage | ImuMessage | ObservationMessage | TagDetections
+_InFrame: TypeAlias = AnyMeasurement | TagDetections
 Measured: TypeAlias = _InFrame | PoseMessage
 
 DropError: TypeAlias = TransformError | InvalidEventError
@@ -49,15 +45,9 @@ def with_receive_time(measured: Measured, receive_stamp_ns: int) -> Measured:
 
     Fiducials keep theirs, which /tf has as well. Where time begins at zero, zero is a stamp.
     """
-    if receive_stamp_ns == 0 or isinstance(measured, TagDetections):
+    if receive_stamp_ns == 0 or isinstance(measured, TagDetections) or measured.stamp_ns:
         return measured
-    if isinstance(measured, ImuMessage | PoseMessage):
-        return measured if measured.stamp_ns else replace(measured, stamp_ns=receive_stamp_ns)
-    if measured.event.stamp_ns:
-        return measured
-    if isinstance(measured, VelocityMessage):
-        return replace(measured, event=replace(measured.event, stamp_ns=receive_stamp_ns))
-    return replace(measured, event=replace(measured.event, stamp_ns=receive_stamp_ns))
+    return measured.with_stamp(receive_stamp_ns)
 
 
 def drop_reason(error: DropError) -> str:
@@ -96,7 +86,7 @@ class EventBuilder:
         self._on_drop = on_drop
         self._poses = PoseDifferences(to_ns(velocity_timeout_s))
         self._waiting: deque[tuple[_Waiting, TransformError]] = deque()
-        self._taken_as_base: dict[str, tuple[int, VelocityMessage]] = {}
+        self._taken_as_base: dict[str, tuple[int, VelocityEvent]] = {}
 
     def add(self, measured: Measured, now_ns: int) -> list[Event]:
         """Take a measurement; return the event that comes of it, unless it has to wait.
@@ -114,7 +104,7 @@ class EventBuilder:
             velocity = self._difference(measured)
             if velocity is None:
                 return []
-            measured = VelocityMessage(measured.child_frame_id, velocity)
+            measured = Measurement(measured.child_frame_id, velocity)
         return self._attempt(_Waiting(now_ns + self._transform_timeout_ns, measured), now_ns)
 
     def retry(self, now_ns: int) -> list[Event]:
@@ -156,37 +146,30 @@ class EventBuilder:
         self._waiting.append((item, error))
 
     def _event(self, measured: _InFrame, now_ns: int) -> Event:
-        if isinstance(measured, VelocityMessage):
-            return self._velocity(measured, now_ns)
-        if isinstance(measured, ImuMessage):
-            turned = self._base_frame.angular_velocity(measured)
-            return AngularVelocityEvent(
-                turned.stamp_ns, turned.angular_velocity, turned.covariance
-            )
         if isinstance(measured, TagDetections):
             return self._base_frame.tags(measured)
-        return self._base_frame.observation(measured)
+        event, frame_id = measured.event, measured.frame_id
+        if isinstance(event, VelocityEvent):
+            is_of_base = self._is_taken_as_base(event, frame_id, now_ns)
+            return event if is_of_base else self._base_frame.velocity(event, frame_id)
+        if isinstance(event, AngularVelocityEvent):
+            return self._base_frame.angular_velocity(event, frame_id)
+        return self._base_frame.observation(event, frame_id)
 
-    def _velocity(self, message: VelocityMessage, now_ns: int) -> VelocityEvent:
-        if self._is_taken_as_base(message, now_ns):
-            return message.event
-        return self._base_frame.velocity(message)
-
-    def _is_taken_as_base(self, message: VelocityMessage, now_ns: int) -> bool:
+    def _is_taken_as_base(self, event: VelocityEvent, frame_id: str, now_ns: int) -> bool:
         """Return whether velocities of this frame still do not wait for their transform.
 
         As one that moves comes after the velocities of its time, it is one of these that is looked
         up, for as long as it would have waited, and then the next one.
         """
-        frame_id = message.frame_id
         if frame_id not in self._taken_as_base:
             return False
         deadline_ns, looked_up = self._taken_as_base[frame_id]
         if now_ns >= deadline_ns:
-            deadline_ns, looked_up = now_ns + self._transform_timeout_ns, message
+            deadline_ns, looked_up = now_ns + self._transform_timeout_ns, event
             self._taken_as_base[frame_id] = deadline_ns, looked_up
         try:
-            self._base_frame.velocity(looked_up)
+            self._base_frame.velocity(looked_up, frame_id)
         except TransformError:
             return True
         del self._taken_as_base[frame_id]
@@ -199,10 +182,11 @@ class EventBuilder:
 
     def _give_up(self, item: _Waiting, error: TransformError) -> Event | None:
         measured = item.measured
-        if not isinstance(measured, VelocityMessage):
+        if isinstance(measured, TagDetections) or not isinstance(measured.event, VelocityEvent):
             self._on_drop(error)
             return None
-        self._taken_as_base[measured.frame_id] = item.deadline_ns, measured
+        event = measured.event
+        self._taken_as_base[measured.frame_id] = item.deadline_ns, event
         logger.warning(
             "Velocities in frame '%s' are taken to be those of '%s' until their transform is "
             'known: %s',
@@ -210,4 +194,4 @@ class EventBuilder:
             self._base_frame.name,
             error,
         )
-        return measured.event
+        return event

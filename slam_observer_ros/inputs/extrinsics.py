@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.types import FloatArray
 
@@ -55,3 +55,22 @@ def move_velocity(event: VelocityEvent, pose: FloatArray) -> VelocityEvent:
         if not is_linear_known:  # what the lever arm adds to it would pass for all of it
             covariance[3:] = covariance[:, 3:] = 0.0
     return replace(event, body_velocity=Ad @ event.body_velocity, covariance=covariance)
+
+
+def turn_angular_velocity(event: AngularVelocityEvent, pose: FloatArray) -> AngularVelocityEvent:
+    """Express an angular velocity along the axes of another frame.
+
+    Parameters
+    ----------
+    event : AngularVelocityEvent
+        As measured in a sensor's frame.
+    pose : FloatArray
+        (4, 4) pose of that frame in the new one.
+
+    """
+    R, covariance = pose[:3, :3], event.covariance
+    return replace(
+        event,
+        angular_velocity=R @ event.angular_velocity,
+        covariance=None if covariance is None else R @ covariance @ R.T,
+    )

@@ -8,22 +8,20 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from slam_observer_ros.errors import ParameterError, TransformError
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
+from slam_observer_ros.inputs.extrinsics import (
+    move_observation,
+    move_velocity,
+    turn_angular_velocity,
+)
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.point_clouds import ObservationMessage
-from slam_observer_ros.messages.poses_and_velocities import (
-    ImuMessage,
-    pose_stack,
-    PoseMessage,
-    VelocityMessage,
-)
+from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
 from slam_observer_ros.types import FloatArray
 
-MeasuredT = TypeVar('MeasuredT', ObservationEvent, VelocityEvent, ImuMessage)
+EventT = TypeVar('EventT', ObservationEvent, VelocityEvent, AngularVelocityEvent)
 
 
 def insert_transforms(
@@ -110,8 +108,8 @@ class BaseFrame:
                 )
             self._sensor_pose = se3.from_rpy(settings.sensor_pose)
 
-    def observation(self, message: ObservationMessage) -> ObservationEvent:
-        """Return landmarks in the base frame.
+    def observation(self, event: ObservationEvent, frame_id: str) -> ObservationEvent:
+        """Return landmarks, which were measured in a frame, in the base frame.
 
         Raises
         ------
@@ -120,10 +118,10 @@ class BaseFrame:
 
         """
         if self._sensor_pose is not None:
-            return move_observation(message.event, self._sensor_pose)
-        frame_id = self._sensor_frame or message.frame_id
+            return move_observation(event, self._sensor_pose)
+        frame_id = self._sensor_frame or frame_id
         self._refuse_map_frame(frame_id)
-        return self._moved(move_observation, message.event, frame_id)
+        return self._moved(move_observation, event, frame_id)
 
     def tags(self, detections: TagDetections) -> ObservationEvent:
         """Return where /tf has the fiducials of a detection message, in the base frame.
@@ -142,22 +140,22 @@ class BaseFrame:
         ]
         ids = np.array(detections.ids, dtype=np.int64)
         event = ObservationEvent(detections.stamp_ns, ids, np.array(points).reshape(-1, 3))
-        return self.observation(ObservationMessage(camera_frame, event))
+        return self.observation(event, camera_frame)
 
-    def velocity(self, message: VelocityMessage) -> VelocityEvent:
-        """Return the velocity of the base.
+    def velocity(self, event: VelocityEvent, frame_id: str) -> VelocityEvent:
+        """Return the velocity of the base, given that of a frame on the robot.
 
         Raises
         ------
         TransformError
-            If the pose of the message's frame is not known (yet), or it is no part of the robot.
+            If the pose of that frame is not known (yet), or it is no part of the robot.
 
         """
-        if message.frame_id.lstrip('/') in self._world_frames:
-            raise TransformError(f"'{message.frame_id}' does not move with the robot")
-        return self._moved(move_velocity, message.event, message.frame_id)
+        if frame_id.lstrip('/') in self._world_frames:
+            raise TransformError(f"'{frame_id}' does not move with the robot")
+        return self._moved(move_velocity, event, frame_id)
 
-    def angular_velocity(self, message: ImuMessage) -> ImuMessage:
+    def angular_velocity(self, event: AngularVelocityEvent, frame_id: str) -> AngularVelocityEvent:
         """Return an angular velocity in the base frame's axes.
 
         Raises
@@ -166,7 +164,7 @@ class BaseFrame:
             If the sensor's pose is not known (yet).
 
         """
-        return self._moved(_turn_imu, message, message.frame_id)
+        return self._moved(turn_angular_velocity, event, frame_id)
 
     def _refuse_map_frame(self, frame_id: str) -> None:
         """Refuse landmarks that the estimate itself would bring to where it has them."""
@@ -178,13 +176,13 @@ class BaseFrame:
 
     def _moved(
         self,
-        move: Callable[[MeasuredT, FloatArray], MeasuredT],
-        measured: MeasuredT,
+        move: Callable[[EventT, FloatArray], EventT],
+        event: EventT,
         frame_id: str,
-    ) -> MeasuredT:
+    ) -> EventT:
         if frame_id.lstrip('/') in ('', self.name):
-            return measured
-        return move(measured, self._transforms.lookup(self.name, frame_id, measured.stamp_ns))
+            return event
+        return move(event, self._transforms.lookup(self.name, frame_id, event.stamp_ns))
 
     def _tag_position(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
         """Return where a tag is in the camera's frame (3,), under either of its names."""
@@ -193,9 +191,3 @@ class BaseFrame:
         except TransformError:
             frame = f'{self._tag_frame_prefix}{number}'
             return self._transforms.lookup(camera, frame, stamp_ns)[:3, 3]
-
-
-def _turn_imu(message: ImuMessage, pose: FloatArray) -> ImuMessage:
-    R = pose[:3, :3]
-    covariance = None if message.covariance is None else R @ message.covariance @ R.T
-    return ImuMessage(message.stamp_ns, message.frame_id, R @ message.angular_velocity, covariance)

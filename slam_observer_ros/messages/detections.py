@@ -15,7 +15,8 @@ import numpy as np
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
-from slam_observer_ros.messages.point_clouds import measured, ObservationMessage
+from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.point_clouds import measured
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.types import FloatArray
 
@@ -51,17 +52,17 @@ class TagDetections:
     families: tuple[str, ...]
 
 
-def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
+def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
     """Decode the positions of a geometry_msgs/PoseArray, whose landmarks have no ids."""
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     poses = reader.float64(_POSE * reader.uint32()).reshape(-1, _POSE)
     reader.finish()
     ids = np.full(len(poses), UNKNOWN_ID, dtype=np.int64)
-    return ObservationMessage(frame_id, measured(ObservationEvent(stamp_ns, ids, poses[:, :3])))
+    return Measurement(frame_id, measured(ObservationEvent(stamp_ns, ids, poses[:, :3])))
 
 
-def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
+def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
     """Decode a vision_msgs/Detection3DArray.
 
     The id of a landmark is the number that ends its detection's ``id``, or else its first
@@ -77,7 +78,7 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMes
     known = [covariance for _, _, covariance in detections if covariance.any()]
     covariances = np.array(known) if known and len(known) == len(detections) else None
     event = ObservationEvent(stamp_ns, ids, points, covariances)
-    return ObservationMessage(frame_id, measured(event))
+    return Measurement(frame_id, measured(event))
 
 
 def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:
@@ -93,7 +94,7 @@ def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:
 
 def observed_tags(
     transforms: Iterable[PoseMessage], tag_frame_prefix: str
-) -> list[ObservationMessage]:
+) -> list[Measurement[ObservationEvent]]:
     """Return what of /tf are sightings of fiducials: transforms from a camera to a tag.
 
     Those that are no transforms, which have NaN in them for example, are left out.
@@ -107,7 +108,7 @@ def observed_tags(
 
     Returns
     -------
-    list of ObservationMessage
+    list of Measurement[ObservationEvent]
         One for each camera and stamp.
 
     Raises
@@ -154,10 +155,10 @@ def _camera_and_stamp(sighting: tuple[PoseMessage, int]) -> tuple[str, int]:
 
 def _observation(
     frame_id: str, stamp_ns: int, sightings: Sequence[tuple[PoseMessage, int]]
-) -> ObservationMessage:
+) -> Measurement[ObservationEvent]:
     ids = np.array([landmark_id for _, landmark_id in sightings], dtype=np.int64)
     points = np.array([message.position for message, _ in sightings])
-    return ObservationMessage(frame_id, ObservationEvent(stamp_ns, ids, points))
+    return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points))
 
 
 def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:

@@ -8,13 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.detections import decode_detections, decode_pose_array
-from slam_observer_ros.messages.point_clouds import (
-    decode_point_cloud,
-    decode_point_cloud2,
-    ObservationMessage,
-)
+from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.point_clouds import decode_point_cloud, decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_odometry_pose,
     decode_odometry_twist,
@@ -25,7 +23,6 @@ from slam_observer_ros.messages.poses_and_velocities import (
     decode_twist_stamped,
     decode_twist_with_covariance_stamped,
     PoseMessage,
-    VelocityMessage,
 )
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
@@ -46,10 +43,10 @@ POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
 DETECTIONS = 'vision_msgs/msg/Detection3DArray'
 """Type of landmarks with ids or without."""
 
-VelocityDecoder: TypeAlias = Callable[[Buffer, int], VelocityMessage]
+VelocityDecoder: TypeAlias = Callable[[Buffer, int], Measurement[VelocityEvent]]
 """From the serialised message and its receive time, which only unstamped messages use."""
 
-ObservationDecoder: TypeAlias = Callable[[Buffer, int], ObservationMessage]
+ObservationDecoder: TypeAlias = Callable[[Buffer, int], Measurement[ObservationEvent]]
 """As :data:`VelocityDecoder`, for landmarks."""
 
 PoseDecoder: TypeAlias = Callable[[Buffer], PoseMessage]

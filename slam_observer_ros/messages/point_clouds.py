@@ -5,7 +5,6 @@ No Python object is made per point: a cloud of 1000 points costs microseconds, n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_cloud_layout import (
     CloudField,
     COVARIANCE_NAMES,
@@ -39,24 +39,7 @@ Records: TypeAlias = NDArray[np.void]
 """(height, width) structured view of a cloud's data: one record a point."""
 
 
-@dataclass(frozen=True, slots=True)
-class ObservationMessage:
-    """An observation and the frame that its message gives for the points.
-
-    Attributes
-    ----------
-    frame_id : str
-        Frame of the points: the sensor's or the base's.
-    event : ObservationEvent
-        The points as the message holds them, not yet moved to the base frame.
-
-    """
-
-    frame_id: str
-    event: ObservationEvent
-
-
-def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
+def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
     """Decode a sensor_msgs/PointCloud whose ids, if any, are in the channel ``id``.
 
     Parameters
@@ -66,7 +49,7 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMe
 
     Returns
     -------
-    ObservationMessage
+    Measurement[ObservationEvent]
         Ids are ``UNKNOWN_ID`` where the channel holds -1 or is missing.
 
     Raises
@@ -87,10 +70,10 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMe
                 raise MessageError(f'{len(values)} ids for {len(points)} points')
             ids = _ids_from_floats(values)
     reader.finish()
-    return ObservationMessage(frame_id, measured(ObservationEvent(stamp_ns, ids, points)))
+    return Measurement(frame_id, measured(ObservationEvent(stamp_ns, ids, points)))
 
 
-def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationMessage:
+def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
     """Decode a sensor_msgs/PointCloud2 with fields x, y, z and, if it has them, more.
 
     ``id`` gives the landmark ids; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per
@@ -105,7 +88,7 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationM
 
     Returns
     -------
-    ObservationMessage
+    Measurement[ObservationEvent]
         Ids are ``UNKNOWN_ID`` where the field holds -1 (2³² - 1 if unsigned) or is missing.
 
     Raises
@@ -125,12 +108,12 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> ObservationM
     reader.finish()
     if height * width == 0:
         nothing = ObservationEvent(stamp_ns, np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-        return ObservationMessage(frame_id, nothing)
+        return Measurement(frame_id, nothing)
     _check_size(len(data), height, width, point_step, row_step)
     dtype = _record_type(fields, byte_order, point_step)
     strides = (row_step if height > 1 else len(data), point_step)
     records: Records = np.ndarray((height, width), dtype, data, strides=strides)
-    return ObservationMessage(frame_id, measured(_observation(stamp_ns, records)))
+    return Measurement(frame_id, measured(_observation(stamp_ns, records)))
 
 
 def measured(event: ObservationEvent) -> ObservationEvent:

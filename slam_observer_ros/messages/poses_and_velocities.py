@@ -7,57 +7,19 @@ put angular first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.events import VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.types import FloatArray
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
 _QUATERNION_NORM_TOLERANCE = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class VelocityMessage:
-    """A velocity and the frame that its message gives for it.
-
-    Attributes
-    ----------
-    frame_id : str
-        Frame in which the velocity is expressed; empty if the message doesn't say.
-    event : VelocityEvent
-        The velocity as the message holds it, not yet moved to the base frame.
-
-    """
-
-    frame_id: str
-    event: VelocityEvent
-
-
-@dataclass(frozen=True, slots=True)
-class ImuMessage:
-    """The angular velocity of a sensor_msgs/Imu.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    frame_id : str
-        Frame of the sensor.
-    angular_velocity : FloatArray
-        (3,) rad/s in the sensor's frame.
-    covariance : FloatArray or None
-        (3, 3) rad²/s²; None if unknown.
-
-    """
-
-    stamp_ns: int
-    frame_id: str
-    angular_velocity: FloatArray
-    covariance: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +48,10 @@ class PoseMessage:
     position: FloatArray
     quaternion: FloatArray
     covariance: FloatArray | None = None
+
+    def with_stamp(self, stamp_ns: int) -> PoseMessage:
+        """Return the same with another stamp, nanoseconds."""
+        return replace(self, stamp_ns=stamp_ns)
 
     @property
     def pose(self) -> FloatArray:
@@ -126,35 +92,35 @@ def pose_matrices(positions: FloatArray, quaternions: FloatArray) -> FloatArray:
     return se3.pose(so3.from_quaternion(quaternions), positions)
 
 
-def decode_twist(raw: Buffer, receive_stamp_ns: int) -> VelocityMessage:
+def decode_twist(raw: Buffer, receive_stamp_ns: int) -> Measurement[VelocityEvent]:
     """Decode a geometry_msgs/Twist, whose only time is that of its reception."""
     reader = CdrReader(raw)
     event = VelocityEvent(receive_stamp_ns, _read_twist(reader))
     reader.finish()
-    return VelocityMessage('', event)
+    return Measurement('', event)
 
 
-def decode_twist_stamped(raw: Buffer, _receive_stamp_ns: int = 0) -> VelocityMessage:
+def decode_twist_stamped(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[VelocityEvent]:
     """Decode a geometry_msgs/TwistStamped."""
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     event = VelocityEvent(stamp_ns, _read_twist(reader))
     reader.finish()
-    return VelocityMessage(frame_id, event)
+    return Measurement(frame_id, event)
 
 
 def decode_twist_with_covariance_stamped(
     raw: Buffer, _receive_stamp_ns: int = 0
-) -> VelocityMessage:
+) -> Measurement[VelocityEvent]:
     """Decode a geometry_msgs/TwistWithCovarianceStamped."""
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     event = VelocityEvent(stamp_ns, _read_twist(reader), _read_covariance(reader))
     reader.finish()
-    return VelocityMessage(frame_id, event)
+    return Measurement(frame_id, event)
 
 
-def decode_odometry_twist(raw: Buffer, _receive_stamp_ns: int = 0) -> VelocityMessage:
+def decode_odometry_twist(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[VelocityEvent]:
     """Decode the twist of a nav_msgs/Odometry, which is in its child frame."""
     return _read_odometry(raw)[1]
 
@@ -199,7 +165,7 @@ def decode_transforms(raw: Buffer) -> list[PoseMessage]:
     return messages
 
 
-def decode_imu(raw: Buffer) -> ImuMessage:
+def decode_imu(raw: Buffer) -> Measurement[AngularVelocityEvent]:
     """Decode the angular velocity of a sensor_msgs/Imu.
 
     Raises
@@ -217,7 +183,8 @@ def decode_imu(raw: Buffer) -> ImuMessage:
     angular_velocity, covariance = values[:3], values[3:].reshape(3, 3)
     if covariance[0, 0] == -1.0:
         raise MessageError('this Imu says that it measures no angular velocity')
-    return ImuMessage(stamp_ns, frame_id, angular_velocity, _known(covariance))
+    event = AngularVelocityEvent(stamp_ns, angular_velocity, _known(covariance))
+    return Measurement(frame_id, event)
 
 
 def _read_twist(reader: CdrReader) -> FloatArray:
@@ -243,7 +210,7 @@ def _read_pose(reader: CdrReader) -> tuple[FloatArray, FloatArray]:
     return values[:3], values[3:]
 
 
-def _read_odometry(raw: Buffer) -> tuple[PoseMessage, VelocityMessage]:
+def _read_odometry(raw: Buffer) -> tuple[PoseMessage, Measurement[VelocityEvent]]:
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     child_frame_id = reader.string()
@@ -252,7 +219,7 @@ def _read_odometry(raw: Buffer) -> tuple[PoseMessage, VelocityMessage]:
     )
     velocity = VelocityEvent(stamp_ns, _read_twist(reader), _read_covariance(reader))
     reader.finish()
-    return pose, VelocityMessage(child_frame_id, velocity)
+    return pose, Measurement(child_frame_id, velocity)
 
 
 def _read_transform(reader: CdrReader) -> PoseMessage:

@@ -8,18 +8,18 @@ import numpy as np
 from rclpy.node import Node
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.events import UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.cloud_ids import missing_ids
 from slam_observer_ros.messages.detections import no_tags, observed_tags
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import CLOUD_DECODERS
 from slam_observer_ros.messages.point_cloud_layout import ID_NAME
-from slam_observer_ros.messages.point_clouds import field_names, ObservationMessage
+from slam_observer_ros.messages.point_clouds import field_names
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_odometry_pose,
     decode_odometry_twist,
     decode_transforms,
-    VelocityMessage,
 )
 from slam_observer_ros.types import FloatArray
 
@@ -49,7 +49,7 @@ class CloudDecoder:
         self._message_type = message_type
         self._is_looked_at = False
 
-    def __call__(self, raw: Buffer, receive_ns: int) -> ObservationMessage:
+    def __call__(self, raw: Buffer, receive_ns: int) -> Measurement[ObservationEvent]:
         """Decode a cloud."""
         message = CLOUD_DECODERS[self._message_type](raw, receive_ns)
         ids = message.event.ids
@@ -83,7 +83,7 @@ class OdometryDecoder:
         self._is_told = False
         self._first: FloatArray | None = None
 
-    def __call__(self, raw: Buffer, receive_ns: int) -> VelocityMessage:
+    def __call__(self, raw: Buffer, receive_ns: int) -> Measurement[VelocityEvent]:
         """Decode the velocity of a nav_msgs/Odometry."""
         message = decode_odometry_twist(raw, receive_ns)
         # One that has told a velocity will do so again.
@@ -127,7 +127,7 @@ class TagDecoder:
         self._is_told = False
         self._frames: set[str] = set()
 
-    def __call__(self, raw: Buffer, _receive_ns: int) -> list[ObservationMessage]:
+    def __call__(self, raw: Buffer, _receive_ns: int) -> list[Measurement[ObservationEvent]]:
         """Decode what of a tf2_msgs/TFMessage are sightings of fiducials."""
         transforms = decode_transforms(raw)
         seen = observed_tags(transforms, self._prefix)

@@ -9,12 +9,14 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.events import AngularVelocityEvent
 from slam_observer_ros.inputs.settings import AUTO, ON_TF
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_pose_array,
 )
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
@@ -29,7 +31,6 @@ from slam_observer_ros.messages.message_types import (
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
-    ImuMessage,
     PoseMessage,
 )
 from slam_observer_ros.nodes.decoders import CloudDecoder, OdometryDecoder, TagDecoder
@@ -64,7 +65,7 @@ def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
                 f"velocity_type '{settings.velocity_type}' has no poses: with velocity_source "
                 "'pose_differences' it is 'Odometry' or 'auto'"
             )
-        return Input(node, 'twist', {ODOMETRY: _decode_odometry_pose}, intake.add_pose, qos)
+        return Input(node, 'twist', {ODOMETRY: _decode_odometry_pose}, intake.add_velocity, qos)
     decoders = _chosen(
         VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
     )
@@ -107,7 +108,7 @@ def _qos(reliability: str, depth: int) -> QoSProfile:
     )
 
 
-def _decode_imu(raw: Buffer, _receive_ns: int) -> ImuMessage:
+def _decode_imu(raw: Buffer, _receive_ns: int) -> Measurement[AngularVelocityEvent]:
     return decode_imu(raw)
 
 

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 import time
-from typing import TypeVar
 
 from rclpy.node import Node
 
@@ -26,12 +25,9 @@ from slam_observer_ros.inputs.event_builder import (
 )
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.point_clouds import ObservationMessage, scan_trouble
-from slam_observer_ros.messages.poses_and_velocities import (
-    ImuMessage,
-    PoseMessage,
-    VelocityMessage,
-)
+from slam_observer_ros.messages.measurement import AnyMeasurement, Measurement
+from slam_observer_ros.messages.point_clouds import scan_trouble
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.nodes.clock_offset import ClockOffset
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.units import to_ns
@@ -45,8 +41,6 @@ SOURCES: dict[type[Event], str] = {
     ObservationEvent: 'landmarks',
 }
 """Inputs by the events that come of them; each has stamps of a clock of its own."""
-
-MeasuredT = TypeVar('MeasuredT', VelocityEvent, ObservationEvent, ImuMessage, PoseMessage)
 
 
 class Intake:
@@ -104,38 +98,30 @@ class Intake:
         self.is_active = False
         self.is_paused = False
 
-    def add_velocity(self, message: VelocityMessage, receive_ns: int) -> None:
-        """Take a velocity."""
-        event = self._timed(message.event, 'twist', receive_ns)
-        if event is not None:
-            self._build(replace(message, event=event))
+    def add_velocity(
+        self, measured: Measurement[VelocityEvent] | PoseMessage, receive_ns: int
+    ) -> None:
+        """Take a velocity, or an odometry's pose, of which the differences are used."""
+        self._build_timed(measured, 'twist', receive_ns)
 
-    def add_pose(self, message: PoseMessage, receive_ns: int) -> None:
-        """Take an odometry's pose; the velocity comes from its differences."""
-        timed = self._timed(message, 'twist', receive_ns)
-        if timed is not None:
-            self._build(timed)
-
-    def add_imu(self, message: ImuMessage, receive_ns: int) -> None:
+    def add_imu(self, measured: Measurement[AngularVelocityEvent], receive_ns: int) -> None:
         """Take an angular velocity."""
-        timed = self._timed(message, 'imu', receive_ns)
-        if timed is not None:
-            self._build(timed)
+        self._build_timed(measured, 'imu', receive_ns)
 
-    def add_observation(self, message: ObservationMessage, receive_ns: int) -> None:
+    def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
         """Take landmarks, unless they are a lidar's scan."""
-        trouble = scan_trouble(message.event)
+        trouble = scan_trouble(measured.event)
         if self.is_active and trouble:
             self._drop('scan', trouble)
-            return
-        event = self._timed(message.event, 'landmarks', receive_ns)
-        if event is not None:
-            self._build(replace(message, event=event))
+        else:
+            self._build_timed(measured, 'landmarks', receive_ns)
 
-    def add_observations(self, messages: Sequence[ObservationMessage], receive_ns: int) -> None:
+    def add_observations(
+        self, measured: Sequence[Measurement[ObservationEvent]], receive_ns: int
+    ) -> None:
         """Take landmarks of several cameras."""
-        for message in messages:
-            self.add_observation(message, receive_ns)
+        for one in measured:
+            self.add_observation(one, receive_ns)
 
     def add_tags(self, message: TagDetections, receive_ns: int) -> None:
         """Take fiducials whose positions are on /tf, at the stamps of their message there."""
@@ -193,15 +179,17 @@ class Intake:
         why = f"no transform to '{self._settings.base_frame}': " if is_unplaced else ''
         self._drop(drop_reason(error), f'{why}{error}')
 
-    def _timed(self, measured: MeasuredT, source: str, receive_ns: int) -> MeasuredT | None:
-        """Return the measurement with a stamp; None if it can't be used."""
-        stamp_ns = measured.stamp_ns or receive_ns  # 0: the publisher left it out
+    def _build_timed(
+        self, measured: AnyMeasurement | PoseMessage, source: str, receive_ns: int
+    ) -> None:
+        """Use a measurement of an input; without a stamp it has that of its reception."""
+        stamp_ns = measured.stamp_ns or receive_ns
         if not self._is_usable(source, stamp_ns, receive_ns):
-            return None
+            return
         if not measured.stamp_ns:
             text = f'stamps are zero on {source}: the time of reception is taken instead'
             self._warn(f'stamps of {source}', text)
-        return replace(measured, stamp_ns=stamp_ns)
+        self._build(measured.with_stamp(stamp_ns))
 
     def _is_usable(self, source: str, stamp_ns: int, receive_ns: int) -> bool:
         if not self.is_active:

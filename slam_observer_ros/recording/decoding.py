@@ -8,9 +8,11 @@ from functools import partial
 from typing import TypeAlias
 
 from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 from slam_observer_ros.inputs.event_builder import Measured
 from slam_observer_ros.inputs.settings import InputSettings, POSE_DIFFERENCES
 from slam_observer_ros.messages.detections import decode_apriltags, observed_tags, TagDetections
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
@@ -19,14 +21,12 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.messages.point_clouds import ObservationMessage, scan_trouble
+from slam_observer_ros.messages.point_clouds import scan_trouble
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
     decode_transforms,
-    ImuMessage,
     PoseMessage,
-    VelocityMessage,
 )
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
@@ -58,7 +58,7 @@ def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topi
     return decoders
 
 
-def decode_landmarks(raw: RawMessage) -> ObservationMessage:
+def decode_landmarks(raw: RawMessage) -> Measurement[ObservationEvent]:
     """Decode landmarks, measured or true."""
     return _OBSERVATION_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)
 
@@ -74,7 +74,7 @@ def decode_transform_message(raw: RawMessage) -> list[PoseMessage]:
     return decode_transforms(raw.data)
 
 
-def _velocity(raw: RawMessage) -> list[VelocityMessage]:
+def _velocity(raw: RawMessage) -> list[Measurement[VelocityEvent]]:
     return [VELOCITY_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)]
 
 
@@ -82,11 +82,11 @@ def _odometry_pose(raw: RawMessage) -> list[PoseMessage]:
     return [decode_odometry_pose(raw.data)]
 
 
-def _imu(raw: RawMessage) -> list[ImuMessage]:
+def _imu(raw: RawMessage) -> list[Measurement[AngularVelocityEvent]]:
     return [decode_imu(raw.data)]
 
 
-def _landmarks(raw: RawMessage) -> list[ObservationMessage]:
+def _landmarks(raw: RawMessage) -> list[Measurement[ObservationEvent]]:
     message = decode_landmarks(raw)
     trouble = scan_trouble(message.event)
     if trouble:
@@ -98,5 +98,5 @@ def _tags(raw: RawMessage) -> list[TagDetections]:
     return [decode_apriltags(raw.data)]
 
 
-def _tags_on_tf(tag_frame_prefix: str, raw: RawMessage) -> list[ObservationMessage]:
+def _tags_on_tf(tag_frame_prefix: str, raw: RawMessage) -> list[Measurement[ObservationEvent]]:
     return observed_tags(decode_transforms(raw.data), tag_frame_prefix)

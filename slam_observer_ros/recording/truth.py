@@ -12,9 +12,9 @@ from typing import TypeAlias
 import numpy as np
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.events import UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.inputs.frames import TransformSource
-from slam_observer_ros.messages.point_clouds import ObservationMessage
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
 from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray, IntArray
@@ -46,7 +46,9 @@ class LandmarkTracks:
     world_points: FloatArray
 
     @classmethod
-    def from_messages(cls, messages: Iterable[ObservationMessage]) -> LandmarkTracks | None:
+    def from_messages(
+        cls, messages: Iterable[Measurement[ObservationEvent]]
+    ) -> LandmarkTracks | None:
         """Gather positions of any order; None if no message has a landmark."""
         stamps_ns: list[int] = []
         states: list[_Positions] = []
@@ -109,7 +111,7 @@ class Truth:
         cls,
         poses: Sequence[PoseMessage],
         base_in: Mapping[str, FloatArray],
-        landmarks: Iterable[ObservationMessage],
+        landmarks: Iterable[Measurement[ObservationEvent]],
     ) -> Truth:
         """Gather poses and landmarks of any order.
 
@@ -130,7 +132,9 @@ class Truth:
         return replace(self, tracks=self.tracks.flattened(height_m))
 
 
-def _told_at(messages: Iterable[ObservationMessage]) -> Iterator[tuple[int, _Positions]]:
+def _told_at(
+    messages: Iterable[Measurement[ObservationEvent]],
+) -> Iterator[tuple[int, _Positions]]:
     """Yield what all messages of a stamp tell together, in the order of the stamps."""
     by_stamp = attrgetter('stamp_ns')
     events = sorted((message.event for message in messages), key=by_stamp)
