@@ -41,10 +41,13 @@ from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.map_plot import plot_map
 from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
+from slam_observer_ros.inputs.settings import InputSettings
+from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.replay import replay
+from slam_observer_ros.settings import Settings
 
 logger = logging.getLogger(__name__)
 
@@ -98,6 +101,17 @@ def run(args: argparse.Namespace) -> None:
     _check_files(args)
     warn_of_unused(args, settings)
     landmark_map = None if args.load_map is None else read_map(args.load_map)
+    outcome = _replay(args, settings, inputs, landmark_map)
+    _give_out(args, outcome, _frame_of_outputs(inputs, landmark_map))
+
+
+def _replay(
+    args: argparse.Namespace,
+    settings: Settings,
+    inputs: InputSettings,
+    landmark_map: LandmarkMap | None,
+) -> ReplayOutcome:
+    """Replay a recording; tell what may be wrong with it, or with what is asked of it."""
     with Recording(args.recording) as recording:
         if recording.warning:
             logger.warning('%s', recording.warning)
@@ -117,17 +131,20 @@ def run(args: argparse.Namespace) -> None:
             check_place(args, result, landmark_map)
         outcome = outcome_of(recording, selected, result, truth)
         warn_of_input(recording, selected, result)
-    if args.smooth:
-        outcome = with_smoothed(outcome)
-    map_frame = landmark_map.frame_id if landmark_map else inputs.map_frame
-    if map_frame != inputs.map_frame:
-        logger.warning(
-            "The map is in frame '%s', and so is what is written; the node takes it with "
-            'map_frame: %s only.',
-            map_frame,
-            map_frame,
-        )
-    _give_out(args, outcome, map_frame)
+    return with_smoothed(outcome) if args.smooth else outcome
+
+
+def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
+    """Return the frame of what is written: that of the map that was loaded, if one was."""
+    if landmark_map is None or landmark_map.frame_id == inputs.map_frame:
+        return inputs.map_frame
+    logger.warning(
+        "The map is in frame '%s', and so is what is written; the node takes it with "
+        'map_frame: %s only.',
+        landmark_map.frame_id,
+        landmark_map.frame_id,
+    )
+    return landmark_map.frame_id
 
 
 def _check_files(args: argparse.Namespace) -> None:
