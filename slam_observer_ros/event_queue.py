@@ -13,7 +13,7 @@ from slam_observer_ros.units import to_s
 
 Key: TypeAlias = tuple[int, bool, bytes]
 
-CONFIRMATIONS = 5
+AGREEING_STAMPS = 5
 """How many stamps in a row must agree before a pause or a jump of the clock is believed."""
 
 NEAR_NS = 1_000_000_000
@@ -39,7 +39,7 @@ class EventQueue:
 
     A stamp that is ahead of all others by more than events may be late is kept, but not believed
     at once: one wrong stamp would make all other events too late. It is believed when time has
-    got there, or when ``CONFIRMATIONS`` stamps agree that there was a pause; at once where events
+    got there, or when ``AGREEING_STAMPS`` stamps agree that there was a pause; at once where events
     come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
     received for as long: then it was a silence, not the clock.
 
@@ -168,7 +168,7 @@ class EventQueue:
         agrees = same_side and abs(stamp_ns - self._stray_ns) <= self._max_jump_ns
         self._strays = self._strays + (stamp_ns != self._stray_ns) if agrees else 1
         self._stray_ns = stamp_ns
-        if self._strays < CONFIRMATIONS:
+        if self._strays < AGREEING_STAMPS:
             return False
         self._strays = 0
         return True

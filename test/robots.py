@@ -9,7 +9,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import PointCloud, PointCloud2
 
-from slam_observer_ros.event_queue import CONFIRMATIONS
+from slam_observer_ros.event_queue import AGREEING_STAMPS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
@@ -63,7 +63,7 @@ class Robot:
 
     def send_zeros(self):
         """Stand still for long enough that nothing is held back, even after a pause."""
-        for _ in range(CONFIRMATIONS + 2):
+        for _ in range(AGREEING_STAMPS + 2):
             self.send(VelocityEvent(time.time_ns(), np.zeros(6)))
             self.ros.spin_for(0.06)
 

@@ -19,7 +19,7 @@ from slam_observer_ros.errors import MapError, ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.event_queue import CONFIRMATIONS
+from slam_observer_ros.event_queue import AGREEING_STAMPS
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     LAST_AUTOMATIC_ID,
@@ -610,9 +610,9 @@ def test_after_a_jump_back_in_time_pose_and_map_are_held_if_asked(gains):
     estimator = run(events, on_time_jump='hold', gains=gains)
     pose, points = estimator.pose, estimator.world_points
     stray = ObservationEvent(START_NS - 10**12, np.array([99]), np.ones((1, 3)))
-    for step in range(CONFIRMATIONS):
+    for step in range(AGREEING_STAMPS):
         estimator.add(replace(stray, stamp_ns=stray.stamp_ns + step))
-    assert estimator.newest_stamp_ns == stray.stamp_ns + CONFIRMATIONS - 1
+    assert estimator.newest_stamp_ns == stray.stamp_ns + AGREEING_STAMPS - 1
     estimator.flush()
     np.testing.assert_allclose(estimator.pose, pose, atol=1e-12)
     np.testing.assert_allclose(estimator.world_points[:-1], points, atol=1e-12)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.event_queue import CONFIRMATIONS, EventQueue, MIN_KNOWN
+from slam_observer_ros.event_queue import AGREEING_STAMPS, EventQueue, MIN_KNOWN
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 
 SECOND = 1_000_000_000
@@ -164,9 +164,9 @@ def test_what_still_waits_for_others_at_the_end_is_given_out_too():
 
 def test_a_pause_is_believed_when_enough_events_agree_and_none_of_them_is_lost():
     events = [*dense(SECOND), *dense(11 * SECOND)[540:]]
-    queue = filled(*events[: 50 + CONFIRMATIONS - 1])
+    queue = filled(*events[: 50 + AGREEING_STAMPS - 1])
     assert queue.newest_ns == events[49].stamp_ns
-    for event in events[50 + CONFIRMATIONS - 1 :]:
+    for event in events[50 + AGREEING_STAMPS - 1 :]:
         assert not queue.push(event)
         assert queue.newest_ns == event.stamp_ns
     assert queue.pop_all() == events
@@ -206,24 +206,24 @@ def test_a_stamp_ahead_waits_after_a_silence_and_is_refused_where_there_was_none
 def test_stamps_that_go_on_further_than_time_does_are_a_jump_of_the_clock():
     before, after = before_and_after_a_silence(received_before_ns=LONG_NS - 5 * SECOND)
     queue = filled(*before)
-    for event in after[: CONFIRMATIONS - 1]:
+    for event in after[: AGREEING_STAMPS - 1]:
         with pytest.raises(InvalidEventError):
             queue.push(event)
-    assert queue.push(after[CONFIRMATIONS - 1])
+    assert queue.push(after[AGREEING_STAMPS - 1])
 
 
 def test_where_events_come_seldom_none_waits_for_others():
     events = dense(60 * SECOND, step_ns=5 * SECOND)
-    queue = filled(*events[: 1 + CONFIRMATIONS], window_ns=0)
-    assert queue.pop_ready() == events[: 1 + CONFIRMATIONS]
-    for event in events[1 + CONFIRMATIONS :]:
+    queue = filled(*events[: 1 + AGREEING_STAMPS], window_ns=0)
+    assert queue.pop_ready() == events[: 1 + AGREEING_STAMPS]
+    for event in events[1 + AGREEING_STAMPS :]:
         assert not queue.push(event)
         assert queue.pop_ready() == [event]
 
 
 def test_events_of_one_message_do_not_confirm_each_other():
     queue = filled(*dense(SECOND))
-    for number in range(2 * CONFIRMATIONS):
+    for number in range(2 * AGREEING_STAMPS):
         assert not queue.push(observation(5 * SECOND, [number]))
     assert queue.newest_ns < START_NS + SECOND
 
@@ -246,10 +246,10 @@ def test_stamps_that_do_not_agree_confirm_no_jump():
 @pytest.mark.parametrize('jump_ns', [10**15, -(10**15), -3 * SECOND])
 def test_a_jump_of_the_clock_is_believed_when_enough_events_agree(jump_ns):
     queue = filled(velocity(0))
-    for k in range(CONFIRMATIONS - 1):
+    for k in range(AGREEING_STAMPS - 1):
         with pytest.raises(InvalidEventError):
             queue.push(velocity(jump_ns + k))
-    assert queue.push(velocity(jump_ns + CONFIRMATIONS))
+    assert queue.push(velocity(jump_ns + AGREEING_STAMPS))
 
 
 def test_strays_among_good_events_never_add_up():

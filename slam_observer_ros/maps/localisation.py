@@ -24,7 +24,7 @@ from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 ROUNDING = 1e-14
 """Least variance that can be told from zero, as a share of the sum of all variances."""
 
-CONFIRMATIONS = 10
+CONFIRMING_VOTES = 10
 """Observations that confirm a place that was told."""
 
 
@@ -108,7 +108,7 @@ class PoseTrial:
 
     def is_contradicted(self, outcome: Outcome, often: int) -> bool:
         """Count the vote of an observation; return whether ``often`` ones say it is wrong."""
-        if self._for >= CONFIRMATIONS and self._for > self._against:
+        if self._for >= CONFIRMING_VOTES and self._for > self._against:
             return False
         rejected = int(np.isin(outcome.ids[outcome.rejected], self._ids).sum())
         believed = int(np.isin(outcome.ids, self._ids).sum()) - rejected
