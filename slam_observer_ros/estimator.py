@@ -289,7 +289,7 @@ class Estimator:
 
     @property
     def landmark_map(self) -> LandmarkMap:
-        """The present map, as it can be saved and loaded: without landmarks known to move.
+        """The present map, as it can be saved and loaded: without landmarks that move.
 
         Its covariances are those in its own frame: without the error of how it lies to where
         the robot started, unless the frame is that of a map that was loaded.
@@ -444,9 +444,11 @@ class Estimator:
             event = timeline.carry_forward(event, self._slam)
             self._counts['late_observation'] += 1
         timeline.advance(self._frame.states, event.stamp_ns)
+        if 0 < self.settings.max_landmarks < len(event.ids) and self._slam.is_mapping:
+            self._warnings.more_than_max(len(event.ids), self.settings.max_landmarks)
         outcome = self._frame.states.observe(event)
         if len(outcome.moved_ids):
-            self._warnings.moved_landmarks(outcome.moved_ids)
+            self._warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
         self._warnings.lost_places(self._frame.counts)
         self._counts['observation'] += 1
         if len(self._slam.landmarks) >= MANY_LANDMARKS and self.settings.gains == 'riccati':

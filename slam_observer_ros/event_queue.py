@@ -39,8 +39,8 @@ class EventQueue:
 
     A stamp that is ahead of all others by more than events may be late is kept, but not believed
     at once: one wrong stamp would make all other events too late. It is believed when time has
-    got there, or when ``AGREEING_STAMPS`` stamps agree that there was a pause; at once where events
-    come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
+    got there, or when ``AGREEING_STAMPS`` stamps agree that there was a pause; at once where
+    events come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
     received for as long: then it was a silence, not the clock.
 
     Parameters

@@ -9,6 +9,7 @@ import logging
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, LAST_AUTOMATIC_ID
 from slam_observer_ros.types import IntArray
+from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 logger = logging.getLogger(__name__)
 
@@ -16,7 +17,10 @@ MAX_NAMED = 10
 """Ids that a warning lists at most."""
 
 MANY_MOVED = 5
-"""Landmarks that seem to have moved from which on the odometry may be at fault."""
+"""Landmarks that seem to have moved lately from which on the odometry may be at fault."""
+
+MOVED_LATELY_NS = 60 * NANOSECONDS_PER_SECOND
+"""How long ago that is at most, nanoseconds."""
 
 LOST_PLACES = {
     'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
@@ -32,7 +36,7 @@ class EventWarnings:
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._places: Counter[str] = Counter()
-        self._moved_ids: set[int] = set()
+        self._moved_ns: dict[int, int] = {}
 
     def dropped(self, error: InvalidEventError) -> None:
         """Tell that an event is not used, and why."""
@@ -67,7 +71,8 @@ class EventWarnings:
             self._counts['large_map'] = 1
             logger.warning(
                 'The map has %d landmarks, and the time that riccati gains take grows with their '
-                'square: scheduled gains take many more, and max_landmarks limits them.',
+                'square: scheduled gains take many more, if points have ids, and max_landmarks '
+                'limits them.',
                 count,
             )
 
@@ -76,16 +81,19 @@ class EventWarnings:
         text = f'{count} points in one message, and max_landmarks is {limit}: some are always new'
         self._warn('more_than_max', text)
 
-    def moved_landmarks(self, ids: IntArray) -> None:
-        """Tell that landmarks are not any more where they were."""
-        text = f'Landmarks {ids.tolist()} have moved'
-        self._moved_ids.update(ids.tolist())
-        if len(self._moved_ids) >= MANY_MOVED:
-            text += (
-                '; as so many seem to, odometry may err by more than its noise allows: let its '
-                'bias and scale be estimated (angular_bias_error and the like)'
+    def moved_landmarks(self, ids: IntArray, stamp_ns: int) -> None:
+        """Tell that landmarks are not any more where they were, and if many are so at a time."""
+        self._warn('moved_landmark', f'Landmarks {ids.tolist()} have moved')
+        self._moved_ns |= dict.fromkeys(ids.tolist(), stamp_ns)
+        lately = sum(stamp_ns - moved_ns < MOVED_LATELY_NS for moved_ns in self._moved_ns.values())
+        if lately >= MANY_MOVED:
+            self._moved_ns.clear()
+            text = (
+                f'{lately} landmarks seem to have moved within a minute: odometry may err by more '
+                'than its noise allows. Let its bias and scale be estimated (angular_bias_error '
+                'and the like)'
             )
-        self._warn('moved_landmark', text)
+            self._warn('many_moved', text)
 
     def lost_places(self, counts: Mapping[str, int]) -> None:
         """Tell that the robot is not where it was taken to be, if ``counts`` say so once more."""

@@ -16,8 +16,6 @@ def usable_points(
 ) -> ObservationEvent:
     """Return an observation as the states use it; count its points and tell of those left out."""
     counts['observed_point'] += len(event.ids)
-    if 0 < settings.max_landmarks < len(event.ids):
-        warnings.more_than_max(len(event.ids), settings.max_landmarks)
     event = flatten(event) if settings.two_d_mode else event
     event = _without_reserved(event, counts, warnings)
     event = _without_repeated(event, counts, warnings)

@@ -43,7 +43,7 @@ def check_event(event: Event) -> None:
     if not isinstance(event, Event):
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
     if not isinstance(event.stamp_ns, int | np.int64):
-        reason = f'stamp {event.stamp_ns!r} is no int: stamps are in nanoseconds'
+        reason = f'stamp {event.stamp_ns!r} is no int or np.int64: stamps are in nanoseconds'
         raise InvalidEventError('wrong_type', reason)
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
@@ -119,7 +119,7 @@ def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: i
 def _check_observation(event: ObservationEvent) -> None:
     is_stack = isinstance(event.points, np.ndarray) and event.points.ndim > 0
     m = len(event.points) if is_stack else 0
-    if type(event.ids) is not np.ndarray or event.ids.dtype.kind not in 'iu':
+    if not _is_plain(event.ids) or event.ids.dtype.kind not in 'iu':
         raise InvalidEventError('wrong_type', 'landmark ids are not an array of integers')
     if event.ids.dtype == np.uint64:  # which NumPy joins with int64 as float64
         raise InvalidEventError('wrong_type', 'landmark ids are uint64: make them int64')
@@ -152,13 +152,18 @@ def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> 
 
 
 def _check_array(name: str, array: FloatArray | IntArray, shape: tuple[int, ...]) -> None:
-    # Masked arrays and np.matrix are arrays, too, but not all operations mean the same.
-    if type(array) is not np.ndarray or array.dtype.kind not in 'fiu' or array.itemsize > 8:
-        raise InvalidEventError('wrong_type', f'{name}: no plain numpy array of numbers')
+    if not _is_plain(array) or array.dtype not in (np.float64, np.float32, np.int64):
+        text = f'{name}: no plain numpy array of float64, float32 or int64'
+        raise InvalidEventError('wrong_type', text)
     if array.shape != shape:
         raise InvalidEventError('wrong_shape', f'{name}: shape {array.shape}, not {shape}')
     if not np.isfinite(array).all():
         raise InvalidEventError('not_finite', f'an entry of the {name} is NaN or infinite')
+
+
+def _is_plain(array: object) -> bool:
+    """Return whether something is an array on which all operations mean what they should."""
+    return isinstance(array, np.ndarray) and not isinstance(array, np.ma.MaskedArray | np.matrix)
 
 
 def _check_definite(name: str, covariances: FloatArray) -> None:

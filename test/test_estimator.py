@@ -288,6 +288,8 @@ def bad_events():
         ('wrong_type', ObservationEvent(stamp_ns, np.ma.array(good.ids), points)),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, np.ma.array(points))),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, points.astype(np.longdouble))),
+        ('wrong_type', ObservationEvent(stamp_ns, good.ids, points.astype(np.float16))),
+        ('wrong_type', ObservationEvent(stamp_ns, good.ids, points.astype(np.int8))),
         ('wrong_type', None),
         ('wrong_type', PoseTruth(stamp_ns, np.eye(4))),
         ('too_large', VelocityEvent(2**70, BODY_VELOCITY)),
@@ -365,10 +367,8 @@ def test_where_many_landmarks_seem_to_move_the_odometry_is_named(caplog):
         times_moved = (step // 8 + 4 - np.arange(5)) // 5  # one after another
         points = LANDMARKS + 3.0 * np.outer(times_moved, [0.0, 0.0, 1.0])
         estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), points))
-    told = [message for message in caplog.messages if 'have moved' in message]
-    assert 'angular_bias_error' not in told[0]
-    assert all('angular_bias_error' in message for message in told[1:])
-    assert len(told) > 1
+    told = [message for message in caplog.messages if 'seem to have moved' in message]
+    assert told[0].startswith('5 landmarks seem to have moved within a minute: odometry may err')
 
 
 @pytest.mark.parametrize('gains', GAINS)

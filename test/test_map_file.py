@@ -194,6 +194,7 @@ BAD_FILES = [
     (changed('sigma: 0.01', 'sigma: -1'), "landmark 7: 'sigma' is negative"),
     (changed('sigma: 0.01', 'sigma: .nan'), "landmark 7: 'sigma' has nan"),
     (changed('id: 7', 'id: 010'), "entry 0 of landmarks: 'id' is '010'"),
+    (changed('1.5', '{{ x }}'), 'not valid YAML'),
     (changed('id: 7', 'id: 1:30'), "'id' is '1:30'"),
     (changed('sigma: 0.01', 'position: [0, 0, 0]'), "'position' is there 2 times in one entry"),
     (changed(', sigma: 0.01', ''), "landmark 7 has no 'sigma' or 'covariance', as others have"),

@@ -34,6 +34,7 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
 )
 from slam_observer_ros.nodes.initial_pose import InitialPose
+from slam_observer_ros.nodes.maps import free_name
 from slam_observer_ros.settings import Settings
 
 pytestmark = pytest.mark.ros
@@ -202,9 +203,32 @@ def test_a_map_that_is_not_the_nodes_own_is_kept_when_another_one_takes_its_plac
         assert call(ros, 'save_map').message.endswith('; what it held before is in hall.yaml~')
         assert len(read_map(path).ids) == 4
         assert call(ros, 'save_map').message.endswith('hall.yaml')
+        name_file(ros, tmp_path / ('x' * 300), must_succeed=False)
+        name_file(ros, '~nobody-of-that-name/map.yaml', must_succeed=False)
     finally:
         assert node.stop() == 0
     assert (tmp_path / 'hall.yaml~').read_text() == before
+
+
+def test_a_place_that_there_can_not_be_is_told_and_ends_nothing(ros, robot, tmp_path):
+    with running('observer_node', tmp_path / 'log', **PARAMETERS):
+        robot.connect()
+        for _ in range(3):
+            robot.see_until_published(np.eye(4), range(4))
+        for path in (tmp_path / ('x' * 300), '~nobody-of-that-name/map.yaml', tmp_path):
+            name_file(ros, path)
+            answer = call(ros, 'save_map')
+            assert not answer.success
+            assert answer.message.startswith("can't ")
+
+
+def test_what_a_file_held_is_never_lost_however_often_it_is_replaced(tmp_path):
+    path = tmp_path / 'hall.yaml'
+    for text in ('first', 'second', 'third'):
+        path.write_text(text)
+        path.replace(free_name(path))
+    kept = [(tmp_path / f'hall.yaml~{ending}').read_text() for ending in ('', '2', '3')]
+    assert kept == ['first', 'second', 'third']
 
 
 def test_a_map_that_can_not_be_saved_at_the_end_is_told_by_the_exit_code(ros, robot, tmp_path):

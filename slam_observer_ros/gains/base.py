@@ -122,7 +122,7 @@ class GainDesign:
     calibration : Calibration
         Scale, bias and delay of the velocity, as far as they are known.
     ignores : tuple of str
-        Settings above zero that ask for an estimate which the design does not make.
+        Settings that have no effect on the design if they are above zero.
 
     """
 

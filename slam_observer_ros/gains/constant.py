@@ -54,6 +54,7 @@ class ConstantGains(GainDesign):
         'linear_bias_error',
         'velocity_delay_error',
         'landmark_velocity_error',
+        'observation_error_time',
     )
 
     def __init__(self, settings: Settings) -> None:

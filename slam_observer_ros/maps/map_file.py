@@ -54,7 +54,7 @@ _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 class _StrictLoader(_FastLoader):  # type: ignore[misc]  # one of two classes
-    """Reads the numbers of YAML 1.2, and no key twice: by 1.1, 010 is 8 and 1:30 is 90."""
+    """Reads decimal numbers alone, and no key twice: by YAML 1.1, 010 is 8 and 1:30 is 90."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own)
         first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT)]
@@ -63,7 +63,8 @@ class _StrictLoader(_FastLoader):  # type: ignore[misc]  # one of two classes
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
         """Return a mapping; raise a YAMLError if it has a key twice."""
-        for key, count in Counter(key.value for key, _ in node.value).items():
+        keys = (key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for key, count in Counter(keys).items():
             if count > 1:
                 raise yaml.YAMLError(f"'{key}' is there {count} times in one entry")
         return super().construct_mapping(node, deep)
@@ -133,9 +134,9 @@ def check_writable(path: Path) -> None:
         If the directory that its name leads to takes no file, or it is there and no file.
 
     """
-    if path.is_dir():
-        raise MapError(f"can't write map {path}: it is a directory")
     try:
+        if path.is_dir():
+            raise MapError(f"can't write map {path}: it is a directory")
         directory = destination(path).parent
     except OSError as error:
         raise MapError(f"can't write map {path}: {error.strerror}") from error
@@ -275,7 +276,8 @@ def _check_names(
 def _natural(value: Any, what: str) -> int:
     is_natural = isinstance(value, int) and not isinstance(value, bool)
     _expect(
-        is_natural and 0 <= value <= _MAX_INT64, f'{what} is {value!r}, not a whole number ≥ 0'
+        is_natural and 0 <= value <= _MAX_INT64,
+        f'{what} is {value!r}, not a whole number ≥ 0',
     )
     return int(value)
 

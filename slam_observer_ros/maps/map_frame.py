@@ -28,6 +28,9 @@ logger = logging.getLogger(__name__)
 GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 """Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
 
+MOVING_SPEED = 0.1
+"""Speed from which on a landmark is left out of a map, m/s; slower ones may be at rest."""
+
 NEWS = 0.1
 """Share of the observations that is new when the same landmarks are compared with a map again:
 with many of them that takes long, and a single further observation seldom decides it.
@@ -86,8 +89,7 @@ class MapFrame:
     def landmark_map(self) -> LandmarkMap:
         """The present map; see :attr:`slam_observer_ros.estimator.Estimator.landmark_map`."""
         slam, rows = self.slam, self.slam.confirmed
-        if self.settings.landmark_velocity_error == 0.0:
-            rows = rows[~slam.observer.u[rows].any(axis=1)]
+        rows = rows[np.linalg.norm(slam.observer.u[rows], axis=1) < MOVING_SPEED]
         covariances = shape_covariances(slam) if self.loaded is None else slam.landmark_covariances
         return LandmarkMap(
             slam.landmarks.ids[rows],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
+from itertools import chain, count
 from pathlib import Path
 import shutil
 
@@ -88,7 +89,7 @@ class Maps:
         try:
             for change in changes:
                 if change.name == 'map_path' and self._autosave:
-                    self._check_autosave(change.value)
+                    self._check_autosave(str(change.value))
         except SlamObserverError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -105,18 +106,20 @@ class Maps:
         if self._autosave and path.exists() and path not in self._own_files:
             self._node.get_logger().warning(
                 f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
-                f'holds will be kept in {_backup(path).name}'
+                f'holds will be kept in {free_name(path).name}'
             )
 
     def _keep(self, path: Path) -> str:
         """Keep a copy of a map that is not this node's own; return how to tell of it."""
-        if path in self._own_files or not path.exists():
+        if path in self._own_files:
             return ''
-        backup = _backup(path)
         try:
+            if not path.exists():
+                return ''
+            backup = free_name(path)
             shutil.copy2(path, backup)
         except OSError as error:
-            raise MapError(f"can't keep a copy of {path} in {backup}: {error.strerror}") from error
+            raise MapError(f"can't keep a copy of map {path}: {error.strerror}") from error
         return f'; what it held before is in {backup.name}'
 
     def _answer_save(
@@ -157,8 +160,8 @@ class Maps:
         self._own_files.add(path)
         moving = len(estimator.landmark_ids) - len(landmark_map.ids)
         without = f' (without {moving} that move)' if moving else ''
-        count = len(landmark_map.ids)
-        return f"saved {count} landmarks{without} in frame '{self._map_frame}' to {path}{kept}"
+        what = f'{len(landmark_map.ids)} landmarks{without}'
+        return f"saved {what} in frame '{self._map_frame}' to {path}{kept}"
 
     def _load(self, path: Path) -> str:
         landmark_map = read_map(path)
@@ -176,17 +179,22 @@ class Maps:
     def _place(self) -> str:
         estimator = self._estimator
         if not estimator.is_localised:
-            count = 'two' if estimator.settings.two_d_mode else 'three'
-            return f'the pose is unknown until {count} of them are seen or it is given'
+            number = 'two' if estimator.settings.two_d_mode else 'three'
+            return f'the pose is unknown until {number} of them are seen or it is given'
         if estimator.last_update is None:
             x, y, z = estimator.pose[:3, 3].tolist()
             return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
         return 'the robot has found its place in it'
 
 
-def _backup(path: Path) -> Path:
-    return path.with_name(f'{path.name}~')
+def free_name(path: Path) -> Path:
+    """Return a name that is not taken for a copy of a file: with ~, ~2 and so on behind it."""
+    names = (path.with_name(f'{path.name}~{ending}') for ending in chain([''], count(2)))
+    return next(name for name in names if not name.exists())
 
 
 def _absolute(path: str) -> Path:
-    return Path(path).expanduser().absolute()
+    try:
+        return Path(path).expanduser().absolute()
+    except RuntimeError as error:  # of a user that there is none of
+        raise ParameterError(f"can't find {path}: {error}") from error

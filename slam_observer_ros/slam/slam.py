@@ -282,11 +282,13 @@ class Slam:
         self, event: ObservationEvent, rows: IntArray, rejected_ids: IntArray
     ) -> None:
         """Let landmarks move as the sensor says; by one that says nothing they are static."""
-        if event.velocities is not None and not self.is_held:
-            used = ~np.isin(event.ids, rejected_ids)
-            self.observer.set_landmark_velocities(rows[used], event.velocities[used])
-        elif self.observer.have_moved and self.settings.landmark_velocity_error == 0.0:
-            self.observer.set_landmark_velocities(rows, np.zeros((len(rows), 3)))
+        velocities = event.velocities
+        if velocities is None and self.settings.landmark_velocity_error == 0.0:
+            velocities = np.zeros((len(rows), 3)) if self.observer.have_moved else None
+        if velocities is None or self.is_held:
+            return
+        used = ~np.isin(event.ids, rejected_ids)
+        self.observer.set_landmark_velocities(rows[used], velocities[used])
 
     def _places(
         self, event: ObservationEvent, residuals: Residuals
