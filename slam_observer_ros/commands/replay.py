@@ -174,19 +174,11 @@ def _write_files(
     args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str
 ) -> tuple[dict[str, Path], list[str]]:
     """Write what was asked for; return what was written, and why something was not."""
-    estimator, smoothed = outcome.result.estimator, outcome.smoothed
-    landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=map_frame)
-    moving = len(estimator.landmark_ids) - len(landmark_map.ids)
-    if moving and args.map is not None:
-        logger.warning('%d landmarks that move are left out of the map.', moving)
-    trajectory = outcome.result.trajectory
-    if smoothed is not None:
-        # The covariances stay: what the filter knows of the map in the end is hindsight, too.
-        landmark_map = dataclasses.replace(landmark_map, world_points=smoothed.world_points)
-        trajectory = trajectory_of(smoothed)
+    smoothed = outcome.smoothed
+    trajectory = outcome.result.trajectory if smoothed is None else trajectory_of(smoothed)
     outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
         ('trajectory', args.tum, lambda path: write_tum(trajectory, path)),
-        ('map', args.map, lambda path: write_map(path, landmark_map, estimator.settings)),
+        ('map', args.map, lambda path: _write_map(outcome, map_frame, path)),
         ('figures', args.plot, lambda path: _draw(outcome, trajectory, path)),
     )
     written: dict[str, Path] = {}
@@ -200,6 +192,18 @@ def _write_files(
         except (SlamObserverError, OSError) as error:
             errors.append(str(error))
     return written, errors
+
+
+def _write_map(outcome: ReplayOutcome, map_frame: str, path: Path) -> None:
+    estimator, smoothed = outcome.result.estimator, outcome.smoothed
+    landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=map_frame)
+    moving = len(estimator.landmark_ids) - len(landmark_map.ids)
+    if moving:
+        logger.warning('%d landmarks that move are left out of the map.', moving)
+    if smoothed is not None:
+        # The covariances stay: what the filter knows of the map in the end is hindsight, too.
+        landmark_map = dataclasses.replace(landmark_map, world_points=smoothed.world_points)
+    write_map(path, landmark_map, estimator.settings)
 
 
 def _draw(outcome: ReplayOutcome, trajectory: Trajectory, directory: Path) -> None:

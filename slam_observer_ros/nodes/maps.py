@@ -103,7 +103,7 @@ class Maps:
     def _warn_of_another(self, map_path: str) -> None:
         """Warn that the map of the end will take the place of one that is not loaded."""
         path = _absolute(map_path)
-        if self._autosave and path.exists() and path not in self._own_files:
+        if self._autosave and self._is_another(path):
             self._node.get_logger().warning(
                 f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
                 f'holds will be kept in {free_name(path).name}'
@@ -111,16 +111,17 @@ class Maps:
 
     def _keep(self, path: Path) -> str:
         """Keep a copy of a map that is not this node's own; return how to tell of it."""
-        if path in self._own_files:
-            return ''
         try:
-            if not path.exists():
+            if not self._is_another(path):
                 return ''
             backup = free_name(path)
             shutil.copy2(path, backup)
         except OSError as error:
             raise MapError(f"can't keep a copy of map {path}: {error.strerror}") from error
         return f'; what it held before is in {backup.name}'
+
+    def _is_another(self, path: Path) -> bool:
+        return path not in self._own_files and path.exists()
 
     def _answer_save(
         self, _request: Trigger.Request, response: Trigger.Response
