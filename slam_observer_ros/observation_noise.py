@@ -9,13 +9,16 @@ from slam_observer_ros.matrices import limited
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, Immutable
 
-RESOLUTION_M = 1e-6
-"""Standard deviation that no coordinate of an observed point falls short of, metres."""
+RESOLUTION_M = 1e-4
+"""Standard deviation that no coordinate of an observed point falls short of, metres.
+
+What claims to be better is lost in rounding beside a pose that is known to a kilometre.
+"""
 
 RELATIVE_RESOLUTION = 1e-6
 """The same as a share of the distance, for messages with points in single precision or better."""
 
-MAX_ERROR_M = 1e4
+MAX_ERROR_M = 1e3
 """Standard deviation of an observed point beyond which a message only says 'unknown', metres."""
 
 MIN_SHARE = 1e-6

@@ -15,7 +15,7 @@ from slam_observer_ros.matrices import limited
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray, IntArray
 
-MAX_POSE_ERRORS = np.repeat([np.pi, 1e4], 3)
+MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
 """Standard deviations of a pose that is told, rad and m, beyond which it is only 'unknown'."""
 
 
