@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 import logging
 
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
-from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import (
     landmark_errors,
     trajectory_errors,

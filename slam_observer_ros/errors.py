@@ -50,3 +50,15 @@ class MapError(SlamObserverError):
 
 class TransformError(SlamObserverError):
     """Two frames are not connected, or not at the time that is asked for."""
+
+
+class EvaluationError(SlamObserverError):
+    """A trajectory, its file or a pair of point sets can't be evaluated."""
+
+
+class UsageError(SlamObserverError):
+    """The command line asks for something that can't be done."""
+
+
+class OutputError(SlamObserverError):
+    """Some of what was asked for could not be written."""

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from strategies import generators, poses
 
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.evaluation import consistency, metrics
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
-from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.truth import LandmarkTruth

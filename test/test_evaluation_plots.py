@@ -13,10 +13,10 @@ from matplotlib.image import imread
 import numpy as np
 import pytest
 
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.evaluation import map_plot, replay_plots, simulation_plots
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.drawing import BLUE, GREEN, GREY, RED
-from slam_observer_ros.evaluation.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID

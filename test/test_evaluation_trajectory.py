@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tum_files import read_tum
 
-from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import (
     associate,
     interpolate,

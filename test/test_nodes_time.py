@@ -200,11 +200,12 @@ class AnotherClock:
         for child, pose in (('turret', se3.exp(angle * TURN)), ('tag_9', np.eye(4))):
             parent = 'base_link' if child == 'turret' else 'turret'
             self.transforms.insert(parent, child, stamp_ns, pose)
-        self.intake.add_velocity(Measurement('', VelocityEvent(stamp_ns, STILL)), received_ns)
+        self.intake.add('twist', Measurement('', VelocityEvent(stamp_ns, STILL)), received_ns)
         seen = se3.transform(se3.exp(-angle * TURN), np.array([[3.0, 1.0, 0.0]]))
         event = ObservationEvent(stamp_ns, np.array([4]), seen)
         self.intake.add_observation(Measurement('turret', event), received_ns)
-        self.intake.add_tags(TagDetections(stamp_ns, 'turret', (9,), ('none',)), received_ns + 1)
+        tags = TagDetections(stamp_ns, 'turret', (9,), ('none',))
+        self.intake.add('landmarks', tags, received_ns + 1)
 
     def send_all(self):
         for step in range(40):

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 import tempfile
 
-from slam_observer_ros.commands.errors import OutputError, UsageError
+from slam_observer_ros.errors import OutputError, UsageError
 from slam_observer_ros.output_files import destination
 
 

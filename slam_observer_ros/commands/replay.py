@@ -10,7 +10,6 @@ from pathlib import Path
 
 from slam_observer_ros.accuracy import trajectory_of
 from slam_observer_ros.commands.console import print_json, show_progress
-from slam_observer_ros.commands.errors import OutputError, UsageError
 from slam_observer_ros.commands.options import add_settings_options, find_config, read_settings
 from slam_observer_ros.commands.outputs import (
     add_force_option,
@@ -36,7 +35,7 @@ from slam_observer_ros.commands.replay_inputs import (
 )
 from slam_observer_ros.commands.replay_outcome import outcome_of, ReplayOutcome, with_smoothed
 from slam_observer_ros.commands.replay_report import as_json, print_summary
-from slam_observer_ros.errors import SlamObserverError
+from slam_observer_ros.errors import OutputError, SlamObserverError, UsageError
 from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.map_plot import plot_map
 from slam_observer_ros.evaluation.replay_plots import plot_errors, plot_residuals

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.commands.replay_outcome import unused_messages
 from slam_observer_ros.counts import MAX_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.errors import UsageError
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.maps.landmark_map import LandmarkMap

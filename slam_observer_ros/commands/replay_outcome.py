@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import logging
 
 from slam_observer_ros.accuracy import Accuracy, measure, measure_smoothed
-from slam_observer_ros.commands.errors import UsageError
+from slam_observer_ros.errors import UsageError
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.recording.reader import Recording

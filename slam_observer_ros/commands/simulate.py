@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.commands.console import print_json, print_table, show_progress
-from slam_observer_ros.commands.errors import UsageError
 from slam_observer_ros.commands.options import add_settings_options, read_settings, value_of
 from slam_observer_ros.commands.outputs import (
     add_force_option,
@@ -19,6 +18,7 @@ from slam_observer_ros.commands.outputs import (
     filled_directory,
     recording_path,
 )
+from slam_observer_ros.errors import UsageError
 from slam_observer_ros.evaluation.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.writer import RecordingWriter

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.geometry import se3

@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 import numpy as np
 
-from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.types import FloatArray
 
 BLUE, RED, GREEN, GREY = '#0072B2', '#D55E00', '#009E73', '#7F7F7F'

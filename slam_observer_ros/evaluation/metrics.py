@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.evaluation.alignment import align
-from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.matrices import transpose
 from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -100,7 +100,7 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
             f'{len(paired)} of its {len(estimate)} poses are at times that the truth covers, '
             f'where true poses are no more than {to_s(MAX_GAP_NS)} s apart; it takes {MIN_POSES}'
         )
-    alignment = align(paired.positions, true_paired.positions)
+    alignment = rigid_alignment(paired.positions, true_paired.positions)
     aligned = paired.moved(alignment)
     errors = pose_errors(aligned.poses, true_paired.poses)
     return TrajectoryErrors(aligned, true_paired, covered, alignment, errors)
@@ -173,5 +173,5 @@ def landmark_errors(
     if len(common) == 0:
         raise EvaluationError('no landmark is in both the estimated map and the true one')
     points, true_points = world_points[rows], truth.world_points[true_rows]
-    alignment = align(points, true_points)
+    alignment = rigid_alignment(points, true_points)
     return LandmarkErrors(common, alignment, se3.transform(alignment, points) - true_points)

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 import numpy as np
 
-from slam_observer_ros.evaluation.alignment import align
 from slam_observer_ros.evaluation.drawing import (
     BLUE,
     END,
@@ -28,6 +27,7 @@ from slam_observer_ros.evaluation.drawing import (
 )
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.types import FloatArray
 
 
@@ -122,7 +122,7 @@ def plot_configuration(
     """
     settled = slice(len(truth) // 2, None)
     known = np.isfinite(landmark_tracks[-1]).all(axis=-1)
-    correction = align(
+    correction = rigid_alignment(
         np.concatenate([estimate.positions[settled], landmark_tracks[-1, known]]),
         np.concatenate([truth.positions[settled], true_landmarks[known]]),
     )

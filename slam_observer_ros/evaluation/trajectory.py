@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.evaluation.errors import EvaluationError
+from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.geometry import paths, so3
 from slam_observer_ros.output_files import unfinished_file
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray

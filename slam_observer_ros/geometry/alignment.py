@@ -14,7 +14,9 @@ _ROUNDING = 1e-14
 """Offsets from the mean below this part of the largest coordinate are rounding."""
 
 
-def rigid_alignment(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
+def rigid_alignment(
+    source: FloatArray, target: FloatArray, weights: FloatArray | None = None
+) -> FloatArray:
     """Find the rigid motion that brings ``source`` closest to ``target`` in least squares.
 
     A proper rotation even where a reflection would fit better. What the points leave open stays
@@ -28,8 +30,8 @@ def rigid_alignment(source: FloatArray, target: FloatArray, weights: FloatArray)
         (n, 3) points to be moved, metres; at least one.
     target : FloatArray
         (n, 3) points to be met, in the same order, metres.
-    weights : FloatArray
-        (n,) how much each squared distance counts, positive.
+    weights : FloatArray, optional
+        (n,) how much each squared distance counts, positive; by default all the same.
 
     Returns
     -------
@@ -37,6 +39,7 @@ def rigid_alignment(source: FloatArray, target: FloatArray, weights: FloatArray)
         (4, 4) transform T with ``target ≈ T source``.
 
     """
+    weights = np.ones(len(source)) if weights is None else weights
     source_centre = np.average(source, axis=0, weights=weights)
     target_centre = np.average(target, axis=0, weights=weights)
     offsets = _offsets(source, source_centre)

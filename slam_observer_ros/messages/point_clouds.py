@@ -5,6 +5,7 @@ No Python object is made per point: a cloud of 1000 points costs microseconds, n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -172,6 +173,23 @@ def field_names(raw: Buffer, message_type: str) -> tuple[str, ...]:
         names.append(reader.string())
         reader.float32(reader.uint32())
     return tuple(names)
+
+
+def missing_ids(names: Sequence[str], message_type: str) -> str:
+    """Tell what there is instead of ids; empty if there are ids.
+
+    Parameters
+    ----------
+    names : sequence of str
+        From :func:`field_names`.
+    message_type : str
+        ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
+
+    """
+    if ID_NAME in names:
+        return ''
+    kind = 'fields' if message_type.endswith('PointCloud2') else 'channels'
+    return f'without ids; {kind} {" ".join(names) or "none"}'
 
 
 def _read_field(reader: CdrReader) -> CloudField:

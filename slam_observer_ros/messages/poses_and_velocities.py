@@ -125,7 +125,7 @@ def decode_odometry_twist(raw: Buffer, _receive_stamp_ns: int = 0) -> Measuremen
     return _read_odometry(raw)[1]
 
 
-def decode_odometry_pose(raw: Buffer) -> PoseMessage:
+def decode_odometry_pose(raw: Buffer, _receive_stamp_ns: int = 0) -> PoseMessage:
     """Decode the pose of a nav_msgs/Odometry."""
     return _checked(_read_odometry(raw)[0])
 
@@ -165,7 +165,7 @@ def decode_transforms(raw: Buffer) -> list[PoseMessage]:
     return messages
 
 
-def decode_imu(raw: Buffer) -> Measurement[AngularVelocityEvent]:
+def decode_imu(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[AngularVelocityEvent]:
     """Decode the angular velocity of a sensor_msgs/Imu.
 
     Raises

@@ -16,7 +16,7 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from std_msgs.msg import Float64
 from visualization_msgs.msg import MarkerArray
 
-from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.messages.cdr import CdrReader
 from slam_observer_ros.messages.point_clouds import decode_point_cloud, decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import (
@@ -124,12 +124,7 @@ class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
         """Return the estimated and the true poses at the stamps of those estimates."""
         truth = Trajectory.from_samples(self._true_stamps_ns, self._true_poses)
         estimate = Trajectory.from_samples(self._stamps_ns, self._poses)
-        true_poses, is_covered = interpolate(truth, estimate.stamps_ns)
-        stamps_ns = estimate.stamps_ns[is_covered]
-        return (
-            Trajectory(stamps_ns, estimate.poses[is_covered]),
-            Trajectory(stamps_ns, true_poses[is_covered]),
-        )
+        return associate(estimate, truth)[:2]
 
     def landmark_tracks(self, stamps_ns: list[int]) -> FloatArray:
         """Return the estimates (k, n, 3) of all true landmarks at k stamps, NaN where unknown."""

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.events import AngularVelocityEvent
 from slam_observer_ros.inputs.settings import AUTO, ON_TF
-from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_pose_array,
 )
-from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
@@ -31,7 +29,6 @@ from slam_observer_ros.messages.message_types import (
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
-    PoseMessage,
 )
 from slam_observer_ros.nodes.decoders import CloudDecoder, OdometryDecoder, TagDecoder
 from slam_observer_ros.nodes.inputs import Input
@@ -53,7 +50,7 @@ def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> l
     inputs = [_velocity_input(node, settings, intake), _landmark_input(node, settings, intake)]
     if settings.use_imu:
         qos = _qos(settings.twist_qos, settings.queue_depth)
-        inputs.append(Input(node, 'imu', {IMU: _decode_imu}, intake.add_imu, qos))
+        inputs.append(Input(node, 'imu', {IMU: decode_imu}, partial(intake.add, 'imu'), qos))
     return inputs
 
 
@@ -65,11 +62,12 @@ def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
                 f"velocity_type '{settings.velocity_type}' has no poses: with velocity_source "
                 "'pose_differences' it is 'Odometry' or 'auto'"
             )
-        return Input(node, 'twist', {ODOMETRY: _decode_odometry_pose}, intake.add_velocity, qos)
-    decoders = _chosen(
-        VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
-    )
-    return Input(node, 'twist', decoders, intake.add_velocity, qos)
+        decoders: dict[str, Any] = {ODOMETRY: decode_odometry_pose}
+    else:
+        decoders = _chosen(
+            VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
+        )
+    return Input(node, 'twist', decoders, partial(intake.add, 'twist'), qos)
 
 
 def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
@@ -78,7 +76,8 @@ def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
         decoder = TagDecoder(node, settings.tag_frame_prefix)
         return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos)
     if settings.landmarks_type == 'AprilTagDetectionArray':
-        return Input(node, 'landmarks', {APRILTAGS: decode_apriltags}, intake.add_tags, qos)
+        decoders: dict[str, Any] = {APRILTAGS: decode_apriltags}
+        return Input(node, 'landmarks', decoders, partial(intake.add, 'landmarks'), qos)
     if settings.landmarks_type == AUTO:
         # Not detections: their package, which need not be installed, would be imported unasked.
         decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
@@ -106,11 +105,3 @@ def _qos(reliability: str, depth: int) -> QoSProfile:
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,
     )
-
-
-def _decode_imu(raw: Buffer, _receive_ns: int) -> Measurement[AngularVelocityEvent]:
-    return decode_imu(raw)
-
-
-def _decode_odometry_pose(raw: Buffer, _receive_ns: int) -> PoseMessage:
-    return decode_odometry_pose(raw)

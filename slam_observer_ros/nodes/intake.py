@@ -22,12 +22,11 @@ from slam_observer_ros.inputs.event_builder import (
     DropError,
     EventBuilder,
     Measured,
+    with_receive_time,
 )
 from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.measurement import AnyMeasurement, Measurement
+from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_trouble
-from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.nodes.clock_offset import ClockOffset
 from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.units import to_ns
@@ -98,15 +97,16 @@ class Intake:
         self.is_active = False
         self.is_paused = False
 
-    def add_velocity(
-        self, measured: Measurement[VelocityEvent] | PoseMessage, receive_ns: int
-    ) -> None:
-        """Take a velocity, or an odometry's pose, of which the differences are used."""
-        self._build_timed(measured, 'twist', receive_ns)
-
-    def add_imu(self, measured: Measurement[AngularVelocityEvent], receive_ns: int) -> None:
-        """Take an angular velocity."""
-        self._build_timed(measured, 'imu', receive_ns)
+    def add(self, source: str, measured: Measured, receive_ns: int) -> None:
+        """Take what an input measures; without a stamp it has that of its reception."""
+        timed = with_receive_time(measured, receive_ns)
+        if not self._is_usable(source, timed.stamp_ns, receive_ns):
+            return
+        if timed is not measured:
+            text = f'stamps are zero on {source}: the time of reception is taken instead'
+            self._warn(f'stamps of {source}', text)
+        for event in self._builder.add(timed, time.monotonic_ns()):
+            self._use(event)
 
     def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
         """Take landmarks, unless they are a lidar's scan."""
@@ -114,7 +114,7 @@ class Intake:
         if self.is_active and trouble:
             self._drop('scan', trouble)
         else:
-            self._build_timed(measured, 'landmarks', receive_ns)
+            self.add('landmarks', measured, receive_ns)
 
     def add_observations(
         self, measured: Sequence[Measurement[ObservationEvent]], receive_ns: int
@@ -122,11 +122,6 @@ class Intake:
         """Take landmarks of several cameras."""
         for one in measured:
             self.add_observation(one, receive_ns)
-
-    def add_tags(self, message: TagDetections, receive_ns: int) -> None:
-        """Take fiducials whose positions are on /tf, at the stamps of their message there."""
-        if self._is_usable('landmarks', message.stamp_ns, receive_ns):
-            self._build(message)
 
     def retry(self) -> None:
         """Try again what waits for a transform; call it often."""
@@ -159,10 +154,6 @@ class Intake:
         self._processing_s, self._processed = 0.0, 0
         return mean_s * 1e3
 
-    def _build(self, measured: Measured) -> None:
-        for event in self._builder.add(measured, time.monotonic_ns()):
-            self._use(event)
-
     def _use(self, event: Event) -> None:
         stamp_ns = event.stamp_ns
         if self._settings.correct_clock_offset:
@@ -178,18 +169,6 @@ class Intake:
         is_unplaced = isinstance(error, TransformError)
         why = f"no transform to '{self._settings.base_frame}': " if is_unplaced else ''
         self._drop(drop_reason(error), f'{why}{error}')
-
-    def _build_timed(
-        self, measured: AnyMeasurement | PoseMessage, source: str, receive_ns: int
-    ) -> None:
-        """Use a measurement of an input; without a stamp it has that of its reception."""
-        stamp_ns = measured.stamp_ns or receive_ns
-        if not self._is_usable(source, stamp_ns, receive_ns):
-            return
-        if not measured.stamp_ns:
-            text = f'stamps are zero on {source}: the time of reception is taken instead'
-            self._warn(f'stamps of {source}', text)
-        self._build(measured.with_stamp(stamp_ns))
 
     def _is_usable(self, source: str, stamp_ns: int, receive_ns: int) -> bool:
         if not self.is_active:

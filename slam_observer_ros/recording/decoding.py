@@ -8,10 +8,11 @@ from functools import partial
 from typing import TypeAlias
 
 from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.inputs.event_builder import Measured
 from slam_observer_ros.inputs.settings import InputSettings, POSE_DIFFERENCES
-from slam_observer_ros.messages.detections import decode_apriltags, observed_tags, TagDetections
+from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.messages.detections import decode_apriltags, observed_tags
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
@@ -44,17 +45,17 @@ _OBSERVATION_DECODERS = CLOUD_DECODERS | DETECTION_DECODERS
 def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topic, Decode]:
     """Return how each of the estimator's topics is decoded."""
     decoders: dict[Topic, Decode] = {
-        selected.velocity: _velocity,
+        selected.velocity: _one(VELOCITY_DECODERS[selected.velocity.message_type]),
         selected.landmarks: _landmarks,
     }
     if inputs.velocity_source == POSE_DIFFERENCES:
-        decoders[selected.velocity] = _odometry_pose
+        decoders[selected.velocity] = _one(decode_odometry_pose)
     if selected.landmarks.message_type == TRANSFORMS:
         decoders[selected.landmarks] = partial(_tags_on_tf, inputs.tag_frame_prefix)
     elif selected.landmarks.message_type == APRILTAGS:
-        decoders[selected.landmarks] = _tags
+        decoders[selected.landmarks] = _one(decode_apriltags)
     if selected.imu is not None:
-        decoders[selected.imu] = _imu
+        decoders[selected.imu] = _one(decode_imu)
     return decoders
 
 
@@ -74,16 +75,8 @@ def decode_transform_message(raw: RawMessage) -> list[PoseMessage]:
     return decode_transforms(raw.data)
 
 
-def _velocity(raw: RawMessage) -> list[Measurement[VelocityEvent]]:
-    return [VELOCITY_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)]
-
-
-def _odometry_pose(raw: RawMessage) -> list[PoseMessage]:
-    return [decode_odometry_pose(raw.data)]
-
-
-def _imu(raw: RawMessage) -> list[Measurement[AngularVelocityEvent]]:
-    return [decode_imu(raw.data)]
+def _one(decode: Callable[[Buffer, int], Measured]) -> Decode:
+    return lambda raw: [decode(raw.data, raw.receive_stamp_ns)]
 
 
 def _landmarks(raw: RawMessage) -> list[Measurement[ObservationEvent]]:
@@ -92,10 +85,6 @@ def _landmarks(raw: RawMessage) -> list[Measurement[ObservationEvent]]:
     if trouble:
         raise RecordingError(f'{raw.topic}: {trouble}')
     return [message]
-
-
-def _tags(raw: RawMessage) -> list[TagDetections]:
-    return [decode_apriltags(raw.data)]
 
 
 def _tags_on_tf(tag_frame_prefix: str, raw: RawMessage) -> list[Measurement[ObservationEvent]]:

@@ -26,7 +26,6 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.cloud_ids import missing_ids
 from slam_observer_ros.messages.detections import no_tags
 from slam_observer_ros.messages.message_types import (
     CLOUD_DECODERS,
@@ -35,7 +34,7 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
 )
 from slam_observer_ros.messages.point_cloud_layout import ID_NAME
-from slam_observer_ros.messages.point_clouds import field_names
+from slam_observer_ros.messages.point_clouds import field_names, missing_ids
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_landmarks,
