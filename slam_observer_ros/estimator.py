@@ -24,6 +24,7 @@ from slam_observer_ros.maps.map_frame import MapFrame
 from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.parameters import checked, table
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam import covariances
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
@@ -32,9 +33,6 @@ from slam_observer_ros.usable_points import usable_points
 from slam_observer_ros.validation import check_event, check_map, check_pose
 
 logger = logging.getLogger(__name__)
-
-MANY_LANDMARKS = 1000
-"""Landmarks from which on Riccati gains take too long for most sensors."""
 
 
 class Estimator:
@@ -54,27 +52,19 @@ class Estimator:
         Called with an :class:`Update` after each observation that was used.
     on_stamp : callable, optional
         Called when all events of a stamp have been used: before the first one of a later stamp
-        or after a jump of the clock, and by :meth:`flush`.
+        or after a jump of the clock that holds the pose, and by :meth:`flush`.
     on_motion : callable, optional
         Called with the velocities and two stamps, nanoseconds, before the state is moved on along
         them from one to the other.
 
     Attributes
     ----------
-    counts : Counter
-        Events used, by kind (``'velocity'``, ``'observation'``), those of them that came late
-        (``'late_velocity'``, ``'late_observation'``), points in observations
-        (``'observed_point'``), observations made before the place in a loaded map was found
-        (``'not_localised'``), how often it was lost again (``'lost'``), how often the robot was
-        not where odometry had it (``'slip'``) or nothing in view, without ids, where the map has
-        it (``'strange_place'``), and what became of landmarks
-        (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``,
-        ``'repeated_id'`` and ``'reserved_id'``, which are not used).
     dropped : Counter
         Events refused, by reason.
     jumps : int
         How often the clock has jumped.
+    last_update : Update or None
+        The latest update; None before the first observation.
 
     Raises
     ------
@@ -96,7 +86,7 @@ class Estimator:
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
         self._warnings = EventWarnings()
-        self._last: Update | None = None
+        self.last_update: Update | None = None
         self._on_update, self._on_stamp, self._on_motion = on_update, on_stamp, on_motion
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
@@ -276,7 +266,18 @@ class Estimator:
 
     @property
     def counts(self) -> Counter[str]:
-        """How many events were used, by kind, and what befell the landmarks in them."""
+        """How many events were used, by kind, and what befell the landmarks in them.
+
+        Events used (``'velocity'``, ``'observation'``), those of them that came late
+        (``'late_velocity'``, ``'late_observation'``), points in observations
+        (``'observed_point'``), observations made before the place in a loaded map was found
+        (``'not_localised'``), how often it was lost again (``'lost'``), how often the robot was
+        not where odometry had it (``'slip'``) or nothing in view, without ids, where the map has
+        it (``'strange_place'``), and what became of landmarks
+        (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``,
+        ``'repeated_id'`` and ``'reserved_id'``, which are not used).
+        """
         return self._counts + self._frame.counts
 
     @property
@@ -334,7 +335,7 @@ class Estimator:
 
     @property
     def body_velocity(self) -> FloatArray:
-        """(6,) newest velocity (Ω, v) as it is calibrated; zero when it has timed out.
+        """(6,) newest velocity (Ω, v), calibrated, rad/s and m/s; zero when it has timed out.
 
         It is that of ``stamp_ns``, unless a delay is calibrated: then a little before or after.
         """
@@ -366,8 +367,8 @@ class Estimator:
     @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
-        covariances = self._slam.landmark_covariances
-        return None if covariances is None else covariances[self._slam.confirmed]
+        of_all = self._slam.landmark_covariances
+        return None if of_all is None else of_all[self._slam.confirmed]
 
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
@@ -376,7 +377,9 @@ class Estimator:
         the state, which is moved on at observations: ask for it in ``on_update``. ``rows`` (m,)
         are places in ``landmark_ids``. None where the gains know none.
         """
-        return self._slam.configuration_covariance(self._slam.confirmed[rows])
+        slam = self._slam
+        seen_rows = slam.confirmed[rows]
+        return covariances.of_configuration(slam.observer, slam.gains, slam.axes, seen_rows)
 
     @property
     def landmark_velocities(self) -> FloatArray:
@@ -391,14 +394,9 @@ class Estimator:
         return gains.calibration.estimates(gains.calibration_variances)
 
     @property
-    def last_update(self) -> Update | None:
-        """The latest update; None before the first observation."""
-        return self._last
-
-    @property
     def lyapunov(self) -> float:
         """L (34) of the latest observation's residuals; zero before the first."""
-        return 0.0 if self._last is None else self._last.lyapunov
+        return 0.0 if self.last_update is None else self.last_update.lyapunov
 
     @property
     def _slam(self) -> Slam:
@@ -438,24 +436,20 @@ class Estimator:
 
     def _process_observation(self, event: ObservationEvent) -> None:
         event = usable_points(event, self.settings, self._counts, self._warnings)
-        timeline = self._timeline
-        timeline.begin(event.stamp_ns)
-        if event.stamp_ns < (timeline.state_ns or 0):
-            event = timeline.carry_forward(event, self._slam)
-            self._counts['late_observation'] += 1
-        timeline.advance(self._frame.states, event.stamp_ns)
+        stamp_ns = event.stamp_ns
+        event = self._timeline.meet(event, self._frame.states)
+        self._counts['late_observation'] += event.stamp_ns > stamp_ns
         if 0 < self.settings.max_landmarks < len(event.ids) and self._slam.is_mapping:
             self._warnings.more_than_max(len(event.ids), self.settings.max_landmarks)
-        outcome = self._frame.states.observe(event)
+        outcome = self._frame.observe(event)
         if len(outcome.moved_ids):
             self._warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
         self._warnings.lost_places(self._frame.counts)
         self._counts['observation'] += 1
-        if len(self._slam.landmarks) >= MANY_LANDMARKS and self.settings.gains == 'riccati':
+        if self.settings.gains == 'riccati':
             self._warnings.large_map(len(self._slam.landmarks))
-        self._frame.find_place(outcome)
         observer = self._slam.observer
-        self._last = Update(
+        self.last_update = Update(
             event.stamp_ns,
             observer.pose,
             outcome.ids,
@@ -464,7 +458,7 @@ class Estimator:
             lyapunov(self.settings.gain_k, outcome.residuals),
         )
         if self._on_update is not None:
-            self._on_update(self._last)
+            self._on_update(self.last_update)
 
     def _catch_up(self) -> None:
         """Move the states on to the last event that was used."""
@@ -474,7 +468,7 @@ class Estimator:
     def _begin(self) -> None:
         """Wait for the first event."""
         self._forget_time()
-        self._last = None
+        self.last_update = None
 
     def _forget_time(self) -> None:
         """Forget all that has a stamp but the map."""

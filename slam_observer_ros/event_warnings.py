@@ -16,6 +16,9 @@ logger = logging.getLogger(__name__)
 MAX_NAMED = 10
 """Ids that a warning lists at most."""
 
+MANY_LANDMARKS = 1000
+"""Landmarks from which on Riccati gains take too long for most sensors."""
+
 MANY_MOVED = 5
 """Landmarks that seem to have moved lately from which on the odometry may be at fault."""
 
@@ -66,8 +69,8 @@ class EventWarnings:
         self._warn('unknown_id', text)
 
     def large_map(self, count: int) -> None:
-        """Tell once that Riccati gains are slow on a map of so many landmarks."""
-        if not self._counts['large_map']:
+        """Tell once that Riccati gains are slow if a map has so many landmarks."""
+        if count >= MANY_LANDMARKS and not self._counts['large_map']:
             self._counts['large_map'] = 1
             logger.warning(
                 'The map has %d landmarks, and the time that riccati gains take grows with their '
@@ -84,14 +87,16 @@ class EventWarnings:
     def moved_landmarks(self, ids: IntArray, stamp_ns: int) -> None:
         """Tell that landmarks are not any more where they were, and if many are so at a time."""
         self._warn('moved_landmark', f'Landmarks {ids.tolist()} have moved')
-        self._moved_ns |= dict.fromkeys(ids.tolist(), stamp_ns)
-        lately = sum(stamp_ns - moved_ns < MOVED_LATELY_NS for moved_ns in self._moved_ns.values())
-        if lately >= MANY_MOVED:
-            self._moved_ns.clear()
+        moved_ns = self._moved_ns | dict.fromkeys(ids.tolist(), stamp_ns)
+        # Those after this stamp are from before a jump of the clock.
+        lately = {i: t for i, t in moved_ns.items() if 0 <= stamp_ns - t < MOVED_LATELY_NS}
+        self._moved_ns = lately
+        if len(lately) >= MANY_MOVED:
+            self._moved_ns = {}
             text = (
-                f'{lately} landmarks seem to have moved within a minute: odometry may err by more '
-                'than its noise allows. Let its bias and scale be estimated (angular_bias_error '
-                'and the like)'
+                f'{len(lately)} landmarks seem to have moved within a minute: odometry may err by '
+                'more than its noise allows. Let its bias and scale be estimated '
+                '(angular_bias_error and the like)'
             )
             self._warn('many_moved', text)
 

@@ -131,15 +131,14 @@ class Observer:
         self.y_ref[rows] = se3.transform(self.A, points)
         self.a[rows] = self.u[rows] = 0.0
 
-    def hold_landmarks(self, y_ref: FloatArray) -> None:
+    def fix_landmarks(self, y_ref: FloatArray) -> None:
         """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest."""
-        self.rebase(self.A, y_ref)
+        self.rebase(y_ref)
         self.u = np.zeros_like(y_ref)
         self.have_moved = False
 
-    def rebase(self, A: FloatArray, y_ref: FloatArray) -> None:
-        """Take Â (4, 4) and the landmarks (n, 3) as they are for the reference, with â_i = 0."""
-        self.A = A
+    def rebase(self, y_ref: FloatArray) -> None:
+        """Put the landmarks at ``y_ref`` (n, 3), reference frame, with â_i = 0."""
         self.y_ref = y_ref
         self.a = np.zeros_like(y_ref)
 

@@ -221,7 +221,7 @@ class Simulation:
         return heapq.merge(motion, sightings, key=lambda entry: entry[0])
 
     def _stamps(self, rate_hz: float) -> Iterator[int]:
-        end_ns = self.scenario.end_s * NANOSECONDS_PER_SECOND
+        end_ns = self.scenario.end_s * NANOSECONDS_PER_SECOND + 0.5  # as stamps are rounded
         step = 0
         while (elapsed_ns := round(step * NANOSECONDS_PER_SECOND / rate_hz)) <= end_ns:
             yield self.start_ns + elapsed_ns

@@ -70,7 +70,7 @@ class Timeline:
             self.state_ns = stamp_ns
 
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
-        """Add a velocity; return whether it leads on from its stamp, or waits for its linear part.
+        """Add a velocity; return whether it is in force: an angular one waits for a linear one.
 
         Where a newer event was used before it, it leads on from there.
 
@@ -114,13 +114,21 @@ class Timeline:
         self.velocities.forget_before(stamp_ns - self._kept_ns)
         self.state_ns = stamp_ns
 
+    def meet(self, event: ObservationEvent, states: Hypotheses) -> ObservationEvent:
+        """Move the states on to an observation, or it to them if it is late; return it."""
+        self.begin(event.stamp_ns)
+        if event.stamp_ns < (self.state_ns or 0):
+            event = self._carried_forward(event, states.best)
+        self.advance(states, event.stamp_ns)
+        return event
+
     def motion(self, calibration: Calibration, start_ns: int, end_ns: int) -> FloatArray:
         """Return how the body moves (4, 4) between two stamps, backwards if need be."""
         if end_ns < start_ns:
             return se3.inverse(self.motion(calibration, end_ns, start_ns))
         return transition(self.velocities, calibration, start_ns, end_ns)
 
-    def carry_forward(self, event: ObservationEvent, slam: Slam) -> ObservationEvent:
+    def _carried_forward(self, event: ObservationEvent, slam: Slam) -> ObservationEvent:
         """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
 
         Its points are as uncertain as they were, and as that motion makes them. Its error is one

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 
-from slam_observer_ros import estimator as estimator_module
+from slam_observer_ros import event_warnings
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.counts import used_points
 from slam_observer_ros.errors import MapError, ParameterError
@@ -176,10 +176,11 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_
     turning = np.array([0.0, 0.0, 1e-9, 0.0, 0.0, 0.0])
     for step in range(21):
         timeline.append(velocity(0.1 * step, turning))
-    timeline.advance(Hypotheses(slam, settings), START_NS + 2 * 10**9)
+    states = Hypotheses(slam)
+    timeline.advance(states, START_NS + 2 * 10**9)
     given_m2 = 0.01 * np.eye(3)[None] if are_given else None
     event = ObservationEvent(START_NS + 10**9, np.array([1]), np.array([[5.0, 0, 0]]), given_m2)
-    carried = timeline.carry_forward(event, slam)
+    carried = timeline.meet(event, states)
     expected = np.diag([0.01 + 0.3**2, 0.01 + (5.0 * 0.2) ** 2, 0.01])
     np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
 
@@ -349,14 +350,19 @@ def test_points_with_ids_that_are_kept_for_others_are_left_out_counted_and_named
 
 
 def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
-    asked = {'landmark_velocity_error': 0.1, 'linear_bias_error': (0.2, 0.0, 0.0)}
+    asked = {
+        'landmark_velocity_error': 0.1,
+        'linear_bias_error': (0.2, 0.0, 0.0),
+        'calibration_drift': 0.1,
+    }
     Estimator(Settings(gains='riccati', **asked))
     assert not caplog.records
     Estimator(Settings(gains='scheduled', **asked)).reset()
     Estimator(Settings(gains='constant', **asked))
     assert caplog.messages == [
         'No effect on scheduled gains: landmark_velocity_error.',
-        'No effect on constant gains: linear_bias_error, landmark_velocity_error.',
+        'No effect on constant gains: linear_bias_error, calibration_drift, '
+        'landmark_velocity_error.',
     ]
 
 
@@ -371,9 +377,17 @@ def test_where_many_landmarks_seem_to_move_the_odometry_is_named(caplog):
     assert told[0].startswith('5 landmarks seem to have moved within a minute: odometry may err')
 
 
+def test_landmarks_that_moved_before_a_jump_of_the_clock_did_not_move_lately(caplog):
+    warnings = event_warnings.EventWarnings()
+    for landmark_id in range(event_warnings.MANY_MOVED):
+        stamp_s = 1000 - 200 * landmark_id
+        warnings.moved_landmarks(np.array([landmark_id]), stamp_s * 10**9)
+    assert 'seem to have moved' not in caplog.text
+
+
 @pytest.mark.parametrize('gains', GAINS)
 def test_a_map_too_large_for_riccati_gains_is_told_once(caplog, monkeypatch, gains):
-    monkeypatch.setattr(estimator_module, 'MANY_LANDMARKS', 5)
+    monkeypatch.setattr(event_warnings, 'MANY_LANDMARKS', 5)
     run([observation(0.1 * step) for step in range(5)], gains=gains)
     told = [message for message in caplog.messages if 'The map has 5 landmarks' in message]
     assert len(told) == (gains == 'riccati')

@@ -159,7 +159,9 @@ class TestPoses:
         for transform in decoded:
             np.testing.assert_allclose(transform.pose, self.EXPECTED, atol=1e-15)
 
-    @pytest.mark.parametrize('quaternion', [[0.0] * 4, [np.nan] * 4, [0.0, 0.0, 0.0, 2.0]])
+    @pytest.mark.parametrize(
+        'quaternion', [[0.0] * 4, [np.nan] * 4, [0.0, 0.0, 0.0, 2.0], [1e200] * 4]
+    )
     def test_quaternion_that_is_no_rotation_is_refused(self, quaternion):
         pose = ros.pose(self.POSITION, quaternion)
         raw = ros.serialise(ros.make('geometry_msgs/msg/PoseStamped', ros.header('map'), pose))

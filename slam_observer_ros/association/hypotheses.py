@@ -55,15 +55,13 @@ class Hypotheses:
     ----------
     slam : Slam
         The state at the start.
-    settings : Settings
-        ``max_hypotheses``.
 
     """
 
-    def __init__(self, slam: Slam, settings: Settings) -> None:
+    def __init__(self, slam: Slam) -> None:
         self._states = [slam]
         self._costs = [0.0]
-        self._limit = settings.max_hypotheses
+        self._limit = slam.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._doubt: FloatArray | None = None

@@ -122,7 +122,7 @@ class GainDesign:
     calibration : Calibration
         Scale, bias and delay of the velocity, as far as they are known.
     ignores : tuple of str
-        Settings that have no effect on the design if they are above zero.
+        Settings without effect on the design; a warning names those that are not zero.
 
     """
 
@@ -170,7 +170,7 @@ class GainDesign:
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Account for landmarks from a map with ``covariances`` (m, 3, 3), reference frame, m²."""
 
-    def held(self, landmark_covariances: FloatArray) -> GainDesign:
+    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> GainDesign:
         """Return gains that know what these do, and never move a landmark again.
 
         ``landmark_covariances`` (n, 3, 3), reference frame, m², are what a map says of all

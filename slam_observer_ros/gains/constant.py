@@ -53,22 +53,20 @@ class ConstantGains(GainDesign):
         'angular_bias_error',
         'linear_bias_error',
         'velocity_delay_error',
+        'calibration_drift',
         'landmark_velocity_error',
         'observation_error_time',
     )
 
     def __init__(self, settings: Settings) -> None:
         self._axes = axes_of(settings.two_d_mode)
-        self._is_held = False
+        self._settings = settings
+        self._is_fixed = False
         self.calibration = Calibration(Settings(), self._axes)
-        self.change_settings(settings)
 
     def change_settings(self, settings: Settings) -> None:
         """Take over k, l and the step mode."""
-        self.gain_k = settings.gain_k
-        self.gain_l = 0.0 if self._is_held else settings.gain_l
-        self.step_mode = settings.step_mode
-        self.max_time_s = settings.max_innovation_time
+        self._settings = settings
 
     def anchor(
         self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
@@ -76,22 +74,23 @@ class ConstantGains(GainDesign):
         """Return the correction that puts the known landmarks where they are known to be."""
         return Correction(np.eye(4), rows, -r)
 
-    def held(self, landmark_covariances: FloatArray) -> ConstantGains:
+    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> ConstantGains:
         """Return these gains with l = 0."""
-        self._is_held = True
-        self.gain_l = 0.0
+        self._is_fixed = True
         return self
 
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return the correction; all points seen take part."""
-        k = np.full(len(residuals.r), self.gain_k)
-        step_on = paper_step if self.step_mode == 'paper' else centroid_step
+        settings = self._settings
+        gain_l = 0.0 if self._is_fixed else settings.gain_l
+        k = np.full(len(residuals.r), settings.gain_k)
+        step_on = paper_step if settings.step_mode == 'paper' else centroid_step
         step = partial(step_on, axes=self._axes)
-        dt_s = np.minimum(residuals.dt_s, self.max_time_s)
+        dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)
         # One time for the pose: were the r_i to act for different ones, L (34) might grow.
         D = safe_step(step, k, residuals.e, residuals.r, float(np.mean(dt_s)))  # (30)
         remaining = se3.transform(D, residuals.e) - residuals.e + residuals.r
-        shares = -np.expm1(-self.gain_l / self.gain_k * dt_s)
+        shares = -np.expm1(-gain_l / settings.gain_k * dt_s)
         d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
         return Correction(D, residuals.rows, d), np.ones(len(k))
 

@@ -96,7 +96,7 @@ class FullMapGains(RiccatiGains):
         self._hindsight.history.relocate_landmarks(rows)
         self._joint.place_seen(rows, y_ref, covariances)
 
-    def held(self, landmark_covariances: FloatArray) -> FixedMapGains:
+    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> FixedMapGains:
         """Return gains that know pose and calibration as well, and never move a landmark."""
         return FixedMapGains(self._settings, self.calibration, self._joint, landmark_covariances)
 

@@ -197,7 +197,8 @@ class Hindsight:
         something of the gauge, of which nothing is known; settling carries it over.
         """
         start, end = step.start, step.end
-        observer.rebase(start.poses[-1], start.points)
+        observer.A = start.poses[-1]
+        observer.rebase(start.points)
         self._joint.P = covariance
         self._joint.P = self._joint.with_pose_error_by(observer.A)
         self._calibration.shift(end.calibration - self._calibration.values)

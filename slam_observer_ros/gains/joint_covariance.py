@@ -139,7 +139,7 @@ class JointCovariance:
         if not observer.a.any():
             return
         self.turn(self.map_columns, observer.a)
-        observer.rebase(observer.A, observer.points)
+        observer.rebase(observer.points)
 
     def with_pose_error_by(self, A: FloatArray) -> FloatArray:
         """Return the covariance of Ad_A ε and all else."""

@@ -144,7 +144,7 @@ class ScheduledGains(GainDesign):
         self._leaves.update(everything, F, N)
         return self._as_correction(everything, -x[z], shifts, observer.a)
 
-    def held(self, landmark_covariances: FloatArray) -> ScheduledGains:
+    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> ScheduledGains:
         """Return these gains with all landmarks taken for exact."""
         count, k = len(landmark_covariances), self._axes.point
         self._core.remove(np.arange(len(self._leaves)))

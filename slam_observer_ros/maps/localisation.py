@@ -193,25 +193,25 @@ def _complete(slam: Slam, known: LandmarkMap) -> None:
     new = known.select(slam.landmarks.rows_of(known.ids) < 0)
     y_ref, covariances = _in_reference_frame(slam, new)
     observer.add_reference_landmarks(y_ref)
-    observer.rebase(observer.A, observer.points)
+    observer.rebase(observer.points)
     # A surveyed landmark needs no observation to be believed.
     slam.landmarks.add_known(new.ids, np.maximum(new.counts, settings.confirmations))
     slam.is_mapping = settings.localization_mode == 'off'
     if settings.localization_mode == 'fixed':
-        _hold(slam, known)
+        _fix(slam, known)
     else:
         slam.gains.add_known_landmarks(covariances)
     slam.gains.restart(observer, 'the place in the loaded map was found')
 
 
-def _hold(slam: Slam, known: LandmarkMap) -> None:
+def _fix(slam: Slam, known: LandmarkMap) -> None:
     """Put the landmarks exactly where the map has them, and leave them there."""
     order = np.argsort(known.ids)
     rows = order[np.searchsorted(known.ids, slam.landmarks.ids, sorter=order)]
     y_ref, covariances = _in_reference_frame(slam, known.select(rows))
-    slam.observer.hold_landmarks(y_ref)
-    slam.gains = slam.gains.held(covariances)
-    slam.is_held = True
+    slam.observer.fix_landmarks(y_ref)
+    slam.gains = slam.gains.with_fixed_landmarks(covariances)
+    slam.is_fixed = True
 
 
 def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:

@@ -8,6 +8,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.association.hypotheses import Hypotheses
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.localisation import (
@@ -62,7 +63,7 @@ class MapFrame:
         self.settings = settings
         self.loaded: LandmarkMap | None = None
         self.is_localised = True
-        self.states = Hypotheses(Slam(settings, np.eye(4)), settings)
+        self.states = Hypotheses(Slam(settings, np.eye(4)))
         self._counts: Counter[str] = Counter()
         self._trial: PoseTrial | None = None
         self._start_pose: FloatArray | None = None
@@ -139,7 +140,7 @@ class MapFrame:
         """
         self._counts += self.slam.counts
         slam = Slam(self.settings, np.eye(4) if pose is None else self._allowed(pose))
-        self.states = Hypotheses(slam, self.settings)
+        self.states = Hypotheses(slam)
         self._begin_search()
         self.is_localised = self.loaded is None or pose is not None
         self._trial = None
@@ -181,11 +182,16 @@ class MapFrame:
         else:
             self._start(pose, covariance)
 
-    def find_place(self, outcome: Outcome) -> None:
-        """Find the place in the loaded map if it is not known, or not any more.
+    def observe(self, event: ObservationEvent) -> Outcome:
+        """Use an observation made at the states' instant; return what the best one makes of it.
 
-        ``outcome`` is what the most likely state has made of an observation right now.
+        The place in a loaded map is then looked for if it is not known, or not any more.
         """
+        outcome = self.states.observe(event)
+        self._find_place(outcome)
+        return outcome
+
+    def _find_place(self, outcome: Outcome) -> None:
         if self.loaded is None:
             return
         often = self.settings.max_rejections

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -235,7 +236,7 @@ def _checked(message: PoseMessage) -> PoseMessage:
 
 def _turn_trouble(quaternion: FloatArray) -> str:
     """Return why a quaternion is no rotation; empty if it is one."""
-    norm = float(np.linalg.norm(quaternion))
+    norm = math.hypot(*quaternion)  # which does not overflow
     # Written so that NaN is refused too.
     is_turn = abs(norm - 1.0) < _QUATERNION_NORM_TOLERANCE
     return '' if is_turn else f'quaternion of norm {norm:.3g}, not 1'

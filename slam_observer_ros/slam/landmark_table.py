@@ -126,7 +126,7 @@ class LandmarkTable:
     def are_rejected_again(
         self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray
     ) -> BoolArray:
-        """Return which rows (m,) were last rejected, and within what :meth:`reject` allows."""
+        """Return which rows (m,) were rejected the last time, and at the same place."""
         shifts_m = np.linalg.norm(world_points - self._rejected_at[rows], axis=1)
         return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
 

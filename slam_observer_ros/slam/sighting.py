@@ -8,11 +8,15 @@ import numpy as np
 
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.gains.base import Residuals, Seen
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.landmark_table import LandmarkTable
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+SAME_PLACE = 4.0
+"""Rejections within this many standard deviations of each other are at one place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +33,6 @@ class Sighting:
         (m,) which are not new.
     covariances : FloatArray
         (m, 3, 3) their covariances, body frame, m².
-    dt_s : FloatArray
-        (m,) seconds since each was seen before; infinite if it is new.
     residuals : Residuals
         Of those that are not new.
     left_out : dict
@@ -43,7 +45,6 @@ class Sighting:
     rows: IntArray
     known: BoolArray
     covariances: FloatArray
-    dt_s: FloatArray
     residuals: Residuals
     left_out: dict[str, int]
 
@@ -98,14 +99,12 @@ class Outlook:
         self._settings = settings
 
     def sighting(
-        self, event: ObservationEvent, rows: IntArray, known: BoolArray, left_out: dict[str, int]
+        self, event: ObservationEvent, rows: IntArray, left_out: dict[str, int]
     ) -> Sighting:
-        """Return what the points of ``event`` tell, which are the ``known`` of ``rows`` (m,)."""
-        covariances = self._covariances(event, rows)
+        """Return what the points of ``event`` tell, of landmarks ``rows`` (m,)."""
+        known, covariances = rows >= 0, self._covariances(event, rows)
         residuals = self.residuals(event.select(known), rows[known], covariances[known])
-        dt_s = np.full(len(rows), np.inf)
-        dt_s[known] = residuals.dt_s
-        return Sighting(event, rows, known, covariances, dt_s, residuals, left_out)
+        return Sighting(event, rows, known, covariances, residuals, left_out)
 
     def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
@@ -122,11 +121,19 @@ class Outlook:
             self._landmarks.unseen_s(rows, event.stamp_ns),
         )
 
-    def seen(self, event: ObservationEvent, rows: IntArray, dt_s: FloatArray) -> Seen:
-        """Return what there is to look back at later; ``dt_s`` (m,) is that of the sighting."""
+    def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:
+        """Return what there is to look back at later, after the correction."""
         sights = self._sights(event, rows)
         stated = None if event.covariances is None else self._noise.covariances(event, sights)
+        dt_s = self._landmarks.unseen_s(rows, event.stamp_ns)
         return Seen(event.stamp_ns, rows, event.points, sights, stated, dt_s)
+
+    def places(
+        self, event: ObservationEvent, residuals: Residuals
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return where points seem to be (m, 3), world, and within what they are at one place."""
+        spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
+        return se3.transform(self._observer.pose, event.points), SAME_PLACE * spread_m
 
     def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return the covariances (m, 3, 3) of observed points, body frame, m².

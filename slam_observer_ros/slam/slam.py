@@ -26,9 +26,6 @@ from slam_observer_ros.slam.sighting import Outcome, Outlook, Sighting
 from slam_observer_ros.slam.surroundings import Surroundings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
-SAME_PLACE = 4.0
-"""Rejections within this many standard deviations of each other are at one place."""
-
 
 class Slam:
     """Pose and map as of one instant, with the life cycle of the landmarks.
@@ -52,7 +49,7 @@ class Slam:
         Ids and counts of the n known landmarks.
     is_mapping : bool
         Whether landmarks are added, and taken to have moved if they are rejected too often.
-    is_held : bool
+    is_fixed : bool
         Whether the landmarks are those of a map that is exact, and at rest.
     motion_noise : MotionNoise
         Noise of velocities.
@@ -74,7 +71,7 @@ class Slam:
         self.gains = make_gains(settings)
         self.landmarks = LandmarkTable()
         self.is_mapping = True
-        self.is_held = False
+        self.is_fixed = False
         self.counts: Counter[str] = Counter()
         self.rejected_in_a_row = 0
         self.motion_noise = MotionNoise(settings)
@@ -106,13 +103,6 @@ class Slam:
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
         return covariances.of_landmarks(self.observer, self.gains)
-
-    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
-        """Return the joint covariance (m k, m k) of where landmarks are seen from the robot, m².
-
-        Along the axes of the body that are estimated; None where the gains know none.
-        """
-        return covariances.of_configuration(self.observer, self.gains, self.axes, rows)
 
     def pose_covariance(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
@@ -194,13 +184,12 @@ class Slam:
             left_out['unmapped_landmark'] = int(np.sum(~known))
             event, rows, known = event.select(known), rows[known], known[known]
         self.gains.recall(self.observer, rows[known])
-        return self._outlook.sighting(event, rows, known, left_out)
+        return self._outlook.sighting(event, rows, left_out)
 
     def observe(self, sighting: Sighting) -> Outcome:
         """Use what :meth:`look` has returned for an observation; return what was made of it."""
         self.counts.update(sighting.left_out)
         event, rows, known = sighting.event, sighting.rows, sighting.known
-        dt_s = sighting.dt_s
         forgotten = self._in_the_way(sighting)
         if len(forgotten):
             # A history without them would lose what they have told of the pose.
@@ -208,31 +197,22 @@ class Slam:
         seen_before = event.select(known)
         rejected = self._correct(seen_before, sighting.residuals)
         if not known.all():
-            self._make_room(forgotten)
+            self._forget(forgotten, 'forgotten_landmark')
             self._initialise(event.select(~known), sighting.covariances[~known])
             rows = self.landmarks.rows_of(event.ids)
-            event, rows, dt_s = event.select(rows >= 0), rows[rows >= 0], dt_s[rows >= 0]
+            event, rows = event.select(rows >= 0), rows[rows >= 0]
         self._note_velocities(event, rows, seen_before.ids[rejected])
-        moved_ids = self._look_back(event, rows, dt_s)
+        moved_ids = self._look_back(event, rows)
         return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
 
     def are_rejected_again(self, sighting: Sighting) -> BoolArray:
         """Return which known landmarks (m,) in it were rejected before where they are seen now."""
         event = sighting.event.select(sighting.known)
-        places = self._places(event, sighting.residuals)
+        places = self._outlook.places(event, sighting.residuals)
         return self.landmarks.are_rejected_again(sighting.residuals.rows, *places)
 
     def smooth(self) -> Smoothed:
-        """Return trajectory and map in hindsight.
-
-        Raises
-        ------
-        ParameterError
-            If the gain design keeps no history.
-        SmoothingError
-            If the observations don't determine the whole trajectory.
-
-        """
+        """Return trajectory and map in hindsight; see :meth:`.GainDesign.smooth`."""
         found, rows = self.gains.smooth(self.observer), self.confirmed
         P = self.observer.reference_pose
         return Smoothed(
@@ -256,10 +236,13 @@ class Slam:
         Parameters are those of :meth:`.Surroundings.note`.
         """
         self.counts['strange_place'] += self._surroundings.note(event, some_have_ids)
-        forgotten = self.landmarks.unsupported(self.settings.min_support)
-        if len(forgotten):
-            self.remove(forgotten)
-            self.counts['unsupported_landmark'] += len(forgotten)
+        unsupported = self.landmarks.unsupported(self.settings.min_support)
+        self._forget(unsupported, 'unsupported_landmark')
+
+    def _forget(self, rows: IntArray, why: str) -> None:
+        if len(rows):
+            self.remove(rows)
+            self.counts[why] += len(rows)
 
     def _correct(self, event: ObservationEvent, residuals: Residuals) -> BoolArray:
         """Correct the state by the landmarks of ``event``; return which (m,) were rejected."""
@@ -273,7 +256,7 @@ class Slam:
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
         self.landmarks.see(rows[~rejected], event.stamp_ns)
         if rejected.any():
-            places = self._places(event.select(rejected), residuals.select(rejected))
+            places = self._outlook.places(event.select(rejected), residuals.select(rejected))
             self.landmarks.reject(rows[rejected], *places)
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return rejected
@@ -285,19 +268,12 @@ class Slam:
         velocities = event.velocities
         if velocities is None and self.settings.landmark_velocity_error == 0.0:
             velocities = np.zeros((len(rows), 3)) if self.observer.have_moved else None
-        if velocities is None or self.is_held:
+        if velocities is None or self.is_fixed:
             return
         used = ~np.isin(event.ids, rejected_ids)
         self.observer.set_landmark_velocities(rows[used], velocities[used])
 
-    def _places(
-        self, event: ObservationEvent, residuals: Residuals
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return where points seem to be (m, 3), world, and within what they are at one place."""
-        spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
-        return se3.transform(self.observer.pose, event.points), SAME_PLACE * spread_m
-
-    def _look_back(self, event: ObservationEvent, rows: IntArray, dt_s: FloatArray) -> IntArray:
+    def _look_back(self, event: ObservationEvent, rows: IntArray) -> IntArray:
         """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
 
         Now that the state is corrected, it is known better than before from where they were seen.
@@ -306,7 +282,7 @@ class Slam:
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
         if some_are or self.gains.looks_back:
-            self.gains.look_back(self.observer, self._outlook.seen(event, rows, dt_s), some_are)
+            self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
         if some_are:
             return self._relocate(event.select(in_doubt), rows[in_doubt])
         return np.empty(0, dtype=np.int64)
@@ -338,11 +314,6 @@ class Slam:
             return np.empty(0, dtype=np.int64)
         unseen = self.landmarks.unseen_since(sighting.event.stamp_ns)
         return np.sort(unseen[~np.isin(unseen, sighting.rows)][:excess])
-
-    def _make_room(self, rows: IntArray) -> None:
-        if len(rows):
-            self.remove(rows)
-            self.counts['forgotten_landmark'] += len(rows)
 
     def _initialise(self, event: ObservationEvent, noise: FloatArray) -> None:
         """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
