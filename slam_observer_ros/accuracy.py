@@ -14,6 +14,7 @@ from slam_observer_ros.evaluation.metrics import (
     TrajectoryErrors,
 )
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import is_automatic
 from slam_observer_ros.recording.truth import Truth
 from slam_observer_ros.replay import Replay
 from slam_observer_ros.types import FloatArray, IntArray
@@ -112,8 +113,8 @@ def _anees(result: Replay, truth: Trajectory) -> float | None:
 
 
 def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
-    if truth.landmarks is None:
-        return None
+    if truth.landmarks is None or is_automatic(ids).all():
+        return None  # landmarks without ids of their own have no counterpart
     try:
         errors = landmark_errors(ids, world_points, truth.landmarks)
     except EvaluationError as error:

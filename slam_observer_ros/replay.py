@@ -235,4 +235,5 @@ class _Run:
                 true_poses[0],
                 self._landmark_tracks.at(update.stamp_ns),
                 self._estimator.configuration_covariance if is_due else None,
+                update.ids[~update.rejected],
             )

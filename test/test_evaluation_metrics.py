@@ -12,6 +12,7 @@ from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.evaluation import consistency, metrics
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray
@@ -118,6 +119,17 @@ def test_configuration_error_is_the_rms_over_landmarks_and_then_over_time() -> N
     assert error.stamps_ns == [6, 7]
     np.testing.assert_allclose(error.values_m, [np.sqrt((0.09 + 0.16) / 2), 0.3])
     assert error.rmse_m == pytest.approx(np.sqrt((0.125 + 0.09) / 2))
+
+
+def test_a_landmark_without_id_stands_for_what_it_was_nearest_to_when_it_was_seen() -> None:
+    truth = LandmarkTruth(np.array([7, 3]), np.array([[1.0, 0.0, 0.0], [0.0, 4.0, 0.0]]))
+    ids, points = FIRST_AUTOMATIC_ID + np.arange(2), np.array([[1.5, 0.0, 0.0], [9.0, 9.0, 0.0]])
+    error = ConfigurationError()
+    error.add(1, np.eye(4), ids, points, np.eye(4), truth, seen_ids=ids[:1])
+    points[0] = 0.0, 3.8, 0.0
+    for stamp_ns in (2, 3):
+        error.add(stamp_ns, np.eye(4), ids, points, np.eye(4), truth, seen_ids=ids[2:])
+    assert error.values_m == pytest.approx([0.5, np.hypot(1.0, 3.8), np.hypot(1.0, 3.8)])
 
 
 def random_covariance(rng: np.random.Generator, d: int) -> FloatArray:

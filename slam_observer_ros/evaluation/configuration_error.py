@@ -53,6 +53,7 @@ class ConfigurationError:
         true_pose: FloatArray,
         truth: LandmarkTruth,
         covariance_of: Callable[[IntArray], FloatArray | None] | None = None,
+        seen_ids: IntArray | None = None,
     ) -> None:
         """Take in one configuration, once after each observation.
 
@@ -64,8 +65,8 @@ class ConfigurationError:
             (4, 4) estimated pose.
         ids : IntArray
             (n,) landmarks known so far; those without truth are passed over. One whose sensor
-            gave no id stands for the true landmark that it was nearest to most often so far, as
-            seen by the robot.
+            gave no id stands for the true landmark that it was nearest to most often so far when
+            it was seen, as the robot had it; before that it is passed over, too.
         world_points : FloatArray
             (n, 3) their estimated positions in the estimate's world, metres.
         true_pose : FloatArray
@@ -75,13 +76,16 @@ class ConfigurationError:
         covariance_of : callable, optional
             Gives the joint covariance (m k, m k) of m of the landmarks as seen by the robot, of
             their first k coordinates, m²; None if it is not known.
+        seen_ids : IntArray, optional
+            (m,) which of the landmarks were seen now; by default all.
 
         """
         if not len(truth.ids):
             return
         seen = se3.transform(se3.inverse(pose), world_points)
         true_seen = se3.transform(se3.inverse(true_pose), truth.world_points)
-        for row in np.flatnonzero(is_automatic(ids)):
+        are_seen = True if seen_ids is None else np.isin(ids, seen_ids)
+        for row in np.flatnonzero(is_automatic(ids) & are_seen):
             nearest = np.argmin(np.linalg.norm(true_seen - seen[row], axis=1))
             self._votes[int(ids[row])][int(truth.ids[nearest])] += 1
         true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
