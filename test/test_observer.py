@@ -5,6 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
+from paper_innovation import lyapunov_rate, paper_innovation
 import pytest
 from strategies import generators, poses, rotations
 
@@ -15,7 +16,6 @@ from slam_observer_ros.gains.constant import (
     paper_step,
     safe_step,
 )
-from slam_observer_ros.gains.paper import lyapunov_rate, paper_innovation
 from slam_observer_ros.geometry import paths, se3, slam_group
 from slam_observer_ros.geometry.slam_group import SlamElement, TotalState
 from slam_observer_ros.observer import lyapunov, Observer

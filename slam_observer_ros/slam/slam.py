@@ -230,10 +230,11 @@ class Slam:
         self.landmarks.remove(rows)
 
     def note_surroundings(self, event: ObservationEvent, some_have_ids: bool) -> None:
-        """Forget landmarks without an id that were seen too seldom, after an observation of some.
+        """Count what was in view of an observation of landmarks without an id.
 
-        One that the robot has turned away from may be the only tie to what was mapped before.
-        Parameters are those of :meth:`.Surroundings.note`.
+        Those that were seen too seldom while they were in view are forgotten; out of view none
+        is: it may be the only tie to what was mapped before. Parameters are those of
+        :meth:`.Surroundings.note`.
         """
         self.counts['strange_place'] += self._surroundings.note(event, some_have_ids)
         unsupported = self.landmarks.unsupported(self.settings.min_support)

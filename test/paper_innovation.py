@@ -1,6 +1,6 @@
 """The paper's innovation (28)–(31) in continuous time: what the constant gains integrate.
 
-Tests hold :mod:`slam_observer_ros.gains.constant` against it; nothing else runs on it.
+Tests hold :mod:`slam_observer_ros.gains.constant` against it.
 """
 
 from __future__ import annotations
