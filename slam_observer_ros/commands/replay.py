@@ -81,7 +81,12 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help='estimate trajectory and map in hindsight, too: the outputs are of these then',
     )
     outputs = parser.add_argument_group('outputs')
-    outputs.add_argument('--tum', type=Path, metavar='FILE', help='trajectory, as evo reads it')
+    outputs.add_argument(
+        '--tum',
+        type=Path,
+        metavar='FILE',
+        help='trajectory, as evo reads it, at most 20 poses a second',
+    )
     outputs.add_argument('--map', type=Path, metavar='FILE', help='landmarks, as YAML')
     outputs.add_argument('--plot', type=Path, metavar='DIR', help=f'draw {", ".join(FIGURES)}')
     outputs.add_argument('--json', action='store_true', help='print one JSON object')
