@@ -311,3 +311,19 @@ def cpu_seconds(node):
     stat = Path(f'/proc/{node.process.pid}/stat').read_text()
     fields = stat.rsplit(')', 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def test_diagnostics_tell_why_messages_were_dropped(ros, tmp_path):
+    diagnostics = Diagnostics(ros, '/unclocked')
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/unclocked', use_sim_time=True),
+        Robot(ros, namespace='/unclocked') as robot,
+    ):
+        diagnostics.wait(
+            lambda d: (
+                robot.send_zeros()
+                or re.search(r'[0-9]+ messages dropped \(no_clock\)', d.status.message)
+            ),
+            'the reason',
+        )
+        assert diagnostics.status.level == DiagnosticStatus.ERROR

@@ -63,7 +63,7 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
-        self._last_dropped = 0
+        self._last_dropped: Counter[str] = Counter()
         self._last_counts: Counter[str] = Counter()
         self._recent_counts: deque[Counter[str]] = deque(maxlen=RECENT)
 
@@ -114,22 +114,24 @@ class Diagnostics:
         values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
         return values
 
-    def _progress(self) -> tuple[int, Counter[str]]:
-        """Return how many messages were dropped since the last time, and what else was counted."""
-        dropped = self._estimator.dropped.total() + self._intake.dropped.total()
-        dropped += sum(source.malformed for source in self._inputs)
+    def _progress(self) -> tuple[Counter[str], Counter[str]]:
+        """Return why messages were dropped since the last time, and what else was counted."""
+        dropped = self._estimator.dropped + self._intake.dropped
+        dropped['malformed'] += sum(source.malformed for source in self._inputs)
         counts = self._estimator.counts
         since_last = dropped - self._last_dropped, counts - self._last_counts
         self._last_dropped, self._last_counts = dropped, counts
         return since_last
 
-    def _warnings(self, dropped: int, new: Counter[str]) -> list[str]:
+    def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
         warnings += self._intake.clock_troubles()
         if self._intake.is_paused:
             warnings.append('paused')
         elif dropped:
-            warnings.append(f'{dropped} messages dropped')
+            (reason, _), *others = dropped.most_common()
+            reasons = f'mostly {reason}' if others else reason
+            warnings.append(f'{dropped.total()} messages dropped ({reasons})')
         warnings.append(self._points_warning(new))
         warnings.append(self._rejections_warning(new))
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
