@@ -44,7 +44,8 @@ class Settings(Immutable):
     )
     max_innovation_time: float = parameter(
         0.2,
-        'Constant gains: longest time that one observation acts, since it was unseen before',
+        'Constant gains: longest time step of one observation, which is the time since the '
+        'landmark was last seen',
         unit='s',
         minimum=1e-3,
         read_only=False,
@@ -196,8 +197,9 @@ class Settings(Immutable):
     )
     calibration_drift: float = parameter(
         0.0,
-        'How fast what is estimated of these drifts, as a share of its standard deviation; '
-        'above 0 Riccati gains do not look back',
+        'Scheduled and Riccati gains: how fast scale, bias and delay of the velocity drift, as a '
+        'share of the standard deviation of each; above 0, where any of them is estimated, '
+        'Riccati gains do not look back',
         unit='1/√s',
         minimum=0.0,
     )
