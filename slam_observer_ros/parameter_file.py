@@ -6,11 +6,13 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 import logging
 from pathlib import Path
 import re
+from typing import Any
 
 import yaml
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import suggestion
+from slam_observer_ros.yaml_keys import check_keys
 
 logger = logging.getLogger(__name__)
 
@@ -43,8 +45,8 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     Raises
     ------
     ParameterError
-        If the file can't be read, is not YAML, or holds no parameters for this package, or those
-        of several robots.
+        If the file can't be read, is not YAML, has a key twice, or holds no parameters for this
+        package, or those of several robots.
 
     """
     try:
@@ -97,7 +99,12 @@ def _is_misspelt(name: str, ours: str) -> bool:
 
 
 class _RosLoader(yaml.SafeLoader):
-    """Reads numbers as ROS does: 1e-3 is one, though YAML 1.1 wants 1.0e-3."""
+    """Reads no key twice, and numbers as ROS does: 1e-3 is one, though YAML 1.1 wants 1.0e-3."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
+        """Return a mapping; raise a YAMLError if it has a key twice."""
+        check_keys(node)
+        return super().construct_mapping(node, deep)
 
 
 _RosLoader.add_implicit_resolver(

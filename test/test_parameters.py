@@ -301,3 +301,19 @@ def test_numbers_in_a_file_are_read_as_ros_reads_them(tmp_path):
     file.write_text('/**:\n  ros__parameters:\n    gain_k: 1e-3\n    gain_l: 2\n')
     settings = from_parameters(Settings, read_parameter_file(file))
     assert (settings.gain_k, settings.gain_l) == (0.001, 2.0)
+
+
+@pytest.mark.parametrize(
+    ('text', 'twice'),
+    [
+        (
+            '/**:\n  ros__parameters:\n    gain_k: 1.0\n    gain_l: 2.0\n    gain_k: 3.0\n',
+            'gain_k',
+        ),
+        ('/**: {ros__parameters: {a: 1}}\n/**: {ros__parameters: {b: 2}}\n', '/**'),
+    ],
+)
+def test_what_a_file_has_twice_is_refused_by_its_name(tmp_path, text, twice):
+    with pytest.raises(ParameterError) as error:
+        read_parameter_file(write(tmp_path, text))
+    assert f"'{twice}' is there 2 times" in str(error.value)

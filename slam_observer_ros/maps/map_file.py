@@ -34,6 +34,7 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.yaml_keys import check_keys
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
@@ -63,10 +64,7 @@ class _StrictLoader(_FastLoader):  # type: ignore[misc]  # one of two classes
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
         """Return a mapping; raise a YAMLError if it has a key twice."""
-        keys = (key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        for key, count in Counter(keys).items():
-            if count > 1:
-                raise yaml.YAMLError(f"'{key}' is there {count} times in one entry")
+        check_keys(node)
         return super().construct_mapping(node, deep)
 
 
