@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 import itertools
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.association.assignments import MARGIN
+from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     huber_loss,
@@ -41,7 +43,8 @@ from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.field_of_view import FieldOfView
 from slam_observer_ros.slam.landmark_index import LandmarkIndex
-from slam_observer_ros.slam.landmark_table import LandmarkTable
+from slam_observer_ros.slam.landmark_table import LandmarkTable, PATIENCE
+from slam_observer_ros.slam.slam import Slam
 
 CONFIG = Path(__file__).resolve().parent.parent / 'config' / 'wheeled_bearing_range.yaml'
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
@@ -522,6 +525,19 @@ def test_nothing_is_forgotten_before_it_is_known_how_often_a_landmark_is_seen():
     assert landmarks.unsupported(5).tolist() == []
 
 
+def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_before():
+    """One has settled, and was seen each time; the other one never was but once."""
+    landmarks, both = LandmarkTable(), np.array([0, 1])
+    landmarks.add(FIRST_AUTOMATIC_ID + both, 0)
+    landmarks.look(both, np.array([True, True]))
+    for look in range(1, 3 * PATIENCE):
+        assert landmarks.unsupported(3).tolist() == []
+        landmarks.see(both[:1], look)
+        landmarks.look(both, np.array([True, False]))
+    assert landmarks.counts.tolist() == [3 * PATIENCE, 1]
+    assert landmarks.unsupported(3).tolist() == [1]
+
+
 def test_reflectors_that_are_told_one_a_message_are_all_kept():
     random = np.random.default_rng(0)
     points = random.uniform([-8.0, -8.0, 0.0], [8.0, 8.0, 0.0], (24, 3))
@@ -560,3 +576,24 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
     (before, after), (_, unasked) = run(True), run(False)
     assert_array_equal(after, unasked)
     assert before[2, 2] < after[2, 2]
+
+
+def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
+    """Σ w_i (P_i + d_i d_iᵀ) about the first, of poses that differ by d_i."""
+    settings, rng = Settings(), np.random.default_rng(0)
+    poses = se3.exp(rng.normal(scale=[0.3] * 3 + [2.0] * 3, size=(3, 6)))
+    roots = 0.1 * rng.normal(size=(3, 6, 6))
+    covariances, costs = roots @ roots.swapaxes(1, 2), np.array([0.0, 1.0, 3.0])
+    states = Hypotheses(Slam(settings, np.eye(4)), settings)
+    states._states = [deepcopy(states.best) for _ in poses]
+    states._costs = costs.tolist()
+    for slam, pose, covariance in zip(states._states, poses, covariances, strict=True):
+        slam.set_pose(pose, covariance)
+    weights = np.exp(-costs / 2.0) / np.exp(-costs / 2.0).sum()
+    turns = so3.log(poses[:, :3, :3] @ poses[0, :3, :3].T)
+    d = np.column_stack([turns, poses[:, :3, 3] - poses[0, :3, 3]])
+    each = covariances + d[:, :, None] * d[:, None, :]
+    expected = np.einsum('i,ijk->jk', weights, each) - covariances[0]
+    assert_allclose(states.doubt, expected, atol=1e-9)
+    states.decide()
+    assert states.doubt is None

@@ -121,6 +121,13 @@ class TestReport:
         }  # fmt: skip
         assert 'no truth to compare with' in slam_observer('replay', path).output
 
+    def test_with_a_truth_all_that_can_be_known_is_told(self, slam_observer, simulated):
+        report = slam_observer.succeed('replay', simulated, '--smooth', '--json').json
+        unknown = {key for key, value in report.items() if value is None}
+        assert unknown == {'localised_after_s', 'imu_topic', 'unaligned_rmse_m'}
+        assert report['configuration_anees'] > 0.0
+        assert report['truth_covered'] == pytest.approx(1.0)
+
     def test_the_configuration_error_is_that_of_landmarks_where_they_are(
         self, slam_observer, tmp_path
     ):

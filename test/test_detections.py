@@ -14,6 +14,8 @@ from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_detections,
     decode_pose_array,
+    MAX_NAMES,
+    no_tags,
     observed_tags,
 )
 from slam_observer_ros.messages.point_cloud_layout import point_cloud2_layout
@@ -123,3 +125,11 @@ def test_fiducials_on_tf_are_told_by_their_names():
     ]  # fmt: skip
     assert_array_equal(seen[0].event.ids, [7, 8])
     assert_array_equal(seen[0].event.points, [[1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+
+
+def test_of_the_frames_that_are_no_fiducials_the_first_few_are_named():
+    frames = [f'frame_{letter}' for letter in 'abcdefghijklm']
+    assert len(frames) == MAX_NAMES + 1
+    all_of_them = ', '.join(frames[:MAX_NAMES])
+    assert f'(there are {all_of_them}): set' in no_tags('tag_', reversed(frames[:MAX_NAMES]))
+    assert f'(there are {all_of_them}, …): set' in no_tags('tag_', frames)

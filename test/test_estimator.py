@@ -33,6 +33,7 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
 from slam_observer_ros.truth import PoseTruth
+from slam_observer_ros.validation import MAX_MEASURED
 
 GAINS = ('constant', 'scheduled', 'riccati')
 START_NS = 1_700_000_000_000_000_000
@@ -97,6 +98,16 @@ def test_what_leaves_the_plane_does_not_count_in_planar_mode():
     np.testing.assert_array_equal(estimator.world_points[:, 2], np.zeros(5))
 
 
+def test_without_observations_the_state_is_moved_on_all_the_same():
+    moves = []
+    estimator = Estimator(
+        Settings(reorder_window=0.0), on_motion=lambda _, start_ns, end_ns: moves.append(end_ns)
+    )
+    for step in range(1 + 3 * MAX_PENDING_VELOCITIES):
+        estimator.add(VelocityEvent(START_NS + step * 10**7, np.zeros(6)))
+    assert len(moves) == 3
+
+
 def test_a_landmark_is_in_the_map_once_it_was_seen_often_enough():
     events = [velocity(0.0), *(observation(0.1 * step, [2]) for step in range(3))]
     assert len(run(events[:3], confirmations=3).landmark_ids) == 0
@@ -138,6 +149,13 @@ def test_asking_for_the_pose_never_changes_the_estimate():
 def test_long_stretches_of_velocity_move_the_state_on_and_stay_exact():
     estimator = run([velocity(0.01 * step) for step in range(1001)])
     np.testing.assert_allclose(estimator.pose, true_pose(10.0), atol=1e-9)
+
+
+def test_velocities_of_long_ago_are_not_kept():
+    estimator = Estimator(Settings(reorder_window=0.0))
+    for step in range(20_000):
+        estimator.add(VelocityEvent(START_NS + step * 10**7, np.zeros(6)))
+    assert len(estimator._timeline.velocities._stamps_ns) < 5_000
 
 
 def test_an_observation_later_than_the_window_is_carried_forward():
@@ -221,6 +239,18 @@ def test_with_constant_gains_a_second_camera_of_the_same_stamps_corrects_the_map
     np.testing.assert_allclose(seen, LANDMARKS[estimator.landmark_ids], atol=0.01)
 
 
+@pytest.mark.parametrize('gains', GAINS)
+def test_two_sensors_that_see_at_one_instant_are_none_of_them_late(gains):
+    estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
+    for step in range(5):
+        stamp_ns = START_NS + step * 10**8
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        for ids in (np.arange(3), np.arange(2, 5)):
+            assert estimator.add(ObservationEvent(stamp_ns, ids, LANDMARKS[ids]))
+    assert estimator.counts['observation'] == 10
+    assert estimator.counts['late_observation'] == estimator.counts['late_velocity'] == 0
+
+
 def test_an_event_later_than_the_limit_is_refused():
     events = [velocity(0.05 * step) for step in range(100)] + [observation(1.0)]
     estimator = run(events, reorder_window=0.1, late_limit=1.0)
@@ -259,6 +289,30 @@ def test_a_forgotten_landmark_leaves_the_others_alone_and_may_come_back():
     assert estimator.landmark_ids[-1] == 3
 
 
+@pytest.mark.parametrize('gains', GAINS)
+def test_the_first_landmark_can_be_forgotten_like_any_other(gains):
+    estimator = run([ObservationEvent(START_NS, np.arange(5), LANDMARKS)], gains=gains)
+    for landmark_id in (0, 4, 2):
+        assert estimator.forget(landmark_id)
+        assert landmark_id not in estimator.landmark_ids
+        assert not estimator.forget(landmark_id)
+    assert estimator.landmark_ids.tolist() == [1, 3]
+
+
+@pytest.mark.parametrize('gains', GAINS)
+def test_where_one_landmark_is_forgotten_the_others_keep_their_velocities(gains):
+    speed = np.zeros_like(LANDMARKS)
+    speed[:, 1] = [0.1, 0.2, 0.3, 0.4, 0.5]
+    estimator = Estimator(Settings(gains=gains, confirmations=1, reorder_window=0.0))
+    estimator.add(ObservationEvent(START_NS, np.arange(5), LANDMARKS, None, speed))
+    assert estimator.forget(1)
+    kept = [0, 2, 3, 4]
+    np.testing.assert_allclose(estimator.landmark_velocities, speed[kept], atol=1e-12)
+    nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    estimator.add(ObservationEvent(START_NS + 10**9, *nothing))
+    np.testing.assert_allclose(estimator.world_points, (LANDMARKS + speed)[kept], atol=1e-9)
+
+
 def test_reset_forgets_everything_so_that_a_recording_may_start_over():
     estimator = Estimator(Settings(confirmations=1))
     for event in drive():
@@ -272,10 +326,25 @@ def test_reset_forgets_everything_so_that_a_recording_may_start_over():
     np.testing.assert_array_equal(estimator.pose, np.eye(4))
 
 
+def test_what_was_counted_is_kept_by_a_reset():
+    off = np.array([3.0, 2.0, -4.0])
+    events = [
+        ObservationEvent(START_NS + step * 10**8, np.arange(5), LANDMARKS + (step == 9) * off)
+        for step in range(12)
+    ]
+    estimator = run(events)
+    counts = estimator.counts
+    assert counts['rejected_landmark'] > 0
+    estimator.reset()
+    assert estimator.counts == counts
+    estimator.restart_time()
+    assert estimator.counts == counts
+
+
 def bad_events():
     good = observation(5.0, [0, 1])
     stamp_ns = good.stamp_ns
-    points = good.points
+    points, eyes = good.points, np.tile(np.eye(3), (2, 1, 1))
     return [
         ('negative_stamp', VelocityEvent(-1, BODY_VELOCITY)),
         ('wrong_type', VelocityEvent(stamp_ns * 1e-9, BODY_VELOCITY)),
@@ -312,6 +381,14 @@ def bad_events():
         ('negative_id', ObservationEvent(stamp_ns, np.array([7, -2]), points)),
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points, np.ones((2, 3)))),
         ('not_finite', ObservationEvent(stamp_ns, good.ids, points, np.full((2, 3, 3), np.nan))),
+        ('bad_covariance', ObservationEvent(stamp_ns, good.ids, points, covariances=-eyes)),
+        ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points, velocities=points[:1])),
+        ('wrong_type', ObservationEvent(stamp_ns, good.ids, points, velocities=points.tolist())),
+        ('not_finite', ObservationEvent(stamp_ns, good.ids, points, velocities=points * np.nan)),
+        ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points, sensor=points[0])),
+        ('wrong_type', ObservationEvent(stamp_ns, good.ids, points, sensor=points.tolist())),
+        ('not_finite', ObservationEvent(stamp_ns, good.ids, points, sensor=points * np.inf)),
+        ('too_large', ObservationEvent(stamp_ns, good.ids, points, sensor=points * 1e7)),
         ('stamp_jump', VelocityEvent(stamp_ns + 10**12, BODY_VELOCITY)),
         ('duplicate', drive()[-2]),
         ('duplicate', drive()[-1]),
@@ -329,6 +406,20 @@ def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason,
     estimator.flush()
     untouched.flush()
     assert_same_state(estimator, untouched)
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('dtype', [np.float64, np.float32])
+def test_what_is_as_large_as_may_be_is_taken_and_what_is_larger_refused(sign, dtype):
+    for size, is_taken in ((MAX_MEASURED, True), (1.001 * MAX_MEASURED, False)):
+        entries = np.array([0.0, sign * size, 0.0], dtype=dtype)
+        estimator, ids = Estimator(Settings()), np.array([1])
+        assert estimator.add(VelocityEvent(START_NS, np.tile(entries, 2))) == is_taken
+        assert estimator.add(ObservationEvent(START_NS, ids, entries[None])) == is_taken
+        velocities = entries[None] * np.ones((1, 3), dtype=dtype)
+        moving = ObservationEvent(START_NS + 1, ids, np.ones((1, 3)), None, velocities)
+        assert estimator.add(moving) == is_taken
+        assert estimator.dropped == ({} if is_taken else {'too_large': 3})
 
 
 @pytest.mark.parametrize('gains', GAINS)
@@ -657,6 +748,18 @@ def test_a_landmark_in_view_makes_no_room_though_its_point_is_rejected():
     assert estimator.smooth().since == 'the last start'
 
 
+def test_observations_in_a_row_of_which_all_landmarks_were_rejected_are_counted():
+    """From which a place in a map is taken for wrong, or odometry for having slipped."""
+    estimator = Estimator(Settings(gains='scheduled', reorder_window=0.0, max_rejections=100))
+    counted = []
+    for step in range(12):
+        off = 50.0 * (step in (6, 7, 8, 10, 11)) * np.array([1.0, -2.0, 3.0])
+        estimator.add(VelocityEvent(START_NS + step * 10**8, np.zeros(6)))
+        estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), LANDMARKS + off))
+        counted.append(estimator._slam.rejected_in_a_row)
+    assert counted == [0, 0, 0, 0, 0, 0, 1, 2, 3, 0, 1, 2]
+
+
 def test_after_a_jump_all_starts_where_the_run_began_though_the_robot_was_moved_since():
     start = true_pose(3.0)
     estimator = Estimator(Settings(), initial_pose=start)
@@ -674,19 +777,36 @@ def test_told_of_a_jump_the_estimator_starts_again_at_once():
     assert estimator.add(velocity(-1e6))
 
 
+def test_all_events_of_a_stamp_are_told_of_once_and_also_after_a_jump_of_the_clock():
+    told = []
+    settings = Settings(reorder_window=0.0, on_time_jump='hold')
+    estimator = Estimator(settings, on_stamp=lambda: told.append(estimator.stamp_ns))
+    for step in range(3):
+        stamp_ns = START_NS + step * 10**8
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        estimator.add(ObservationEvent(stamp_ns, np.arange(5), LANDMARKS))
+    assert told == [START_NS, START_NS + 10**8]
+    estimator.restart_time()
+    assert told == [START_NS + step * 10**8 for step in range(3)]
+    estimator.add(VelocityEvent(START_NS, np.zeros(6)))
+    estimator.flush()
+    assert told[3:] == [START_NS]
+
+
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_far_points_said_to_be_exact_are_taken_after_turning_blindly(gains):
+def test_far_points_said_to_be_all_but_exact_are_taken_after_turning_blindly(gains):
+    """Not by zeros, which say unknown."""
     estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
     points = np.random.default_rng(1).uniform(-100.0, 100.0, size=(10, 3))
     velocity = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])
-    exact = np.zeros((4, 3, 3))
+    exact = np.tile(1e-300 * np.eye(3), (4, 1, 1))
     for number in range(60):
         pose = se3.exp(number * velocity)
         stamp_ns = START_NS + number * 5_000_000_000
         seen = np.arange(4) + number % 7
         estimator.add(VelocityEvent(stamp_ns, velocity))
         body_points = se3.transform(se3.inverse(pose), points[seen])
-        estimator.add(ObservationEvent(stamp_ns, seen, body_points, exact))
+        assert estimator.add(ObservationEvent(stamp_ns, seen, body_points, exact))
         assert len(estimator.landmark_map.ids) == len(estimator.landmark_ids)
     np.testing.assert_allclose(estimator.pose, pose, atol=1e-6)
 
@@ -712,6 +832,25 @@ def test_only_settings_that_may_change_while_running_do():
     with pytest.raises(ParameterError, match='gains, confirmations can only be set'):
         estimator.change_settings(Settings(gains='constant', confirmations=9, gain_k=7.0))
     assert estimator.settings == Settings(gain_k=1.0, rejection_distance=4.0)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_settings_that_change_while_running_count_from_then_on(gains):
+    settings = Settings(gains=gains, reorder_window=0.0, max_hypotheses=1)
+
+    def rejected(estimator, step):
+        before = estimator.counts['rejected_landmark']
+        estimator.add(VelocityEvent(START_NS + step * 10**8, np.zeros(6)))
+        seen = LANDMARKS + (step >= 10) * np.array([[1.5, 0, 0], *4 * [[0.0, 0, 0]]])
+        estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), seen))
+        return estimator.counts['rejected_landmark'] - before
+
+    for changed, expected in ((settings, 1), (replace(settings, rejection_distance=1e6), 0)):
+        estimator = Estimator(settings)
+        for step in range(10):
+            assert rejected(estimator, step) == 0
+        estimator.change_settings(changed)
+        assert rejected(estimator, 10) == expected
 
 
 def test_what_is_no_settings_is_refused():

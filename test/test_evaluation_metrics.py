@@ -10,7 +10,7 @@ from strategies import generators, poses
 
 from slam_observer_ros.errors import EvaluationError
 from slam_observer_ros.evaluation import consistency, metrics
-from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError, MAX_JOINT
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
@@ -161,6 +161,49 @@ def test_exactly_known_directions_do_not_count() -> None:
 def test_an_indefinite_covariance_is_refused() -> None:
     with pytest.raises(EvaluationError, match='negative'):
         consistency.average_nees(np.ones((1, 2)), np.array([[[1.0, 2.0], [2.0, 1.0]]]))
+
+
+@pytest.mark.parametrize('k', [2, 3])
+def test_anees_of_the_configuration_is_by_the_joint_covariance_as_the_robot_sees_it(
+    k: int,
+) -> None:
+    rng = np.random.default_rng(0)
+    truth = LandmarkTruth(np.arange(5), rng.normal(scale=5.0, size=(5, 3)))
+    pose, true_pose = se3.exp(rng.normal(size=(2, 6)))
+    P = random_covariance(rng, 4 * k)
+    ids, asked = np.array([3, 9, 0, 4, 1]), []
+
+    def covariance_of(rows):
+        asked.append(rows.tolist())
+        return P
+
+    error = ConfigurationError()
+    assert error.anees is None
+    points = rng.normal(scale=5.0, size=(5, 3))
+    error.add(0, pose, ids, points, true_pose, truth, covariance_of)
+    error.add(1, pose, ids, points, true_pose, truth)  # without: counts for the error alone
+    error.add(2, pose, ids, points, true_pose, truth, lambda rows: None)
+    assert asked == [[0, 2, 3, 4]], 'those whose truth is known, in the order of the map'
+    seen = se3.transform(se3.inverse(pose), points[asked[0]])
+    true_seen = se3.transform(se3.inverse(true_pose), truth.world_points[ids[asked[0]]])
+    e = (seen - true_seen)[:, :k].ravel()
+    assert len(error.values_m) == 3
+    assert error.nees == [pytest.approx(e @ np.linalg.solve(P, e) / (4 * k))]
+    assert error.anees == error.nees[0]
+
+
+def test_of_very_many_landmarks_some_are_normalised_together() -> None:
+    n = 3 * MAX_JOINT - 1
+    truth = LandmarkTruth(np.arange(n), np.zeros((n, 3)))
+    error, asked = ConfigurationError(), []
+
+    def covariance_of(rows):
+        asked.append(len(rows))
+        return 4.0 * np.eye(3 * len(rows))
+
+    error.add(0, np.eye(4), np.arange(n), np.full((n, 3), 2.0), np.eye(4), truth, covariance_of)
+    assert 0 < asked[0] <= MAX_JOINT
+    assert error.anees == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(('inflation', 'inside'), [(1.0, True), (0.7, False), (1.4, False)])

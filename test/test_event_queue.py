@@ -12,7 +12,7 @@ import pytest
 
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.event_queue import AGREEING_STAMPS, EventQueue, MIN_KNOWN
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
 
 SECOND = 1_000_000_000
 START_NS = 1_700_000_000 * SECOND
@@ -79,9 +79,13 @@ def test_the_order_of_arrival_within_the_window_does_not_matter(order):
     assert [stamp_ns for stamp_ns, *_ in given_out] == sorted(event.stamp_ns for event in events)
 
 
-def test_of_one_stamp_the_velocity_comes_first():
-    queue = filled(observation(7), velocity(7))
-    assert [type(event) for event in queue.pop_all()] == [VelocityEvent, ObservationEvent]
+def test_of_one_stamp_all_velocities_come_first():
+    """However the digest of an observation compares with the name of a class."""
+    events = [*(observation(7, [number]) for number in range(20)), velocity(7)]
+    events.append(AngularVelocityEvent(events[0].stamp_ns, np.zeros(3)))
+    given_out = filled(*events).pop_all()
+    kinds = [isinstance(event, ObservationEvent) for event in given_out]
+    assert kinds == [False, False, *[True] * 20]
 
 
 @pytest.mark.parametrize('event', [velocity(3), observation(3), observation(3, [])])

@@ -221,6 +221,40 @@ def test_removed_landmarks_leave_the_others_as_they_were():
     assert np.isfinite(slam.covariance).all()
 
 
+def test_after_landmarks_of_the_core_were_removed_what_tells_nothing_changes_nothing():
+    """Else some would be taken for others that were in the core."""
+    rng, n = np.random.default_rng(1), 14
+    slam = landmarks_about_a_robot(rng, n)
+    slam.gains.recall(slam.observer, np.arange(n))
+    last_seen = slam.gains._core.rows
+    removed = np.sort(last_seen[last_seen >= 0][:3])
+    slam.observer.remove_landmarks(removed)
+    slam.gains.remove_landmarks(removed)
+    n -= 3
+    before, points, own = slam.covariance, slam.points, of_pose_and_each_landmark(n)
+    for row in range(n):
+        seen = np.array([row])
+        slam.see(seen, slam.expected(seen), 1e9 * np.eye(3)[None])
+    np.testing.assert_allclose(slam.points, points, atol=1e-9)
+    np.testing.assert_allclose(slam.covariance[own], before[own], atol=1e-6 * before.max())
+
+
+def test_a_landmark_that_is_relocated_is_as_uncertain_as_a_new_one():
+    rng, n = np.random.default_rng(2), 5
+    relocated, added = (landmarks_about_a_robot(np.random.default_rng(3), n) for _ in range(2))
+    point, R = rng.normal(size=(1, 3)), random_covariances(rng, 1, 3)
+    relocated.relocate(np.array([1]), point, R)
+    added.add(point, R)
+    np.testing.assert_allclose(relocated.points[1], added.points[n], atol=1e-12)
+    of_one = np.append(np.arange(6), np.arange(9, 12))
+    of_last = np.append(np.arange(6), 6 + 3 * n + np.arange(3))
+    np.testing.assert_allclose(
+        relocated.covariance[np.ix_(of_one, of_one)],
+        added.covariance[np.ix_(of_last, of_last)],
+        atol=1e-12,
+    )
+
+
 @pytest.mark.parametrize('gains', DESIGNS)
 def test_each_design_converges_on_the_circle_of_the_paper(gains):
     simulation = Simulation(Scenario(duration=40.0, observation_rate=10.0))

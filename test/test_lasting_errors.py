@@ -128,3 +128,14 @@ def test_a_landmark_that_was_placed_anew_has_not_been_seen_before():
     landmarks.restart(row, 3 * 10**9)
     assert landmarks.unseen_s(row, 3 * 10**9) == np.inf
     assert landmarks.unseen_s(row, 4 * 10**9) == 1.0
+
+
+def test_where_a_landmark_was_rejected_is_still_known_when_another_one_was_removed():
+    landmarks, last = LandmarkTable(), np.array([2])
+    landmarks.add(np.array([7, 8, 9]), 0)
+    place, tolerance_m = np.array([[4.0, 5.0, 6.0]]), np.array([0.1])
+    landmarks.reject(last, place, tolerance_m)
+    landmarks.remove(np.array([0]))
+    assert landmarks.are_rejected_again(np.array([1]), place, tolerance_m).all()
+    landmarks.reject(np.array([1]), place, tolerance_m)
+    assert landmarks.rejections.tolist() == [0, 2]

@@ -172,6 +172,7 @@ BAD_FILES = [
     (changed('version: 1\n', ''), 'version None'),
     (changed('frame: hall\n', ''), "lacks 'frame'"),
     (changed('frame: hall', 'frame: 3'), "'frame' is 3, not a name"),
+    (changed('frame: hall', "frame: ''"), "'frame' is '', not a name"),
     (changed('frame: hall', 'frame: hall\nframes: 1'), "has 'frames', which is not known"),
     ('\n'.join(SURVEYED.splitlines()[:3]), "lacks 'landmarks'"),
     ('\n'.join(SURVEYED.splitlines()[:4]), "'landmarks' is not a list"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 import logging
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -17,12 +18,14 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
     VelocityEvent,
 )
+from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.maps import map_frame
-from slam_observer_ros.maps.alignment import find_transform
+from slam_observer_ros.maps.alignment import _contradictions, find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.localisation import is_lost
 from slam_observer_ros.settings import Settings
 
 POINT_NOISE_M = 0.05
@@ -164,6 +167,39 @@ def test_tracking_in_an_uncertain_map_stays_honest(mode):
         add(estimator, world.drive(0.0, 8.0, count=3))
         nees.append(world.nees(estimator, 7.9))
     assert 0.5 < np.mean(nees) / 3 < 1.7
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+def test_the_velocitys_scale_is_estimated_in_a_map_that_is_known(mode):
+    """As without one; in a fixed map, too."""
+    world = World(3, is_planar=True)
+    settings = world.settings(
+        localization_mode=mode, linear_scale_error=(0.2, 0.0, 0.0), hindsight_interval=0
+    )
+    estimator = Estimator(settings)
+    estimator.load_map(world.map(sigma_m=0.001), world.pose(0.0))
+    for event in world.drive(0.0, 20.0):
+        if isinstance(event, VelocityEvent):
+            event = replace(event, body_velocity=event.body_velocity * [1, 1, 1, 0.9, 1, 1])
+        estimator.add(event)
+    (scale,) = estimator.calibration
+    assert scale.name == 'linear_scale_x'
+    assert scale.value == pytest.approx(1.0 / 0.9, abs=4.0 * scale.deviation)
+    assert scale.deviation < 0.02
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+@pytest.mark.parametrize('is_told', [False, True])
+def test_of_a_map_with_heights_a_planar_estimate_takes_the_plan(mode, is_told):
+    world = World(3, is_planar=True)
+    known = world.map(sigma_m=0.001)
+    raised = replace(known, world_points=known.world_points + [0.0, 0.0, 1.7])
+    estimator = Estimator(world.settings(localization_mode=mode))
+    estimator.load_map(raised, world.start if is_told else None)
+    add(estimator, world.drive(0.0, 1.0))
+    assert estimator.is_localised
+    assert_array_equal(estimator.world_points[:, 2], 0.0)
+    assert_array_equal(estimator.pose[2], [0.0, 0.0, 1.0, 0.0])
 
 
 def test_landmarks_may_be_seen_one_after_another():
@@ -467,6 +503,20 @@ def test_a_fixed_map_is_saved_as_it_was_loaded():
     assert_allclose(saved.covariances[order], known.covariances, atol=1e-12)
 
 
+def test_a_landmark_of_a_fixed_map_that_is_forgotten_leaves_the_others_as_they_were():
+    world = World(3)
+    known = world.map()
+    growing = replace(known, covariances=known.covariances * np.arange(1, 51)[:, None, None])
+    estimator = Estimator(world.settings(localization_mode='fixed'))
+    estimator.load_map(growing, world.start)
+    assert estimator.forget(7)
+    kept = np.array([i for i in range(50) if i != 7])
+    assert estimator.landmark_ids.tolist() == kept.tolist()
+    assert_allclose(estimator.world_points, known.world_points[kept], atol=1e-9)
+    assert_allclose(estimator.landmark_covariances, growing.covariances[kept], atol=1e-12)
+    assert_allclose(estimator.landmark_map.covariances, growing.covariances[kept], atol=1e-12)
+
+
 def test_a_fixed_map_may_be_large():
     world = World(18)
     random = np.random.default_rng(0)
@@ -506,6 +556,30 @@ def test_a_landmark_that_has_moved_does_not_make_the_robot_lost_when_it_is_alone
     assert_allclose(estimator.pose, np.eye(4), atol=0.05)
 
 
+@pytest.mark.parametrize(
+    ('changes', 'expected'),
+    [
+        ({}, True),
+        ({'rejections': [5, 5, 4, 0]}, False),
+        ({'rejections': [9, 9, 9, 0]}, True),
+        ({'rejected_in_a_row': 4}, False),
+        ({'is_mapping': True}, False),
+    ],
+)
+def test_a_robot_is_lost_where_as_many_landmarks_as_place_it_were_rejected_so_often(
+    changes, expected
+):
+    state = {'rejections': [5, 5, 5, 0], 'rejected_in_a_row': 5, 'is_mapping': False} | changes
+    slam = SimpleNamespace(
+        settings=Settings(max_rejections=5),
+        landmarks=SimpleNamespace(rejections=np.array(state['rejections'])),
+        axes=SPATIAL,
+        rejected_in_a_row=state['rejected_in_a_row'],
+        is_mapping=state['is_mapping'],
+    )
+    assert is_lost(slam) == expected
+
+
 def test_the_landmarks_by_which_the_place_was_found_are_in_the_map():
     landmarks = np.array([[5, 0, 0], [5, 3, 1], [5, -3, 0.5], [4, 1, 2], [3, 3, -1]])
     estimator = Estimator(Settings(reorder_window=0.0))
@@ -525,6 +599,28 @@ def test_of_many_landmarks_the_few_that_fit_by_chance_do_not_place_the_robot(is_
         estimator.load_map(LandmarkMap(ids, other, None, np.zeros(20, dtype=np.int64)))
         estimator.add(ObservationEvent(0, ids, own))
         assert not estimator.is_localised
+
+
+def test_a_motion_of_everything_contradicts_nothing_and_one_landmark_that_moved_itself_alone():
+    """What is left is that of the best fitting motion, by generalised least squares."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(scale=5.0, size=(6, 3))
+    J = SPATIAL.output_matrix(points).reshape(-1, 6)
+    root = rng.normal(size=(18, 18))
+    S = 0.01 * (root @ root.T + np.eye(18))
+    moved = (J @ rng.normal(size=6)).reshape(6, 3)
+    total, each = _contradictions(J, S, moved)
+    assert_allclose(total, 0.0, atol=1e-6)
+    assert_allclose(each, 0.0, atol=1e-6)
+    r = rng.normal(size=(6, 3))
+    inverse = np.linalg.inv(S)
+    gamma = np.linalg.solve(J.T @ inverse @ J, J.T @ inverse @ r.ravel())
+    left = r.ravel() - J @ gamma
+    total, _ = _contradictions(J, S, r)
+    assert total == pytest.approx(left @ inverse @ left, rel=1e-6)
+    moved[4] += [3.0, 0.0, 0.0]
+    _, each = _contradictions(J, 0.01 * np.eye(18), moved)
+    assert np.argmax(each) == 4
 
 
 def test_a_pose_that_is_set_stays_in_the_plane():
@@ -677,9 +773,16 @@ class TestInitialPoseOfTheSettings:
         assert estimator.is_localised
         assert np.linalg.norm(world.error(estimator, 3.9)[3:]) < 0.1
 
-    def test_one_that_is_not_asked_for_is_told_to_have_no_effect(self, caplog):
-        estimator = Estimator(Settings(initial_yaw=0.5))
-        assert_array_equal(estimator.pose, np.eye(4))
+    @pytest.mark.parametrize(
+        'given',
+        [
+            {'initial_yaw': 0.5},
+            {'initial_position': (1.0, 0.0, 0.0)},
+            {'initial_position': (0.0, 0.0, -1.0)},
+        ],
+    )
+    def test_one_that_is_not_asked_for_is_told_to_have_no_effect(self, given, caplog):
+        assert_array_equal(Estimator(Settings(**given)).pose, np.eye(4))
         assert 'use set_initial_pose: true' in caplog.text
 
 
@@ -706,6 +809,31 @@ def test_landmarks_of_an_exact_map_stay_where_it_has_them(gains, velocity_error)
     assert_allclose(estimator.world_points, known.world_points, atol=1e-12)
     assert_array_equal(estimator.landmark_velocities, 0.0)
     assert_allclose(estimator.pose, place, atol=0.1)
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain'])
+@pytest.mark.parametrize('gains', GAINS)
+def test_landmarks_mapped_before_an_exact_map_was_loaded_are_where_it_has_them(gains, mode):
+    """Within what the map's own noise, a millimetre at least, allows."""
+    world = World(10)
+    settings = world.settings(gains=gains, localization_mode=mode, map_noise=1e-3)
+    estimator = add(Estimator(settings), world.drive(0.0, 5.0))
+    mapped = estimator.landmark_ids
+    estimator.load_map(world.map(sigma_m=0.0))
+    assert estimator.is_localised
+    rows = [list(estimator.landmark_ids).index(i) for i in mapped]
+    assert_allclose(estimator.world_points[rows], world.points[mapped], atol=5e-3)
+
+
+def test_an_exact_estimate_can_be_brought_into_an_exact_map():
+    """Nothing is uncertain then but where the one lies in the other."""
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    G = np.vstack([np.eye(6), SPATIAL.output_matrix(points).reshape(-1, 6)])
+    gamma = np.array([0.01, 0.02, -0.03, 1.0, 2.0, 3.0])
+    rows, exact = np.arange(6, 18), np.zeros((12, 12))
+    x, P = anchor(np.zeros((18, 18)), G, rows, exact, G[rows] @ gamma)
+    assert_allclose(x, G @ gamma, atol=1e-9)
+    assert_allclose(P, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize('gains', GAINS)

@@ -323,6 +323,40 @@ def test_known_landmarks_weigh_the_same_whether_seen_too_near_or_too_far(setting
     np.testing.assert_allclose(near, far, rtol=5e-3)
 
 
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor(gains):
+    """A sensor on a mast 8 m ahead of the base, 2 m from what it sees."""
+    sensor = se3.pose(np.eye(3), np.array([8.0, 0.0, 0.0]))
+    sights = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
+    noise = {'bearing_noise': 0.1, 'range_noise': 0.05}
+    settings = Settings(gains=gains, reorder_window=0.0, confirmations=1, **noise)
+    estimator = Estimator(settings)
+    for step in range(5):
+        estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+        event = move_observation(ObservationEvent(step * 10**8, np.arange(3), sights), sensor)
+        estimator.add(event)
+    expected = observed(sights, **noise)
+    np.testing.assert_allclose(estimator._slam.look(event).covariances, expected, rtol=0.01)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_of_a_landmark_in_doubt_what_counts_is_where_it_was_measured(gains):
+    """One that is not is as uncertain as where it should be is far."""
+    noise = {'bearing_noise': 0.1, 'range_noise': 0.05}
+    estimator = Estimator(Settings(gains=gains, reorder_window=0.0, **noise))
+    points = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]])
+    for step in range(5):
+        estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+        estimator.add(ObservationEvent(step * 10**8, np.arange(3), points))
+    slam, further = estimator._slam, ObservationEvent(5 * 10**8, np.arange(3), 2.0 * points)
+    expected, measured = observed(points, **noise), observed(2.0 * points, **noise)
+    np.testing.assert_allclose(slam.look(further).covariances, expected, rtol=0.01)
+    slam.landmarks.rejections[1] = slam.settings.max_rejections
+    found = slam.look(further).covariances
+    np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]], rtol=0.01)
+    np.testing.assert_allclose(found[1], measured[1], rtol=0.01)
+
+
 def awkward_observations():
     """Points and covariances that are within the rules but leave some direction exact."""
     turned = so3.exp(np.array([0.3, 0.2, 0.5]))

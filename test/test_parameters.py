@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import math
 from pathlib import Path
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
@@ -160,15 +160,36 @@ def test_whatever_is_given_there_are_settings_or_a_parameter_error(row, value):
         assert type(getattr(settings, row.name)) is type(row.default)
 
 
-@given(
-    st.dictionaries(st.sampled_from([row.name for row in table(Settings)]), junk, max_size=5),
-)
+def values_of(row):
+    """Values that a row of the table takes, those at its limits among them."""
+    if isinstance(row.default, bool):
+        return st.booleans()
+    if row.choices:
+        return st.sampled_from(row.choices)
+    if isinstance(row.default, str):
+        return st.text('abc/_é', max_size=5)
+    low, high = max(row.minimum, -1e6), min(row.maximum, 1e6)
+    if isinstance(row.default, int):
+        return st.integers(int(low), int(high))
+    number = st.floats(low, high) | st.sampled_from([low, high])
+    if isinstance(row.default, tuple):
+        return st.lists(number, min_size=len(row.default), max_size=len(row.default))
+    return number
+
+
+@pytest.mark.parametrize('row', table(Settings), ids=lambda row: row.name)
+@given(data=st.data())
+def test_what_is_in_range_is_taken(row, data):
+    value = data.draw(values_of(row))
+    made = from_parameters(Settings, {row.name: value})
+    assert type(getattr(made, row.name)) is type(row.default)
+
+
+@settings(max_examples=50)
+@given(st.fixed_dictionaries({}, optional={row.name: values_of(row) for row in table(Settings)}))
 def test_settings_that_are_accepted_make_an_estimator(values):
-    try:
-        settings = from_parameters(Settings, values)
-    except ParameterError:
-        return
-    Estimator(settings)
+    made = from_parameters(Settings, values)
+    assert Estimator(made).settings == made
 
 
 @pytest.mark.parametrize(

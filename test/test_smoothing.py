@@ -14,8 +14,10 @@ from gain_worlds import (
     START_NS,
     STEP_NS,
 )
+from hypothesis import given
 import numpy as np
 import pytest
+from strategies import generators
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
@@ -254,6 +256,37 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
     np.testing.assert_allclose(parts.motions, whole.motions, atol=1e-12)
     np.testing.assert_allclose(parts.motion_covariances, whole.motion_covariances, atol=1e-12)
     np.testing.assert_allclose(parts.sensitivities, whole.sensitivities, atol=1e-12)
+    assert (np.abs(whole.sensitivities).max(axis=(0, 1)) > 0.01).all()
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+@given(rng=generators())
+def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
+    d = len(axes.pose)
+    settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
+    calibration = Calibration(settings, axes)
+    c = calibration.count
+    start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(d + c))
+    history = History(axes, ObservationNoise(settings), start, 'the start')
+    turn = np.zeros((3, 6))
+    turn[:, axes.pose] = rng.normal(size=(3, d))
+    poses = se3.exp(np.cumsum(turn, axis=0))
+    noises = random_covariances(rng, 3, d, 0.1)
+    sensitivities = rng.normal(size=(3, d, c))
+    path = np.concatenate([np.eye(4)[None], poses])
+    for part in range(3):
+        history.move(path[part : part + 2], noises[part], sensitivities[part], np.zeros(c))
+    nothing = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+    history.see(Seen(0, *nothing), path[-1])
+    history.see(Seen(1, *nothing), path[-1])  # nothing has moved since
+    frames = history.frames()
+    to_body = se3.adjoint(se3.inverse(path[-1]))[np.ix_(axes.pose, axes.pose)]
+    np.testing.assert_allclose(
+        frames.sensitivities, [to_body @ sensitivities.sum(axis=0), np.zeros((d, c))], atol=1e-9
+    )
+    expected = to_body @ noises.sum(axis=0) @ to_body.T
+    np.testing.assert_allclose(frames.motion_covariances[0], expected, atol=1e-9)
+    np.testing.assert_array_equal(frames.motion_covariances[1], 0.0)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])

@@ -111,6 +111,18 @@ def test_imu_replaces_the_angular_part_while_it_is_in_time():
     assert_array_equal(held.body_velocities[4], V, 'the IMU has timed out')
 
 
+def test_a_velocity_is_in_force_until_its_timeout_has_passed():
+    history = VelocityHistory(SECOND)
+    assert history.latest(0) is None
+    assert history.append(VelocityEvent(5 * SECOND, np.ones(6)))
+    assert history.latest(5 * SECOND - 1) is None
+    for stamp_ns in (5 * SECOND, 6 * SECOND):
+        assert_array_equal(history.latest(stamp_ns), np.ones(6))
+    assert history.latest(6 * SECOND + 1) is None
+    held = history.held(5 * SECOND, 8 * SECOND)
+    assert (held.dt_s.sum(), held.gap_s.sum()) == (1.0, 2.0)
+
+
 def test_an_imu_whose_covariance_is_zero_does_not_know_it():
     history = history_of([imu(0.0, [0.0, 0.0, 0.5], np.zeros((3, 3))), wheels(0.1, V)])
     assert not held_for(history, 0.1, 0.2).is_stated.any()
