@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import ExitStack
 import os
 from pathlib import Path
 import re
 import time
+from types import SimpleNamespace
+from unittest.mock import Mock
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from node_processes import running
@@ -23,6 +27,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.conversions import header_message
+from slam_observer_ros.nodes.diagnostics import Diagnostics as NodeDiagnostics
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transforms import TFMessage
 from slam_observer_ros.simulation import Scenario
@@ -243,6 +248,68 @@ def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
             'an error while nothing can be used',
         )
         assert int(diagnostics.values['dropped: not_finite']) > 0
+
+
+class Told:
+    """The status that diagnostics publish of an estimator's counts."""
+
+    def __init__(self):
+        self.node = Mock()
+        self.node.get_name.return_value = 'observer_node'
+        self.node.get_namespace.return_value = '/robot'
+        self.node.get_clock.return_value.now.return_value.to_msg.return_value = Time()
+        self.dropped = Counter()
+        self.estimator = SimpleNamespace(
+            counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
+            calibration=[], lyapunov=0.0, stamp_ns=None, velocity_is_stale=False,
+            is_localised=True,
+        )  # fmt: skip
+        intake = SimpleNamespace(
+            dropped=Counter(), is_paused=False, clock_troubles=list,
+            take_mean_processing_ms=lambda: 0.0,
+        )  # fmt: skip
+        outputs = SimpleNamespace(trouble='')
+        self.diagnostics = NodeDiagnostics(self.node, self.estimator, intake, [], outputs)
+
+    def publish(self, **new):
+        # A new one, as the real one gives.
+        self.estimator.counts = self.estimator.counts + Counter(new)
+        self.diagnostics.publish()
+        return self.node.create_publisher().publish.call_args.args[0].status[0]
+
+
+@pytest.mark.parametrize(
+    ('points', 'rejected', 'warns'), [(20, 3, True), (20, 2, False), (8, 4, False)]
+)
+def test_more_rejected_points_than_outliers_are_told_once_there_are_enough(
+    points, rejected, warns
+):
+    told = Told()
+    for _ in range(5):  # MIN_POINTS are 50
+        status = told.publish(observation=1, observed_point=points, rejected_landmark=rejected)
+    text = f'{100 * rejected / points:.0f} % of the points seen lately were rejected'
+    assert (text in status.message) == warns
+    assert status.level == (DiagnosticStatus.WARN if warns else DiagnosticStatus.OK)
+
+
+def test_points_rejected_long_ago_are_told_of_no_more():
+    told = Told()
+    for _ in range(5):
+        assert told.publish(observation=1, observed_point=20, rejected_landmark=8)
+    for _ in range(30):
+        status = told.publish(observation=1, observed_point=20)
+    assert status.message == 'running'
+
+
+def test_messages_that_are_all_dropped_are_an_error_and_some_a_warning():
+    told = Told()
+    told.publish()
+    told.dropped['not_finite'] += 3
+    assert told.publish().level == DiagnosticStatus.ERROR
+    told.dropped['not_finite'] += 1
+    status = told.publish(velocity=5)
+    assert (status.level, status.message) == (DiagnosticStatus.WARN, '1 messages dropped')
+    assert told.publish(velocity=5).level == DiagnosticStatus.OK
 
 
 SENT = {

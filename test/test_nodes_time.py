@@ -245,6 +245,29 @@ def test_nothing_is_recommended_that_is_done_already():
     assert len(uncorrected.intake.clock_troubles()) == 2
 
 
+def test_until_the_offset_of_its_clock_is_known_what_an_input_says_is_dropped_and_counted():
+    robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
+    robot.send_all()
+    # Ten of the twist, and ten of the landmarks, to which the fiducials belong.
+    assert robot.intake.dropped == {'clock_unknown': 20}
+    plain = AnotherClock(0)
+    plain.send_all()
+    assert not plain.intake.dropped
+
+
+def test_that_a_clock_was_put_right_is_told_and_its_stamps_are_then_taken_as_they_are():
+    robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
+    last_ns = robot.send_all()
+    robot.node.get_logger().info.reset_mock()
+    robot.behind_ns = 0
+    for step in range(1, 21):
+        robot.send(last_ns + step * SECOND // 20)
+    told = [call.args[0] for call in robot.node.get_logger().info.call_args_list]
+    assert len(told) == 2
+    assert all(text.endswith('and not corrected any more') for text in told)
+    assert all(robot.intake.clocks[name].correction_ns == 0 for name in ('twist', 'landmarks'))
+
+
 def test_a_stamp_that_was_left_out_is_the_time_of_reception(ros, tmp_path):
     poses = ros.collect(PoseWithCovarianceStamped, '/bare/pose')
     with (

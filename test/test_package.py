@@ -57,6 +57,11 @@ def test_launch_config_and_rviz_files_are_installed(monkeypatch):
         assert set(data_files[f'share/{NAME}/{folder}']) == written
 
 
+def test_there_are_executables():
+    """Without the installed package the next test would have nothing to load."""
+    assert SCRIPTS
+
+
 @pytest.mark.parametrize('script', SCRIPTS, ids=lambda script: script.name)
 def test_executables_can_be_loaded(script):
     assert callable(script.load())
