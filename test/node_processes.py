@@ -67,6 +67,7 @@ class Client:
         self.node = rclpy.create_node('test_client', context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def collect(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
         """Return a list to which every message on the topic will be appended."""
@@ -103,13 +104,15 @@ class Client:
 
     def call(self, service_class: type, name: str, request: Any) -> Any:
         """Call a service and return its response."""
-        client = self.node.create_client(service_class, name)
-        self.spin_until(client.service_is_ready, name)
-        # The server may not have heard of its client yet; its response would then be lost.
-        self.spin_for(0.5)
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_class, name)
+        client = self._clients[name]
+        if not client.service_is_ready():
+            self.spin_until(client.service_is_ready, name)
+            # The server may not have heard of its client yet; its response would then be lost.
+            self.spin_for(0.5)
         future = client.call_async(request)
         self.spin_until(future.done, f'response of {name}')
-        self.node.destroy_client(client)
         return future.result()
 
     def close(self) -> None:

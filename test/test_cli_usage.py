@@ -135,9 +135,12 @@ def test_stopped_in_the_middle(tmp_path, stop):
     with subprocess.Popen(
         command, cwd=CHECKOUT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
-        wait_until_ready(process)
-        process.send_signal(stop)
-        assert process.communicate(timeout=60) == ('', '')
+        try:
+            wait_until_ready(process)
+            process.send_signal(stop)
+            assert process.communicate(timeout=60) == ('', '')
+        finally:
+            process.kill()
     assert process.returncode == 128 + stop
     assert not list(tmp_path.iterdir())
 

@@ -47,16 +47,23 @@ class Diagnostics:
         self.messages = ros.collect(DiagnosticArray, '/diagnostics')
 
     @property
+    def all(self):
+        return [m.status[0] for m in self.messages if m.status[0].hardware_id == self.namespace]
+
+    @property
     def status(self):
-        own = [m.status[0] for m in self.messages if m.status[0].hardware_id == self.namespace]
-        return own[-1] if own else DiagnosticStatus()
+        return self.all[-1] if self.all else DiagnosticStatus()
 
     @property
     def values(self):
-        return {value.key: value.value for value in self.status.values}
+        return values_of(self.status)
 
     def wait(self, condition, what):
         self.ros.spin_until(lambda: condition(self), what)
+
+
+def values_of(status):
+    return {value.key: value.value for value in status.values}
 
 
 def ids(maps):
@@ -72,19 +79,20 @@ def test_paused_observer_holds_its_pose_and_counts_what_it_drops(ros, tmp_path):
     ):
         robot.run(RUN)
         assert ros.call(Trigger, '/paused/observer_node/pause', Trigger.Request()).success
-        ros.spin_for(0.2)
-        held = poses[-1]
-        poses.clear()
+        paused_ns = time.time_ns()
         robot.run(RUN)
         diagnostics.wait(lambda d: int(d.values.get('dropped: paused', 0)) > 10, 'the count')
         assert diagnostics.status.level == DiagnosticStatus.WARN
         assert 'paused' in diagnostics.status.message
-        assert not poses
+        resumed_ns = time.time_ns()
         ros.call(Trigger, '/paused/observer_node/resume', Trigger.Request())
         robot.send_zeros()
-        ros.spin_until(lambda: poses, 'a pose')
+        ros.spin_until(lambda: stamp_ns(poses[-1]) > resumed_ns, 'a pose')
+    held = [message for message in poses if stamp_ns(message) < paused_ns]
+    after = poses[len(held) :]
+    assert stamp_ns(after[0]) > resumed_ns
     # The velocity from before the pause is held for velocity_timeout at most.
-    assert poses[-1].pose.pose.position.x < held.pose.pose.position.x + 1.1
+    assert after[-1].pose.pose.position.x < held[-1].pose.pose.position.x + 1.1
 
 
 def test_a_pause_longer_than_stamps_may_jump_erases_nothing(ros, tmp_path):
@@ -225,11 +233,16 @@ def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
         Robot(ros, namespace='/watched') as robot,
     ):
         robot.run(Scenario(velocity_rate=40.0, observation_rate=20.0, duration=3.0))
-        diagnostics.wait(lambda d: float(d.values['/watched/twist rate [Hz]']) > 5.0, 'a rate')
-        values = diagnostics.values
-        assert float(values['/watched/landmarks rate [Hz]']) > 2.0
+
+        def of_a_robot_under_way():
+            """Not the latest status: a busy machine may tell of the run when it is over."""
+            told = [values_of(status) for status in diagnostics.all]
+            return [v for v in told if v['landmarks known'] == '4' and is_moving(v)]
+
+        diagnostics.wait(lambda _: of_a_robot_under_way() or robot.send_zeros(), 'the rates')
+        values = of_a_robot_under_way()[-1]
         assert float(values['/watched/twist age [s]']) < 30.0
-        assert values['landmarks known'] == values['known landmarks seen last'] == '4'
+        assert values['known landmarks seen last'] == '4'
         assert float(values['processing time, mean [ms]']) > 0.0
         assert int(values['used: observation']) > 5
         assert values['calibration: velocity_delay'].endswith(' s')
@@ -248,6 +261,13 @@ def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
             'an error while nothing can be used',
         )
         assert int(diagnostics.values['dropped: not_finite']) > 0
+
+
+def is_moving(values):
+    return (
+        float(values['/watched/twist rate [Hz]']) > 5.0
+        and float(values['/watched/landmarks rate [Hz]']) > 2.0
+    )
 
 
 class Told:
@@ -334,10 +354,12 @@ def test_what_is_missing_is_said_once_with_topic_and_type(ros, tmp_path):
             ),
             'all to be told',
         )
+        start_s = time.monotonic()
         busy_s = {namespace: cpu_seconds(node) for namespace, node in nodes.items()}
         ros.spin_for(2.0)
         for namespace, node in nodes.items():
-            assert cpu_seconds(node) - busy_s[namespace] < 1.0, 'it burns CPU'
+            share = (cpu_seconds(node) - busy_s[namespace]) / (time.monotonic() - start_s)
+            assert share < 0.5, 'it burns CPU'
             said = re.findall('nothing publishes on', node.output)
             assert len(said) == 2 - len(SENT[namespace])
 

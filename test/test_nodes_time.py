@@ -49,9 +49,9 @@ def clock(ros):
     ros.node.destroy_publisher(publisher)
 
 
-def play(ros, robots, clock):
+def play(ros, robots, clock, deliveries):
     """Play a recording as `ros2 bag play --clock` does."""
-    for delivery in Simulation(RUN, SECOND).deliveries():
+    for delivery in deliveries:
         clock(delivery.arrival_ns)
         for robot in robots:
             robot.send(delivery.event)
@@ -75,26 +75,32 @@ def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
             nodes[choice] = stack.enter_context(node)
         robots = [stack.enter_context(Robot(ros, namespace=f'/{choice}')) for choice in choices]
         assert not any(poses.values()), 'published before the clock began'
-        play(ros, robots, clock)
+        deliveries = list(Simulation(RUN, SECOND).deliveries())
+        play(ros, robots, clock, deliveries)
         ros.spin_until(lambda: all(landmark_count(m) == 4 for m in maps.values()), 'the maps')
-        ros.spin_for(0.2)
-        end_x = {choice: poses[choice][-1].pose.pose.position.x for choice in choices}
+        ros.spin_until(
+            lambda: all(m[-1].pose.pose.position.x > 1.0 for m in poses.values()), 'the first run'
+        )
         for messages in poses.values():
             messages.clear()
-        play(ros, robots, clock)
+        clock(SECOND)
         for node in nodes.values():
             node.wait_for_output('The clock has jumped')
+        beginning = [d for d in deliveries if d.arrival_ns < int(1.3 * SECOND)]
+        play(ros, robots, clock, beginning)
         ros.spin_until(
-            lambda: all(m and stamp_ns(m[-1]) > 2 * SECOND for m in poses.values()),
+            lambda: all(any(stamp_ns(p) < 1.3 * SECOND for p in m) for m in poses.values()),
             'the second run',
+        )
+        play(ros, robots, clock, deliveries[len(beginning) :])
+        ros.spin_until(
+            lambda: all(m[-1].pose.pose.position.x > 1.0 for m in poses.values()), 'its end'
         )
     for choice in choices:
         first = min(poses[choice], key=stamp_ns)
-        assert stamp_ns(first) < int(1.3 * SECOND)
         output = nodes[choice].output
         assert output.count('The clock has jumped') == 1, 'told by the clock and by the stamps'
         assert 'Dropped' not in output
-        assert end_x[choice] > 1.0
         if choice == 'reset':
             assert first.pose.pose.position.x < 0.3
         else:
@@ -293,17 +299,19 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
     ]
     lateness = np.random.default_rng(1).integers(0, SECOND // 5, len(events))
     arrivals_ns = np.array([event.stamp_ns for event in events]) + lateness
-    last = [VelocityEvent(start_ns + 2 * SECOND, np.zeros(6))]
+    last = [VelocityEvent(start_ns + 3 * SECOND, np.zeros(6))]
     shuffled = [events[index] for index in np.argsort(arrivals_ns, kind='stable')]
     orders = {'/ordered': [*events, *last], '/shuffled': [*shuffled, *last]}
     end_ns = max(event.stamp_ns for event in events)
+    # A wide window, since a busy machine may deliver one topic well before the other.
+    parameters = {'reorder_window': 1.0, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
     with ExitStack() as stack:
         maps, robots = {}, {}
         for name in orders:
             maps[name] = ros.collect(PointCloud2, f'{name}/map', LATCHED_QOS)
             arguments = ('-r', f'__ns:={name}')
             log = tmp_path / name.strip('/')
-            stack.enter_context(running('observer_node', log, *arguments, reorder_window=0.3))
+            stack.enter_context(running('observer_node', log, *arguments, **parameters))
         for name in orders:
             robots[name] = stack.enter_context(Robot(ros, namespace=name))
         for pair in zip(*orders.values(), strict=True):
@@ -343,7 +351,9 @@ def test_looped_recording_without_simulated_time_begins_path_and_tf_anew(ros, tm
                 robot.send(VelocityEvent(stamp, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
                 ros.spin_for(0.01)
         ros.spin_until(lambda: paths and stamp_ns(paths[-1]) < 60 * SECOND, 'the second run')
-        ros.spin_until(lambda: stamp_ns(corrections(transforms)[-1]) < 60 * SECOND, 'its /tf')
+        ros.spin_until(
+            lambda: any(stamp_ns(t) < 60 * SECOND for t in corrections(transforms)), 'its /tf'
+        )
     stamps = [stamp_ns(pose) for pose in paths[-1].poses]
     assert max(stamps) < 60 * SECOND, 'the path still has poses of the first run'
     assert node.output.count('The clock has jumped') == 1
