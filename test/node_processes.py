@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 import rclpy
 from rclpy.context import Context
@@ -26,11 +26,14 @@ RELIABLE = QoSProfile(depth=5000)
 class NodeProcess:
     """A node as a child process, with its output in a file."""
 
+    started: ClassVar[int] = 0
+
     def __init__(self, name: str, log: Path, *arguments: str, **parameters: object) -> None:
         self.log = log
         command = [sys.executable, '-m', f'slam_observer_ros.nodes.{name}', '--ros-args']
         for key, value in parameters.items():
             command += ['-p', f'{key}:={_yaml(value)}']
+        NodeProcess.started += 1
         with log.open('w') as output:
             self.process = subprocess.Popen(
                 [*command, *arguments], stdout=output, stderr=subprocess.STDOUT
@@ -67,7 +70,7 @@ class Client:
         self.node = rclpy.create_node('test_client', context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
-        self._clients: dict[str, Any] = {}
+        self._clients: dict[tuple[type, str, int], Any] = {}
 
     def collect(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
         """Return a list to which every message on the topic will be appended."""
@@ -104,14 +107,14 @@ class Client:
 
     def call(self, service_class: type, name: str, request: Any) -> Any:
         """Call a service and return its response."""
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(service_class, name)
-        client = self._clients[name]
-        if not client.service_is_ready():
-            self.spin_until(client.service_is_ready, name)
+        # A node that was started since may have taken the place of the one that was called.
+        key = service_class, name, NodeProcess.started
+        if key not in self._clients:
+            self._clients[key] = self.node.create_client(service_class, name)
+            self.spin_until(self._clients[key].service_is_ready, name)
             # The server may not have heard of its client yet; its response would then be lost.
             self.spin_for(0.5)
-        future = client.call_async(request)
+        future = self._clients[key].call_async(request)
         self.spin_until(future.done, f'response of {name}')
         return future.result()
 

@@ -139,10 +139,11 @@ def test_every_gain_design_tracks_in_every_mode(gains, mode, is_planar):
     add(estimator, world.drive(0.0, 20.0))
     assert estimator.is_localised
     error = world.error(estimator, 19.9)
-    assert np.linalg.norm(error[3:]) < 0.15
-    assert np.linalg.norm(error[:3]) < 0.03
+    assert np.linalg.norm(error[3:]) < 0.12
+    assert np.linalg.norm(error[:3]) < 0.02
     rows = [list(estimator.landmark_ids).index(i) for i in known.ids]
-    assert_allclose(estimator.world_points[rows], world.points[known.ids], atol=5 * MAP_NOISE_M)
+    off = estimator.world_points[rows] - world.points[known.ids]
+    assert np.std(off) < 1.05 * np.std(known.world_points - world.points[known.ids])
     added = set(estimator.landmark_ids) - set(known.ids)
     assert bool(added) == (mode == 'off')
     moved = not np.allclose(estimator.world_points[rows], known.world_points, atol=1e-9, rtol=0)
