@@ -13,7 +13,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.calibration import Calibration
-from slam_observer_ros.motion.odometry import transition, transition_covariance
+from slam_observer_ros.motion.integration import transition, transition_covariance
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
 from slam_observer_ros.slam.slam import Slam
@@ -63,7 +63,7 @@ class Timeline:
         """Return whether a newer event was used already."""
         return event.stamp_ns < (self.stamp_ns or 0)
 
-    def begin(self, stamp_ns: int) -> None:
+    def note_stamp(self, stamp_ns: int) -> None:
         """Note the stamp of an event that is about to be used."""
         self.stamp_ns = max(stamp_ns, self.stamp_ns or stamp_ns)
         if self.state_ns is None:
@@ -88,7 +88,7 @@ class Timeline:
             event = replace(event, stamp_ns=self.stamp_ns or 0)
         if not self.velocities.append(event):
             return False
-        self.begin(event.stamp_ns)
+        self.note_stamp(event.stamp_ns)
         self._pending += 1
         return True
 
@@ -116,7 +116,7 @@ class Timeline:
 
     def meet(self, event: ObservationEvent, states: Hypotheses) -> ObservationEvent:
         """Move the states on to an observation, or it to them if it is late; return it."""
-        self.begin(event.stamp_ns)
+        self.note_stamp(event.stamp_ns)
         if event.stamp_ns < (self.state_ns or 0):
             event = self._carried_forward(event, states.best)
         self.advance(states, event.stamp_ns)

@@ -20,7 +20,7 @@ from slam_observer_ros.nodes.conversions import (
     twist_message,
 )
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 from slam_observer_ros.simulation import Simulation
 
 

@@ -22,7 +22,7 @@ from slam_observer_ros.commands.replay_report import as_json
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map
-from slam_observer_ros.nodes.settings import ObserverNodeSettings, SimulatorNodeSettings
+from slam_observer_ros.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.parameters import table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario

@@ -10,8 +10,8 @@ import pytest
 import setuptools  # noqa: F401 (provides distutils)
 import yaml
 
+from slam_observer_ros.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.nodes import initial_pose
-from slam_observer_ros.nodes.settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.parameters import table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario

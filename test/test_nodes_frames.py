@@ -26,7 +26,7 @@ from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
-from slam_observer_ros.nodes import frames
+from slam_observer_ros.nodes import transform_listener
 from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.simulation import Scenario, Simulation
@@ -239,9 +239,9 @@ def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
     fake = SimpleNamespace(
         Buffer=FakeBuffer, TransformListener=Mock(), TransformException=LookupError
     )
-    monkeypatch.setattr(frames, 'tf2_ros', fake)
+    monkeypatch.setattr(transform_listener, 'tf2_ros', fake)
     node = Mock()
-    transforms = frames.open_transforms(node, ('map', 'base'))
+    transforms = transform_listener.open_transforms(node, ('map', 'base'))
     assert fake.TransformListener.call_args.args[1] is node
     assert_allclose(transforms.lookup('base', 'camera', 42)[:3, 3], [42.0, 0.0, 0.0])
     with pytest.raises(TransformError, match='does not exist'):
@@ -257,7 +257,7 @@ def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
 
 def test_the_nodes_own_transform_takes_no_other_ones_place():
     node = Mock()
-    transforms = frames.TopicTransforms(node, ('map', 'base_link'))
+    transforms = transform_listener.TopicTransforms(node, ('map', 'base_link'))
     receive = node.create_subscription.call_args_list[0].args[2]
     for parent in ('odom', 'map'):
         header = header_message(SECOND, parent)

@@ -26,6 +26,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.message_types import IMU
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes import decoders, inputs
 from slam_observer_ros.nodes.conversions import (
     header_message,
@@ -37,8 +38,7 @@ from slam_observer_ros.nodes.conversions import (
 from slam_observer_ros.nodes.input_topics import open_inputs
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 
 pytestmark = pytest.mark.ros
 

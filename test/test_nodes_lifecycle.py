@@ -14,7 +14,7 @@ from rcl_interfaces.srv import SetParameters
 from robots import own_topics, Robot, stamp_ns
 from std_srvs.srv import Trigger
 
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros

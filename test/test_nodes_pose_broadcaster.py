@@ -11,10 +11,10 @@ from robots import pose_of, stamp_ns
 
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes import pose_broadcaster
 from slam_observer_ros.nodes.pose_broadcaster import DISCOVERY_S, PoseBroadcaster
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 
 pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not installed')
 

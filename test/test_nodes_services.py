@@ -29,7 +29,7 @@ from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.diagnostics import Diagnostics as NodeDiagnostics
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros

@@ -27,11 +27,11 @@ from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes.conversions import time_message
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
 from slam_observer_ros.units import to_s

@@ -12,7 +12,7 @@ import pytest
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.nodes.settings import ObserverNodeSettings, SimulatorNodeSettings
+from slam_observer_ros.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.parameter_file import read_parameter_file
 from slam_observer_ros.parameters import from_parameters, parameter, table
 from slam_observer_ros.settings import Settings

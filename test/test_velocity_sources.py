@@ -19,7 +19,7 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.velocity_sources import PoseDifferences
+from slam_observer_ros.inputs.pose_differences import PoseDifferences
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.nodes.clock_offset import ClockOffset, SAMPLES

@@ -13,7 +13,7 @@ import sys
 from types import MappingProxyType
 
 from slam_observer_ros.errors import ParameterError, UsageError
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.parameter_file import names_of_others, read_parameter_file
 from slam_observer_ros.parameters import from_parameters, Parameter, table, Value
 from slam_observer_ros.settings import Settings

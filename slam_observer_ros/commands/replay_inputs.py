@@ -8,7 +8,7 @@ import logging
 
 from slam_observer_ros.commands.options import read_assignments, read_config
 from slam_observer_ros.inputs.settings import InputSettings
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics, TopicNames

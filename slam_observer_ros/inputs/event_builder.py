@@ -11,7 +11,7 @@ from typing import TypeAlias
 from slam_observer_ros.errors import InvalidEventError, TransformError
 from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityEvent
 from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.inputs.velocity_sources import PoseDifferences
+from slam_observer_ros.inputs.pose_differences import PoseDifferences
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import AnyMeasurement, Measurement
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage

@@ -16,7 +16,7 @@ from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.point_clouds import measured
+from slam_observer_ros.messages.point_clouds import without_unmeasured
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.types import FloatArray
 
@@ -59,7 +59,7 @@ def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
     poses = reader.float64(_POSE * reader.uint32()).reshape(-1, _POSE)
     reader.finish()
     ids = np.full(len(poses), UNKNOWN_ID, dtype=np.int64)
-    return Measurement(frame_id, measured(ObservationEvent(stamp_ns, ids, poses[:, :3])))
+    return Measurement(frame_id, without_unmeasured(ObservationEvent(stamp_ns, ids, poses[:, :3])))
 
 
 def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
@@ -78,7 +78,7 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
     known = [covariance for _, _, covariance in detections if covariance.any()]
     covariances = np.array(known) if known and len(known) == len(detections) else None
     event = ObservationEvent(stamp_ns, ids, points, covariances)
-    return Measurement(frame_id, measured(event))
+    return Measurement(frame_id, without_unmeasured(event))
 
 
 def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:

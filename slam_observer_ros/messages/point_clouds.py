@@ -71,7 +71,7 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[O
                 raise MessageError(f'{len(values)} ids for {len(points)} points')
             ids = _ids_from_floats(values)
     reader.finish()
-    return Measurement(frame_id, measured(ObservationEvent(stamp_ns, ids, points)))
+    return Measurement(frame_id, without_unmeasured(ObservationEvent(stamp_ns, ids, points)))
 
 
 def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
@@ -114,10 +114,10 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[
     dtype = _record_type(fields, byte_order, point_step)
     strides = (row_step if height > 1 else len(data), point_step)
     records: Records = np.ndarray((height, width), dtype, data, strides=strides)
-    return Measurement(frame_id, measured(_observation(stamp_ns, records)))
+    return Measurement(frame_id, without_unmeasured(_observation(stamp_ns, records)))
 
 
-def measured(event: ObservationEvent) -> ObservationEvent:
+def without_unmeasured(event: ObservationEvent) -> ObservationEvent:
     """Return an observation without the points that are NaN or infinite: they weren't measured."""
     is_measured: BoolArray = np.all(np.isfinite(event.points), axis=1)
     return event.select(is_measured)

@@ -24,7 +24,7 @@ from slam_observer_ros.messages.poses_and_velocities import (
     decode_pose_with_covariance_stamped,
 )
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s

@@ -30,10 +30,10 @@ from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
 )
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes.decoders import CloudDecoder, OdometryDecoder, TagDecoder
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
 
 ValueT = TypeVar('ValueT')
 

@@ -27,8 +27,8 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_trouble
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes.clock_offset import ClockOffset
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.units import to_ns
 
 REPORT_PERIOD_S = 10.0

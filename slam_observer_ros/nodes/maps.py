@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from slam_observer_ros.errors import MapError, ParameterError, SlamObserverError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.maps.map_file import check_writable, read_map, write_map
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.node_settings import ObserverNodeSettings
 
 
 class Maps:

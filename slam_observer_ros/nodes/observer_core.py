@@ -10,17 +10,17 @@ from rclpy.timer import Timer
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes.controls import Controls
 from slam_observer_ros.nodes.diagnostics import Diagnostics
 from slam_observer_ros.nodes.entities import Entities
-from slam_observer_ros.nodes.frames import open_transforms
 from slam_observer_ros.nodes.initial_pose import InitialPose
 from slam_observer_ros.nodes.input_topics import open_inputs
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.maps import Maps
 from slam_observer_ros.nodes.outputs import Outputs
 from slam_observer_ros.nodes.parameters import read_settings
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
+from slam_observer_ros.nodes.transform_listener import open_transforms
 from slam_observer_ros.settings import Settings
 
 OVERVIEW_PERIOD_S = 0.5

@@ -20,6 +20,7 @@ from visualization_msgs.msg import MarkerArray
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud, FLOAT32_ID_LIMIT
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
@@ -31,7 +32,6 @@ from slam_observer_ros.nodes.conversions import (
 from slam_observer_ros.nodes.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
 from slam_observer_ros.types import FloatArray
 
 PATH_SPACING_NS = 100_000_000

@@ -10,9 +10,9 @@ from rclpy.node import Node
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import TransformSource
+from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
-from slam_observer_ros.nodes.settings import ObserverNodeSettings
-from slam_observer_ros.nodes.transforms import TransformPublisher
+from slam_observer_ros.nodes.transform_publisher import TransformPublisher
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_ns, to_s
 

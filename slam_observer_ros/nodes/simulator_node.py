@@ -16,6 +16,7 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
+from slam_observer_ros.node_settings import SimulatorNodeSettings
 from slam_observer_ros.nodes.conversions import (
     header_message,
     point_cloud2_message,
@@ -26,8 +27,7 @@ from slam_observer_ros.nodes.conversions import (
 from slam_observer_ros.nodes.parameters import declare_settings, read_settings
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.runner import run
-from slam_observer_ros.nodes.settings import SimulatorNodeSettings
-from slam_observer_ros.nodes.transforms import TransformPublisher
+from slam_observer_ros.nodes.transform_publisher import TransformPublisher
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
 from slam_observer_ros.truth import PoseTruth
 from slam_observer_ros.units import to_ns

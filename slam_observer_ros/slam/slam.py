@@ -12,9 +12,9 @@ from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.motion.integration import integrate
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
-from slam_observer_ros.motion.odometry import motion
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.observer import Observer
@@ -161,7 +161,7 @@ class Slam:
         self._end_velocity = None if moved.at_ends is None else moved.at_ends[1]
 
     def _motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
-        return motion(
+        return integrate(
             velocities,
             self.gains.calibration,
             self.motion_noise,

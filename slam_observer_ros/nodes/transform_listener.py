@@ -14,7 +14,7 @@ from slam_observer_ros.errors import MessageError, TransformError
 from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.poses_and_velocities import decode_transforms, pose_matrices
-from slam_observer_ros.nodes.transforms import TFMessage
+from slam_observer_ros.nodes.transform_publisher import TFMessage
 from slam_observer_ros.types import FloatArray
 
 try:

@@ -39,7 +39,7 @@ def transition_covariance(
     return covariance
 
 
-def motion(
+def integrate(
     velocities: VelocityHistory,
     calibration: Calibration,
     noise: MotionNoise,
