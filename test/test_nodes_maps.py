@@ -22,7 +22,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.maps.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
@@ -435,3 +435,27 @@ def test_with_wrong_parameters_the_node_says_why_and_does_not_start(tmp_path, pa
     assert node.wait() == 2
     assert reason in node.output
     assert 'Traceback' not in node.output
+
+
+def test_without_ids_the_pose_in_a_map_is_asked_for(ros, robot, tmp_path):
+    diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+    surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(5))
+    message = 'points have no ids: give the pose on initialpose'
+
+    def is_told():
+        return diagnostics and message in diagnostics[-1].status[0].message
+
+    def see_without_ids():
+        ids, points = np.full(3, UNKNOWN_ID), robot.points[2:5]
+        robot.landmarks.publish(point_cloud2_message(time.time_ns(), 'base_link', ids, points))
+        ros.spin_for(0.1)
+
+    with running('observer_node', tmp_path / 'log', map_file=surveyed, **PARAMETERS) as node:
+        node.wait_for_output('until three of them are recognised by their ids, or it is given on')
+        robot.connect()
+        robot.see(np.eye(4), [0, 1])
+        diagnostics.clear()
+        ros.spin_until(lambda: len(diagnostics) > 1, 'diagnostics')
+        assert 'place in the loaded map' in diagnostics[-1].status[0].message
+        assert not is_told()
+        ros.spin_until(lambda: see_without_ids() or is_told(), 'the request')

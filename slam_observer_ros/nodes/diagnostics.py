@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from slam_observer_ros.counts import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.events import is_automatic
 from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.outputs import Outputs
@@ -139,7 +140,16 @@ class Diagnostics:
         warnings.append(self._outputs.trouble)
         if not self._estimator.is_localised:
             warnings.append('the place in the loaded map is not known yet: no pose is published')
+            warnings.append(self._ids_warning())
         return [warning for warning in warnings if warning]
+
+    def _ids_warning(self) -> str:
+        """Tell that the place in a map is not found by what is seen: nothing of it has an id."""
+        update = self._estimator.last_update
+        # Landmarks that came without an id have one that was given here.
+        if update is None or not len(update.ids) or not is_automatic(update.ids).all():
+            return ''
+        return 'points have no ids: give the pose on initialpose'
 
     def _rejections_warning(self, new: Counter[str]) -> str:
         """Tell that more points were rejected of late than a sensor has outliers."""

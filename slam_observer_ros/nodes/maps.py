@@ -181,7 +181,10 @@ class Maps:
         estimator = self._estimator
         if not estimator.is_localised:
             number = 'two' if estimator.settings.two_d_mode else 'three'
-            return f'the pose is unknown until {number} of them are seen or it is given'
+            return (
+                f'the pose is unknown until {number} of them are recognised by their ids, or it '
+                'is given on initialpose'
+            )
         if estimator.last_update is None:
             x, y, z = estimator.pose[:3, 3].tolist()
             return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
