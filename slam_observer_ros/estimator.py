@@ -154,8 +154,8 @@ class Estimator:
             (4, 4) pose in the map's frame; what was mapped until now is forgotten. By default
             the pose is that of the settings if they have one and the robot is still there.
             Otherwise it is unknown: it follows from landmarks of the map that are seen, three in
-            space or two in a plane, and what was mapped until then is carried into the map's
-            frame. See :attr:`is_localised`.
+            space or two in a plane, if they have ids, and what was mapped until then is carried
+            into the map's frame. See :attr:`is_localised`.
         pose_covariance : FloatArray, optional
             (6, 6) covariance of ``pose`` as :attr:`pose_covariance` has it; default exact.
 
