@@ -584,7 +584,7 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     poses = se3.exp(rng.normal(scale=[0.3] * 3 + [2.0] * 3, size=(3, 6)))
     roots = 0.1 * rng.normal(size=(3, 6, 6))
     covariances, costs = roots @ roots.swapaxes(1, 2), np.array([0.0, 1.0, 3.0])
-    states = Hypotheses(Slam(settings, np.eye(4)), settings)
+    states = Hypotheses(Slam(settings, np.eye(4)))
     states._states = [deepcopy(states.best) for _ in poses]
     states._costs = costs.tolist()
     for slam, pose, covariance in zip(states._states, poses, covariances, strict=True):

@@ -328,7 +328,10 @@ def test_messages_that_are_all_dropped_are_an_error_and_some_a_warning():
     assert told.publish().level == DiagnosticStatus.ERROR
     told.dropped['not_finite'] += 1
     status = told.publish(velocity=5)
-    assert (status.level, status.message) == (DiagnosticStatus.WARN, '1 messages dropped')
+    assert (status.level, status.message) == (
+        DiagnosticStatus.WARN,
+        '1 messages dropped (not_finite)',
+    )
     assert told.publish(velocity=5).level == DiagnosticStatus.OK
 
 
