@@ -113,7 +113,7 @@ def _anees(result: Replay, truth: Trajectory) -> float | None:
 
 
 def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
-    if truth.landmarks is None or is_automatic(ids).all():
+    if truth.landmarks is None or (len(ids) and is_automatic(ids).all()):
         return None  # landmarks without ids of their own have no counterpart
     try:
         errors = landmark_errors(ids, world_points, truth.landmarks)

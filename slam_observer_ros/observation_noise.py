@@ -12,7 +12,7 @@ from slam_observer_ros.types import FloatArray, Immutable
 RESOLUTION_M = 1e-4
 """Standard deviation that no coordinate of an observed point falls short of, metres.
 
-What claims to be better is lost in rounding beside a pose that is known to a kilometre.
+What claims to be better is lost in rounding beside a pose that may be off by a kilometre.
 """
 
 RELATIVE_RESOLUTION = 1e-6

@@ -131,7 +131,7 @@ class Settings(Immutable):
         choices=('range_bearing', 'cartesian', 'stereo'),
     )
     range_noise: float = parameter(
-        0.1, 'Range and bearing: standard deviation of the range', unit='m', minimum=1e-6
+        0.1, 'Range and bearing: standard deviation of the range', unit='m', minimum=1e-4
     )
     range_scale_noise: float = parameter(
         0.0,
@@ -142,7 +142,7 @@ class Settings(Immutable):
         0.03, 'Range and bearing: standard deviation of each angle', unit='rad', minimum=1e-6
     )
     point_noise: float = parameter(
-        0.05, 'Cartesian: standard deviation of each coordinate', unit='m', minimum=1e-6
+        0.05, 'Cartesian: standard deviation of each coordinate', unit='m', minimum=1e-4
     )
     stereo_focal_length: float = parameter(500.0, 'Stereo: focal length', unit='px', minimum=1.0)
     stereo_baseline: float = parameter(0.2, 'Stereo: baseline', unit='m', minimum=1e-3)

@@ -333,6 +333,8 @@ def test_messages_that_are_all_dropped_are_an_error_and_some_a_warning():
         DiagnosticStatus.WARN,
         '1 messages dropped (not_finite)',
     )
+    told.dropped.update({'not_finite': 2, 'too_late': 1})
+    assert told.publish(velocity=5).message == '3 messages dropped (mostly not_finite)'
     assert told.publish(velocity=5).level == DiagnosticStatus.OK
 
 

@@ -79,7 +79,8 @@ def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
         play(ros, robots, clock, deliveries)
         ros.spin_until(lambda: all(landmark_count(m) == 4 for m in maps.values()), 'the maps')
         ros.spin_until(
-            lambda: all(m[-1].pose.pose.position.x > 1.0 for m in poses.values()), 'the first run'
+            lambda: all(m and m[-1].pose.pose.position.x > 1.0 for m in poses.values()),
+            'the first run',
         )
         for messages in poses.values():
             messages.clear()
@@ -94,7 +95,7 @@ def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
         )
         play(ros, robots, clock, deliveries[len(beginning) :])
         ros.spin_until(
-            lambda: all(m[-1].pose.pose.position.x > 1.0 for m in poses.values()), 'its end'
+            lambda: all(m and m[-1].pose.pose.position.x > 1.0 for m in poses.values()), 'its end'
         )
     for choice in choices:
         first = min(poses[choice], key=stamp_ns)

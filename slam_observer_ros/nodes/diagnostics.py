@@ -145,9 +145,9 @@ class Diagnostics:
 
     def _ids_warning(self) -> str:
         """Tell that the place in a map is not found by what is seen: nothing of it has an id."""
-        update = self._estimator.last_update
         # Landmarks that came without an id have one that was given here.
-        if update is None or not len(update.ids) or not is_automatic(update.ids).all():
+        ids = self._estimator.landmark_ids
+        if not len(ids) or not is_automatic(ids).all():
             return ''
         return 'points have no ids: give the pose on initialpose'
 
