@@ -65,8 +65,8 @@ class ConfigurationError:
             (4, 4) estimated pose.
         ids : IntArray
             (n,) landmarks known so far; those without truth are passed over. One whose sensor
-            gave no id stands for the true landmark that it was nearest to most often so far when
-            it was seen, as the robot had it; before that it is passed over, too.
+            gave no id stands for the true landmark that it was nearest to most often since it was
+            first seen, as seen by the robot; until then it is passed over, too.
         world_points : FloatArray
             (n, 3) their estimated positions in the estimate's world, metres.
         true_pose : FloatArray
@@ -84,8 +84,9 @@ class ConfigurationError:
             return
         seen = se3.transform(se3.inverse(pose), world_points)
         true_seen = se3.transform(se3.inverse(true_pose), truth.world_points)
-        are_seen = True if seen_ids is None else np.isin(ids, seen_ids)
-        for row in np.flatnonzero(is_automatic(ids) & are_seen):
+        new_ids = ids if seen_ids is None else seen_ids
+        were_seen = np.isin(ids, [*self._votes, *new_ids.tolist()])
+        for row in np.flatnonzero(is_automatic(ids) & were_seen):
             nearest = np.argmin(np.linalg.norm(true_seen - seen[row], axis=1))
             self._votes[int(ids[row])][int(truth.ids[nearest])] += 1
         true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
