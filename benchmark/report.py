@@ -101,8 +101,8 @@ all are given the same larger covariances.
 
 Configuration error: after each observation, the RMS over all landmarks seen three times or more
 so far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. A landmark without
-id is compared with the true one that it was nearest to most of the time so far. ATE and heading are
-those of the poses right after the observations, after one rigid alignment of their positions.
+id is compared with the true one that it was nearest to most of the time so far. ATE and heading
+are those of the poses right after the observations, after one rigid alignment of their positions.
 CPU time is that of the estimator's own calls, the least of three runs (of one, where ids are left
 out); integrating the velocities, which all but the observer do by the same code, costs what dead
 reckoning costs. `failed`: GTSAM gave up with a singular system, or nothing was mapped. Outliers
