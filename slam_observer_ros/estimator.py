@@ -378,8 +378,8 @@ class Estimator:
         are places in ``landmark_ids``. None where the gains know none.
         """
         slam = self._slam
-        seen_rows = slam.confirmed[rows]
-        return covariances.of_configuration(slam.observer, slam.gains, slam.axes, seen_rows)
+        confirmed = slam.confirmed[rows]
+        return covariances.of_configuration(slam.observer, slam.gains, slam.axes, confirmed)
 
     @property
     def landmark_velocities(self) -> FloatArray:

@@ -6,13 +6,12 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 import logging
 from pathlib import Path
 import re
-from typing import Any
 
 import yaml
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import suggestion
-from slam_observer_ros.yaml_keys import check_keys
+from slam_observer_ros.yaml_keys import UniqueKeys
 
 logger = logging.getLogger(__name__)
 
@@ -98,13 +97,8 @@ def _is_misspelt(name: str, ours: str) -> bool:
     return rest in (right[1:], swapped) or rest[1:] in (right, right[1:])
 
 
-class _RosLoader(yaml.SafeLoader):
-    """Reads no key twice, and numbers as ROS does: 1e-3 is one, though YAML 1.1 wants 1.0e-3."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
-        """Return a mapping; raise a YAMLError if it has a key twice."""
-        check_keys(node)
-        return super().construct_mapping(node, deep)
+class _RosLoader(UniqueKeys, yaml.SafeLoader):
+    """Reads numbers as ROS does: 1e-3 is one, though YAML 1.1 wants 1.0e-3."""
 
 
 _RosLoader.add_implicit_resolver(

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import yaml
 
 
-def check_keys(node: yaml.MappingNode) -> None:
-    """Check that a mapping has each key once, before it is made into a dict.
+class UniqueKeys:
+    """Mixin: a YAML loader with it before PyYAML's own refuses a key that is there twice."""
 
-    Raises
-    ------
-    yaml.YAMLError
-        If it has one twice.
-
-    """
-    keys = (key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-    for key, count in Counter(keys).items():
-        if count > 1:
-            raise yaml.YAMLError(f"'{key}' is there {count} times in one entry")
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
+        """Return a mapping; raise a YAMLError if it has a key twice."""
+        keys = (key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for key, count in Counter(keys).items():
+            if count > 1:
+                raise yaml.YAMLError(f"'{key}' is there {count} times in one entry")
+        return super().construct_mapping(node, deep)  # type: ignore[misc]  # the loader's

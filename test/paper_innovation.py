@@ -44,13 +44,7 @@ def paper_innovation(
 def lyapunov_rate(gain_k: FloatArray, gain_l: FloatArray, e: FloatArray, r: FloatArray) -> float:
     """Return dL/dt under the paper's innovation: −‖P(Σ k_i r_i ē_iᵀ)‖² − Σ l_i |r_i|² (35).
 
-    Parameters
-    ----------
-    gain_k, gain_l : FloatArray
-        (m,) gains k_i and l_i.
-    e, r : FloatArray
-        (m, 3) errors (29) and residuals, metres.
-
+    Parameters are those of :func:`paper_innovation`.
     """
     projection = se3.project(_outer_sum(gain_k, e, r))
     return float(-np.sum(projection**2) - np.sum(gain_l * np.sum(r * r, axis=-1)))

@@ -34,7 +34,7 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.yaml_keys import check_keys
+from slam_observer_ros.yaml_keys import UniqueKeys
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
@@ -54,18 +54,13 @@ _FastLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
-class _StrictLoader(_FastLoader):  # type: ignore[misc]  # one of two classes
-    """Reads decimal numbers alone, and no key twice: by YAML 1.1, 010 is 8 and 1:30 is 90."""
+class _StrictLoader(UniqueKeys, _FastLoader):  # type: ignore[misc]  # one of two classes
+    """Reads decimal numbers alone: by YAML 1.1, 010 is 8 and 1:30 is 90."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own)
         first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT)]
         for first, resolvers in _FastLoader.yaml_implicit_resolvers.items()
     }
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
-        """Return a mapping; raise a YAMLError if it has a key twice."""
-        check_keys(node)
-        return super().construct_mapping(node, deep)
 
 
 _StrictLoader.add_implicit_resolver(

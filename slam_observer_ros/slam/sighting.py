@@ -29,8 +29,6 @@ class Sighting:
         The observation without points that have no id, or are of no landmark that is mapped.
     rows : IntArray
         (m,) row of the landmark that each of them is, −1 where it is new.
-    known : BoolArray
-        (m,) which are not new.
     covariances : FloatArray
         (m, 3, 3) their covariances, body frame, m².
     residuals : Residuals
@@ -43,10 +41,14 @@ class Sighting:
 
     event: ObservationEvent
     rows: IntArray
-    known: BoolArray
     covariances: FloatArray
     residuals: Residuals
     left_out: dict[str, int]
+
+    @property
+    def known(self) -> BoolArray:
+        """(m,) which of the points are of landmarks that are not new."""
+        return self.rows >= 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ class Outlook:
         """Return what the points of ``event`` tell, of landmarks ``rows`` (m,)."""
         known, covariances = rows >= 0, self._covariances(event, rows)
         residuals = self.residuals(event.select(known), rows[known], covariances[known])
-        return Sighting(event, rows, known, covariances, residuals, left_out)
+        return Sighting(event, rows, covariances, residuals, left_out)
 
     def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
