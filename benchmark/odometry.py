@@ -52,8 +52,8 @@ class Odometry:
         start_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
         held = self._velocities.held(start_ns, stamp_ns)
         path = paths.path(np.eye(4), held.body_velocities * held.dt_s[:, None])
-        Ad = se3.adjoint(se3.inverse(path[-1]) @ path[:-1])
-        covariances = Ad @ self._noise.covariances(held) @ Ad.swapaxes(1, 2)
+        Ad = se3.adjoint(se3.inverse(path[-1]) @ path)
+        covariances = Ad @ paths.at_poses(self._noise.covariances(held)) @ Ad.swapaxes(1, 2)
         self._velocities.forget_before(stamp_ns)
         self._stamp_ns = stamp_ns
         return path[-1], covariances.sum(axis=0)

@@ -9,6 +9,7 @@ from typing import TypeAlias
 from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.matrices import transpose
@@ -131,25 +132,19 @@ class Timeline:
     def _carried_forward(self, event: ObservationEvent, slam: Slam) -> ObservationEvent:
         """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
 
-        Its points are as uncertain as they were, and as that motion makes them. Its error is one
-        and the same for all m, but is given to each as its own: m of them would average it down.
+        Its points are as uncertain as any seen from there, and as that motion makes them. Its
+        error is one and the same for all m, but is given to each as its own: m would average it
+        down.
         """
         state_ns = event.stamp_ns if self.state_ns is None else self.state_ns
         back = self.motion(slam.gains.calibration, state_ns, event.stamp_ns)
-        turn, points = back[:3, :3], event.points
+        points = event.points
         if event.velocities is not None:
             points = points + event.velocities * to_s(state_ns - event.stamp_ns)
+        moved = move_observation(replace(event, stamp_ns=state_ns, points=points), back)
         Q = transition_covariance(
             self.velocities, slam.gains.calibration, slam.motion_noise, event.stamp_ns, state_ns
         )
-        C = SPATIAL.output_matrix(points)
-        moved = len(points) * C @ Q @ transpose(C)
-        covariances = slam.observation_noise.covariances(event) + moved
-        return replace(
-            event,
-            stamp_ns=state_ns,
-            points=se3.transform(back, points),
-            covariances=turn @ covariances @ turn.T,
-            velocities=None if event.velocities is None else se3.rotate(back, event.velocities),
-            sensor=None,  # the covariances are stated now
-        )
+        C = back[:3, :3] @ SPATIAL.output_matrix(points)
+        shared = len(points) * C @ Q @ transpose(C)
+        return replace(moved, covariances=slam.covariances_of(moved) + shared)

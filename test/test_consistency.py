@@ -16,8 +16,8 @@ from slam_observer_ros.evaluation.consistency import (
 )
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.extrinsics import move_observation
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 

@@ -16,8 +16,8 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from tum_files import read_tum
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.inputs.extrinsics import move_observation
 from slam_observer_ros.maps.map_file import read_map
 from slam_observer_ros.simulation import Scenario, Simulation
 

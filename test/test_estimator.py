@@ -203,6 +203,38 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_
     np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
 
 
+def test_landmarks_that_are_always_seen_late_are_not_drawn_towards_the_robot():
+    """A stereo camera that measures one too near must not be believed more for that."""
+    stereo = Settings(
+        observation_model='stereo',
+        angular_velocity_noise=(1e-4,) * 3,
+        linear_velocity_noise=(1e-4,) * 3,
+        reorder_window=0.0,
+    )
+    directions = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0]])
+    share = 0.12  # of the range is the standard deviation there
+    parallax = stereo.disparity_noise / (stereo.stereo_focal_length * stereo.stereo_baseline)
+    range_m, noise, others = share / parallax, np.random.default_rng(0), np.array([99])
+    estimators = {is_late: Estimator(stereo) for is_late in (False, True)}
+    for step in range(60):
+        stamp_ns = START_NS + step * 10**8
+        scales = 1.0 + share * noise.normal(size=(4, 1))
+        seen = ObservationEvent(stamp_ns, np.arange(4), range_m * scales * directions)
+        newer = ObservationEvent(stamp_ns + 10**7, others, np.ones((1, 3)))
+        for is_late, estimator in estimators.items():
+            estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+            for event in (newer, seen) if is_late else (seen, newer):
+                estimator.add(event)
+    assert estimators[True].counts['late_observation'] == 60
+
+    def mean_range_m(estimator):
+        found = estimator.world_points[np.isin(estimator.landmark_ids, np.arange(4))]
+        return np.linalg.norm(found - estimator.pose[:3, 3], axis=1).mean()
+
+    in_time, late = mean_range_m(estimators[False]), mean_range_m(estimators[True])
+    np.testing.assert_allclose(late, in_time, rtol=5e-3)
+
+
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_observations_that_come_late_among_others_leave_the_covariance_honest(two_d_mode):
     settings = Settings(
@@ -269,6 +301,25 @@ def test_in_a_gap_the_pose_is_held_and_flagged():
     np.testing.assert_allclose(estimator.pose, true_pose(0.5), atol=1e-9)
     assert estimator.velocity_is_stale
     np.testing.assert_array_equal(estimator.body_velocity, np.zeros(6))
+
+
+def test_what_is_unknown_of_a_gap_begins_where_it_leaves_the_robot():
+    """Not where its last velocity came, 4 m behind: turning there would move it sideways."""
+    turn_variance, density = 0.01**2, 0.2  # in rad², m/√s
+    settings = Settings(
+        two_d_mode=True,
+        angular_velocity_noise=(0.0, 0.0, 0.0),
+        linear_velocity_noise=(0.0, 0.0, 0.0),
+        unknown_angular_motion=np.sqrt(turn_variance),
+        unknown_linear_motion=density,
+    )
+    estimator = Estimator(settings)
+    for event in (velocity(0.0, [0, 0, 0, 4, 0, 0]), observation(2.0, [])):  # a second is unknown
+        estimator.add(event)
+    estimator.flush()
+    np.testing.assert_allclose(estimator.pose[:3, 3], [4.0, 0.0, 0.0], atol=1e-9)
+    expected = np.diag([0.0, 0.0, turn_variance, density**2, density**2, 0.0])
+    np.testing.assert_allclose(estimator.pose_covariance, expected, atol=1e-12)
 
 
 def test_without_any_velocity_observations_still_build_a_map():
@@ -620,6 +671,32 @@ def test_a_landmark_stops_where_its_sensor_says_nothing_of_a_velocity_any_more(g
     np.testing.assert_allclose(estimator.world_points, points, atol=1e-6)
     np.testing.assert_array_equal(estimator.landmark_velocities, 0.0)
     assert estimator.counts['rejected_landmark'] == 0
+
+
+def test_a_landmark_that_comes_back_tells_as_much_as_one_that_was_always_there():
+    """The robot knows where it went, but not how it has turned itself meanwhile."""
+    settings = Settings(
+        confirmations=1,
+        reorder_window=0.0,
+        velocity_timeout=10.0,
+        observation_model='cartesian',
+        point_noise=0.01,
+        angular_velocity_noise=(0.01,) * 3,
+    )
+    speed = np.zeros_like(LANDMARKS)
+    speed[0] = [0.0, 3.0, 0.0]
+    at_rest = LANDMARKS + 4.0 * speed
+
+    def back_after_4_s(points, velocities):
+        estimator, back_ns = Estimator(settings), START_NS + 4 * 10**9
+        estimator.add(velocity(0.0, np.zeros(6)))
+        estimator.add(ObservationEvent(START_NS, np.arange(5), points, None, velocities))
+        estimator.add(ObservationEvent(back_ns, np.array([0]), at_rest[:1]))
+        estimator.flush()
+        return estimator.configuration_covariance(np.arange(5))
+
+    moved, expected = back_after_4_s(LANDMARKS, speed), back_after_4_s(at_rest, 0.0 * speed)
+    np.testing.assert_allclose(moved, expected, atol=1e-3 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize('gains', GAINS)

@@ -10,9 +10,9 @@ import pytest
 
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_velocity
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.event_builder import drop_reason, EventBuilder, MAX_WAITING
-from slam_observer_ros.inputs.extrinsics import move_velocity
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer

@@ -21,8 +21,8 @@ from tf2_msgs.msg import TFMessage
 
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation, move_velocity
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices

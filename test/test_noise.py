@@ -12,9 +12,9 @@ from strategies import generators
 
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation, move_velocity
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import SPATIAL
-from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.integration import transition, transition_covariance
 from slam_observer_ros.motion.noise import MotionNoise
@@ -187,8 +187,7 @@ def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
         F = np.array([error(piece, 1e-6 * w) / 1e-6 for w in np.eye(6)]).T
         expected += F @ Q @ F.T
     found = transition_covariance(*way(V), MotionNoise(settings), 0, pieces * dt_ns)
-    # A rate's noise is taken to act at the piece's beginning, not throughout: hence 2 %.
-    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
+    assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize('unknown', [slice(0, 3), slice(3, 6)], ids=['angular', 'linear'])

@@ -12,8 +12,8 @@ from strategies import poses
 
 from slam_observer_ros.errors import TransformError
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.extrinsics import move_observation, move_velocity
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.extrinsics import move_observation, move_velocity
 from slam_observer_ros.inputs.frames import insert_transforms
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
 from slam_observer_ros.messages.poses_and_velocities import decode_transforms

@@ -1,6 +1,6 @@
 """The paper's gains: constant k_i and l_i, integrated so that every time step is stable.
 
-The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²). Here
+The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²/2). Here
 the pose is moved by an exponential integrator of the linearised flow. With J_i = [−[e_i]×, I],
 g = Σ k_i J_iᵀ r_i and the Gauss–Newton matrix H = Σ k_i J_iᵀ J_i, that is
 

@@ -56,6 +56,7 @@ class FullMapGains(RiccatiGains):
 
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
+        self.settle(observer)  # landmarks with a velocity have moved
         if self._is_moving:
             self._predict_moving(observer, motion)
             return
@@ -71,19 +72,16 @@ class FullMapGains(RiccatiGains):
     def _predict_moving(self, observer: Observer, motion: Motion) -> None:
         """Predict landmarks that move by ũ_i dt, then the robot at their end.
 
-        Its noise turns R_Ã in ã_i = â_i − R_Ã a_i and ũ_i = û_i − R_Ã u_i, and leaves
-        â_i − a_i = ã_i − [â_i]× ω and û_i − u_i = ũ_i − [û_i]× ω alone.
+        Its noise turns R_Ã in ũ_i = û_i − R_Ã u_i, and leaves û_i − u_i = ũ_i − [û_i]× ω alone.
         """
         joint, everything = self._joint, np.arange(self._joint.count)
         a, u = joint.columns(everything), joint.velocity_columns(everything)
         duration_s = np.sum(motion.dt_s + motion.gap_s)
         joint.P[a] += duration_s * joint.P[u]
         joint.P[:, a] += duration_s * joint.P[:, u]
-        columns = np.append(a, u)
-        vectors = np.concatenate([observer.a, observer.u])
-        joint.turn(columns, vectors)
+        joint.turn(u, observer.u)
         predict(joint.P, self._axes, self.calibration, motion)
-        joint.turn(columns, -vectors)
+        joint.turn(u, -observer.u)
 
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks (m, 3) with room for them in P."""

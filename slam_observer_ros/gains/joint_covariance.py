@@ -127,8 +127,10 @@ class JointCovariance:
     def turn(self, columns: IntArray | slice, vectors: FloatArray) -> None:
         """Make errors x_i at ``columns`` x_i − [y_i]× ω, for ``vectors`` y (m, 3)."""
         L = self._axes.turn_matrix(vectors).reshape(-1, self._p)
-        self.P[columns] += L @ self.P[: self._p]
-        self.P[:, columns] += self.P[:, : self._p] @ L.T
+        half = L @ self.P[: self._p]
+        half[:, columns] += 0.5 * half[:, : self._p] @ L.T
+        self.P[columns] += half
+        self.P[:, columns] += half.T  # its mirror image, so that P stays symmetric
 
     def settle(self, observer: Observer) -> None:
         """Take the landmarks' estimates for their reference, so that â_i = 0.

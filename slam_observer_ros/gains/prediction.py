@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.matrices import symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
@@ -43,8 +43,7 @@ def predict(
     c = slice(p, p + calibration.count)
     Ad = se3.adjoint(motion.path)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
-    turned = Ad[:-1] @ motion.covariances @ transpose(Ad[:-1])
-    noise: FloatArray = turned.sum(axis=0)
+    noise: FloatArray = (Ad @ paths.at_poses(motion.covariances) @ transpose(Ad)).sum(axis=0)
     if calibration.count:
         P[:p] += F @ P[c]
         P[:p, :p] += P[:p, c] @ F.T

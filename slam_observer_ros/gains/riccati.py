@@ -8,7 +8,7 @@ calibration. The residual is, by (33), r_i = Ã y_i° − ã_i − y_i° ≈ C_i
 
 What no observation can tell, the choice of the world's frame, is exactly in its null space, so
 the covariance stays honest. While â_i = 0, which :meth:`.FullMapGains.settle` sees to after each
-correction (the reference ξ° is arbitrary), the motion's noise touches Ã alone. Then
+correction and each motion (the reference ξ° is arbitrary), noise of the motion touches Ã alone:
 
     prediction   P ← P + Ad_Â Q Ad_Âᵀ in the pose block alone: O(1), however large the map
     update       K = P Cᵀ (C P Cᵀ + R)⁻¹,   X̂ ← exp(−K r) · X̂

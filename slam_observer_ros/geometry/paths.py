@@ -33,6 +33,18 @@ def path(start: FloatArray, twists: FloatArray) -> FloatArray:
     return poses
 
 
+def at_poses(pieces: FloatArray) -> FloatArray:
+    """Return what belongs to k pieces of a path (k, …) as shares (k + 1, …) of its poses.
+
+    Half of it at either end, so that Σ Ad_A (share) over the poses is that over the pieces by the
+    trapezoidal rule.
+    """
+    shares = np.zeros((len(pieces) + 1, *pieces.shape[1:]))
+    shares[:-1] = 0.5 * pieces
+    shares[1:] += 0.5 * pieces
+    return shares
+
+
 def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -> FloatArray:
     """Return poses between two: position in a line, rotation about one axis, as tf2 does.
 

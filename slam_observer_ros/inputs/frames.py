@@ -9,12 +9,12 @@ import numpy as np
 
 from slam_observer_ros.errors import ParameterError, TransformError
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.extrinsics import (
+from slam_observer_ros.extrinsics import (
     move_observation,
     move_velocity,
     turn_angular_velocity,
 )
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.estimates import CalibrationEstimate
+from slam_observer_ros.geometry import paths
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
@@ -107,7 +108,8 @@ class Calibration:
         """
         rates = motion.measured_velocities[:, self._calibrated]
         rates[:, self._scales :] = 1.0
-        of_rates = Ad[:-1, :, self._calibrated] * (rates * motion.dt_s[:, None])[:, None, :]
+        shares = paths.at_poses(rates * motion.dt_s[:, None])
+        of_rates = Ad[:, :, self._calibrated] * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
         F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
         if len(self._calibrated) < self.count and motion.at_ends is not None:

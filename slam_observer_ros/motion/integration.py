@@ -34,8 +34,9 @@ def transition_covariance(
     Along the body's axes at the start.
     """
     held = _held(velocities, calibration, start_ns, end_ns)
-    Ad = se3.adjoint(_path(np.eye(4), held, calibration)[:-1])
-    covariance: FloatArray = (Ad @ noise.covariances(held) @ transpose(Ad)).sum(axis=0)
+    Ad = se3.adjoint(_path(np.eye(4), held, calibration))
+    shares = paths.at_poses(noise.covariances(held))
+    covariance: FloatArray = (Ad @ shares @ transpose(Ad)).sum(axis=0)
     return covariance
 
 

@@ -20,7 +20,7 @@ class Motion:
     dt_s : FloatArray
         (k,) seconds that each velocity was held.
     gap_s : FloatArray
-        (k,) seconds after each piece during which no velocity was known.
+        (k,) seconds of each piece without a known velocity; ``dt_s`` is zero then.
     covariances : FloatArray
         (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
     at_ends : FloatArray or None

@@ -62,11 +62,14 @@ class MotionNoise(Immutable):
         rates = self._density_squared
         if self._has_scale:
             rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
-        dt_s = held.dt_s[:, None]
-        white = rates * dt_s * np.repeat(~held.is_stated, 3, axis=1)
-        in_gaps = np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
-        covariances: FloatArray = (white + in_gaps)[:, :, None] * _IDENTITY_6
-        if held.is_stated.any():
+        dt_s, some_are_stated = held.dt_s[:, None], held.is_stated.any()
+        variances = rates * dt_s
+        if some_are_stated:
+            variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
+        if held.gap_s.any():
+            variances += np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
+        covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
+        if some_are_stated:
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
             grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
             stated = limited(held.covariances, MAX_SPEED_ERRORS)

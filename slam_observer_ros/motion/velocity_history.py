@@ -33,7 +33,7 @@ class HeldVelocities:
     dt_s : FloatArray
         (k,) seconds that each was held.
     gap_s : FloatArray
-        (k,) seconds after each during which no velocity was known, since it had timed out.
+        (k,) seconds without a known velocity, as it had timed out; ``dt_s`` is zero then.
     before_s : FloatArray
         (k, 2) seconds that the angular and the linear part of each had been held for before.
 
@@ -57,6 +57,20 @@ class HeldVelocities:
             np.zeros(k),
             gap_s,
             np.zeros((k, 2)),
+        )
+
+    def with_gaps_apart(self) -> HeldVelocities:
+        """Return the same with each gap as a piece of its own, from where it leaves the robot."""
+        has_gap = self.gap_s > 0.0
+        rows = np.repeat(np.arange(len(has_gap)), 1 + has_gap)
+        is_gap = np.append(False, rows[1:] == rows[:-1])
+        return HeldVelocities(
+            self.body_velocities[rows],
+            self.covariances[rows],
+            self.is_stated[rows],
+            np.where(is_gap, 0.0, self.dt_s[rows]),
+            np.where(is_gap, self.gap_s[rows], 0.0),
+            self.before_s[rows],
         )
 
     def averaged(self, window_s: float) -> FloatArray:
@@ -128,30 +142,26 @@ class VelocityHistory:
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
-        first = bisect_right(self._stamps_ns, start_ns) - 1
-        last = bisect_left(self._stamps_ns, end_ns)
-        stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
-        begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
-        joined, rows = self._written(), slice(first, last)
-        since = joined.since_ns[rows]
-        stops = np.minimum(np.maximum(since[:, 1] + self._timeout_ns, begins), ends)
-        return HeldVelocities(
+        rows, begins, stops, ends = self._pieces(start_ns, end_ns)
+        joined = self._written()
+        held = HeldVelocities(
             self._counting(joined.body_velocities[rows]),
             joined.covariances[rows],
             joined.is_stated[rows],
             to_s(stops - begins),
             to_s(ends - stops),
-            to_s(begins[:, None] - since),
+            to_s(begins[:, None] - joined.since_ns[rows]),
         )
+        return held.with_gaps_apart() if held.gap_s.any() else held
 
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
-        held = self.held(start_ns, end_ns)
-        known_s = held.dt_s.sum()
+        rows, begins, stops, _ = self._pieces(start_ns, end_ns)
+        dt_s = to_s(stops - begins)
+        known_s = dt_s.sum()
         if known_s == 0.0:
             return np.zeros(6)
-        mean: FloatArray = held.dt_s @ held.body_velocities / known_s
-        return mean
+        return self._counting(dt_s @ self._written().body_velocities[rows] / known_s)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
@@ -160,6 +170,15 @@ class VelocityHistory:
             kept, joined = np.append(0, np.arange(first, count)), self._written()
             self._joined = joined.copied(kept, joined.capacity)
             del self._stamps_ns[1:first]
+
+    def _pieces(self, start_ns: int, end_ns: int) -> tuple[slice, IntArray, IntArray, IntArray]:
+        """Return rows of the velocities in force, and when each begins, times out and ends, ns."""
+        first = bisect_right(self._stamps_ns, start_ns) - 1
+        last = bisect_left(self._stamps_ns, end_ns)
+        stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
+        begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
+        timed_out = self._written().since_ns[first:last, 1] + self._timeout_ns
+        return slice(first, last), begins, np.minimum(np.maximum(timed_out, begins), ends), ends
 
     def _written(self) -> _Joined:
         """Return all velocities, those that have come since the last time among them."""
@@ -232,7 +251,8 @@ class _Joined:
         """
         rows = slice(first, first + len(events))
         self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
-        self.since_ns[rows] = [[velocity.stamp_ns] for velocity, _ in events]
+        stamps_ns = np.array([velocity.stamp_ns for velocity, _ in events], dtype=np.int64)
+        self.since_ns[rows] = stamps_ns[:, None]
         for row, (velocity, angular) in enumerate(events, first):
             if (stated := velocity.covariance) is not None:
                 self.covariances[row] = stated

@@ -104,7 +104,7 @@ class Outlook:
         self, event: ObservationEvent, rows: IntArray, left_out: dict[str, int]
     ) -> Sighting:
         """Return what the points of ``event`` tell, of landmarks ``rows`` (m,)."""
-        known, covariances = rows >= 0, self._covariances(event, rows)
+        known, covariances = rows >= 0, self.covariances(event, rows)
         residuals = self.residuals(event.select(known), rows[known], covariances[known])
         return Sighting(event, rows, covariances, residuals, left_out)
 
@@ -137,7 +137,7 @@ class Outlook:
         spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
         return se3.transform(self._observer.pose, event.points), SAME_PLACE * spread_m
 
-    def _covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    def covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return the covariances (m, 3, 3) of observed points, body frame, m².
 
         The noise model is told where a landmark should be, not where it was measured: a landmark

@@ -171,6 +171,10 @@ class Slam:
             self._end_velocity,
         )
 
+    def covariances_of(self, event: ObservationEvent) -> FloatArray:
+        """Return those of the points (m, 3, 3) that would be used, body frame, m²."""
+        return self._outlook.covariances(event, self.landmarks.rows_of(event.ids))
+
     def look(self, event: ObservationEvent) -> Sighting:
         """Return what an observation made at the state's instant tells, before it is used.
 
