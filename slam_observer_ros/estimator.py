@@ -375,9 +375,12 @@ class Estimator:
 
         In the body frame, of the first k coordinates: 2 in ``two_d_mode``, else 3. It is that of
         the state, which is moved on at observations: ask for it in ``on_update``. ``rows`` (m,)
-        are places in ``landmark_ids``. None where the gains know none.
+        are places in ``landmark_ids``. None where the gains know none, and for landmarks that are
+        fixed, whose errors nobody knows.
         """
         slam = self._slam
+        if slam.is_fixed:
+            return None
         confirmed = slam.confirmed[rows]
         return covariances.of_configuration(slam.observer, slam.gains, slam.axes, confirmed)
 

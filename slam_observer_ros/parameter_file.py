@@ -11,7 +11,7 @@ import yaml
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import suggestion
-from slam_observer_ros.yaml_keys import UniqueKeys
+from slam_observer_ros.yaml_keys import reason_of, UniqueKeys
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     except OSError as error:
         raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = str(error).splitlines()[0]
+        reason = reason_of(error)
         raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
     values: dict[str, object] = {}
     found: list[str] = []

@@ -132,6 +132,7 @@ class _Run:
             on_motion=self._on_motion,
         )
         self._in_known_map = landmark_map is not None
+        self._in_fixed_map = self._in_known_map and settings.localization_mode == 'fixed'
         if landmark_map is not None:
             self._estimator.load_map(landmark_map)
         self._landmark_tracks = truth.tracks if truth else None
@@ -225,6 +226,7 @@ class _Run:
         if covered[0]:
             ids = self._estimator.landmark_ids
             is_due = len(ids) > 0 and update.stamp_ns >= self._next_nees_ns
+            is_due = is_due and not self._in_fixed_map
             if is_due:
                 self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
             self._configuration.add(

@@ -29,6 +29,8 @@ MAX_STAMP_NS = 2**63 - 1
 MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
 
+_INTEGERS = (int, np.int64)
+
 
 def check_event(event: Event) -> None:
     """Check an event's shapes and values.
@@ -42,13 +44,16 @@ def check_event(event: Event) -> None:
     """
     if not isinstance(event, Event):
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
-    if not isinstance(event.stamp_ns, int | np.int64):
+    if not isinstance(event.stamp_ns, _INTEGERS):
         reason = f'stamp {event.stamp_ns!r} is no int or np.int64: stamps are in nanoseconds'
         raise InvalidEventError('wrong_type', reason)
     if event.stamp_ns < 0:
         raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
     if event.stamp_ns > MAX_STAMP_NS:
         raise InvalidEventError('too_large', f'stamp {event.stamp_ns} ns is beyond 64 bits')
+    if event.receive_ns is not None and not isinstance(event.receive_ns, _INTEGERS):
+        reason = f'receive_ns {event.receive_ns!r} is no int or np.int64'
+        raise InvalidEventError('wrong_type', reason)
     if isinstance(event, VelocityEvent):
         _check_velocity(event.body_velocity, event.covariance, 6)
     elif isinstance(event, AngularVelocityEvent):

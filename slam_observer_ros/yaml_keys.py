@@ -1,4 +1,7 @@
-"""What YAML forbids and PyYAML takes: a key that is there twice, of which only the last counts."""
+"""What is wrong with a YAML file: what PyYAML says of it, and what it takes though YAML forbids it.
+
+That is a key which is there twice, of which only the last counts.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,13 @@ from collections import Counter
 from typing import Any
 
 import yaml
+
+
+def reason_of(error: Exception) -> str:
+    """Return in one line why YAML could not be read, and where."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
+        return f'{error.problem} in line {error.problem_mark.line + 1}'
+    return str(error).splitlines()[0]
 
 
 class UniqueKeys:

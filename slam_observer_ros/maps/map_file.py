@@ -34,7 +34,7 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.yaml_keys import UniqueKeys
+from slam_observer_ros.yaml_keys import reason_of, UniqueKeys
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
@@ -157,8 +157,7 @@ def read_map(path: Path) -> LandmarkMap:
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = str(error).splitlines()[0]
-        raise MapError(f'map {path} is not valid YAML: {reason}') from error
+        raise MapError(f'map {path} is not valid YAML: {reason_of(error)}') from error
     try:
         return _parse(content)
     except MapError as error:

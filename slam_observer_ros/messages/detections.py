@@ -67,7 +67,7 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
 
     The id of a landmark is the number that ends its detection's ``id``, or else its first
     result's ``class_id``: both are strings. Its position, with covariance if it is known of all,
-    is the first result's, or else the centre of the box.
+    is that result's, or else the centre of the box.
     """
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
@@ -166,7 +166,7 @@ def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
     reader.header()
     results = [_read_result(reader) for _ in range(reader.uint32())]
     centre = reader.float64(_POSE + _SIZE)[:3]
-    names = [reader.string(), *(name for name, _, _ in results)]
+    names = [reader.string(), *(name for name, _, _ in results[:1])]
     matches = (_TRAILING_NUMBER.fullmatch(name) for name in names)
     landmark_id = next((_landmark_id(match[1]) for match in matches if match), UNKNOWN_ID)
     if not results:

@@ -71,11 +71,11 @@ def main(args: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='demo', description=(__doc__ or '').splitlines()[0])
     parser.add_argument(
-        '--duration', type=float, default=80.0, help='simulated seconds (default 80)'
+        '--duration', type=_positive, default=80.0, help='simulated seconds (default 80)'
     )
     parser.add_argument(
         '--real-time-factor',
-        type=float,
+        type=_positive,
         default=4.0,
         help='simulated seconds a second (default 4)',
     )
@@ -86,6 +86,13 @@ def _parser() -> argparse.ArgumentParser:
         help='folder in which run_N is made (default demo_output)',
     )
     return parser
+
+
+def _positive(text: str) -> float:
+    number = float(text)
+    if not 0.0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f'{text} is not above zero, or has no end')
+    return number
 
 
 def _new_folder(parent: Path) -> Path:

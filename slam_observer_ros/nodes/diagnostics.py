@@ -100,7 +100,8 @@ class Diagnostics:
             values[f'{source.topic} rate [Hz]'] = f'{new / elapsed_s:.1f}'
             values[f'{source.topic} age [s]'] = age
             values[f'{source.topic} wait [s]'] = f'{source.backlog.wait_s:.3f}'
-            values[f'{source.topic} malformed'] = str(source.malformed)
+            if source.malformed:
+                values[f'{source.topic} malformed'] = str(source.malformed)
         return values
 
     def _estimator_values(self) -> dict[str, str]:

@@ -12,6 +12,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
 from slam_observer_ros.errors import SlamObserverError
 from slam_observer_ros.threads import use_one_thread
@@ -65,6 +66,12 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int
         get_logger('slam_observer_ros').fatal(f'{type(error).__name__}: {reason}')
         return 2
     try:
+        if unknown := remove_ros_args(args)[1:]:
+            get_logger('slam_observer_ros').fatal(
+                f'unknown arguments {" ".join(unknown)}: parameters, files of them and remappings '
+                'come after --ros-args'
+            )
+            return 2
         return _spin(make_node, stop)
     finally:
         rclpy.try_shutdown()

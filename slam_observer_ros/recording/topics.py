@@ -116,8 +116,8 @@ def select_topics(
         What of the velocities is used, whether an Imu is, and of which type landmarks are.
     identifies : callable
         Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
-        them, such as a lidar's, are taken only if they are chosen by name, or are called
-        ``landmarks``.
+        them, such as a lidar's, are taken only if they are chosen by name or by their type, or
+        are called ``landmarks``.
 
     Raises
     ------
@@ -132,7 +132,8 @@ def select_topics(
             return topic.message_type in role.all_types
         if topic.message_type not in role.message_types:
             return False
-        return topic.message_type not in CLOUD_DECODERS or identifies(topic)
+        is_asked_for = not role.is_truth and inputs.landmarks_type != AUTO
+        return is_asked_for or topic.message_type not in CLOUD_DECODERS or identifies(topic)
 
     def pick(role: _Role, name: str | None) -> Topic | None:
         if name is not None:
