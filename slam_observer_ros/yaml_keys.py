@@ -1,7 +1,4 @@
-"""What is wrong with a YAML file: what PyYAML says of it, and what it takes though YAML forbids it.
-
-That is a key which is there twice, of which only the last counts.
-"""
+"""What is wrong with a YAML file: as PyYAML says it, and keys given twice, which it lets pass."""
 
 from __future__ import annotations
 

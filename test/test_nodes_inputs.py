@@ -14,6 +14,9 @@ from node_processes import NodeProcess, running
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from robots import own_topics, Robot, stamp_ns, TransformSender
@@ -385,6 +388,46 @@ def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatc
     receive(b'', {'received_timestamp': 0})
     assert len(look_for(4)) == 2
     assert not source.trouble
+
+
+def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
+    """Its executor reads one of each topic in turn: landmarks would run ahead of velocities."""
+    qos, order = QoSProfile(depth=100), []
+    node = rclpy.create_node('busy', context=ros.node.context)
+
+    def take(kind, _receive_ns):
+        order.append(kind)
+
+    decoders = {'geometry_msgs/msg/Twist': lambda *_: 'velocity'}
+    velocities = Input(node, 'busy/twist', decoders, take, qos)
+    decoders = {'geometry_msgs/msg/PoseArray': lambda *_: 'landmarks'}
+    Input(node, 'busy/landmarks', decoders, take, qos, [velocities])
+    twists = ros.node.create_publisher(Twist, 'busy/twist', qos)
+    landmarks = ros.node.create_publisher(PoseArray, 'busy/landmarks', qos)
+    executor = SingleThreadedExecutor(context=ros.node.context)
+    executor.add_node(node)
+    try:
+        ros.wait_for_subscriber(twists)
+        ros.wait_for_subscriber(landmarks)
+        for _ in range(12):
+            for _ in range(5):
+                twists.publish(Twist())
+            landmarks.publish(PoseArray())
+        for publisher in (twists, landmarks):
+            assert publisher.wait_for_all_acked(Duration(seconds=10))
+        deadline_s = time.monotonic() + 10.0
+        while len(order) < 72 and time.monotonic() < deadline_s:
+            executor.spin_once(timeout_sec=0.1)
+        assert len(order) == 72
+        velocities_before = np.flatnonzero(np.array(order) == 'landmarks') - np.arange(12)
+        published_before = 5 * np.arange(1, 13)
+        # One more tells that there is none before, and one comes in turn.
+        assert set(velocities_before - published_before) <= {0, 1, 2}
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        for publisher in (twists, landmarks):
+            ros.node.destroy_publisher(publisher)
 
 
 def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_path):

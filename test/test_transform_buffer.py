@@ -140,6 +140,24 @@ def test_after_a_jump_of_the_clock_only_static_transforms_are_left():
         buffer.lookup('odom', 'base', SECOND)
 
 
+def test_a_straggler_of_the_lap_before_does_not_make_all_of_the_next_too_old():
+    buffer = TransformBuffer()
+    buffer.insert('odom', 'base_link', 30 * SECOND, np.eye(4))
+    for step in range(20):
+        buffer.insert('odom', 'base_link', step * SECOND // 50, np.eye(4))
+    assert buffer.newest_ns('odom', 'base_link') == 19 * SECOND // 50
+    np.testing.assert_array_equal(buffer.lookup('odom', 'base_link', SECOND // 3), np.eye(4))
+
+
+def test_transforms_that_come_late_among_others_are_kept():
+    buffer = TransformBuffer()
+    for step in range(10):
+        for behind_s in (0, 3):
+            buffer.insert('odom', 'base_link', (10 + step - behind_s) * SECOND, np.eye(4))
+    assert buffer.newest_ns('odom', 'base_link') == 19 * SECOND
+    buffer.lookup('odom', 'base_link', 10 * SECOND)
+
+
 def test_roll_pitch_and_yaw_turn_about_fixed_axes():
     pose = se3.from_rpy((1.0, 2.0, 3.0, -np.pi / 2, 0.0, -np.pi / 2))  # a camera's optical axes
     assert_allclose(se3.transform(pose, np.array([[0.0, 0.0, 5.0]])), [[6.0, 2.0, 3.0]])

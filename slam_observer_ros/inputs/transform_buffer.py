@@ -13,6 +13,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.errors import TransformError
+from slam_observer_ros.event_queue import AGREEING_STAMPS, NEAR_NS
 from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
@@ -34,14 +35,29 @@ class _Track:
     is_static: bool
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
+    behind: int = 0
 
     def insert(self, stamp_ns: int, pose: FloatArray) -> None:
+        if not self.is_static:
+            self._follow_jump(stamp_ns)
         place = 0 if self.is_static else bisect_left(self.stamps_ns, stamp_ns)
         is_known = self.is_static or self.stamps_ns[place : place + 1] == [stamp_ns]
         self.stamps_ns[place : place + is_known] = [stamp_ns]
         self.poses[place : place + is_known] = [pose]
         outdated = bisect_left(self.stamps_ns, self.stamps_ns[-1] - HISTORY_NS)
         del self.stamps_ns[:outdated], self.poses[:outdated]
+
+    def _follow_jump(self, stamp_ns: int) -> None:
+        """Forget what is newer than a stamp that follows others, all of them far behind that.
+
+        As a straggler of the lap before, when a recording is looped: all to come would be too old.
+        """
+        is_behind = bool(self.stamps_ns) and stamp_ns < self.stamps_ns[-1] - NEAR_NS
+        self.behind = self.behind + 1 if is_behind else 0
+        if self.behind >= AGREEING_STAMPS:
+            newer = bisect_left(self.stamps_ns, stamp_ns)
+            del self.stamps_ns[newer:], self.poses[newer:]
+            self.behind = 0
 
     def pose_at(self, stamp_ns: int) -> FloatArray | None:
         """Interpolate the pose (4, 4); None outside of what is known."""

@@ -47,14 +47,17 @@ def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> l
         If the package of a message type is not installed.
 
     """
-    inputs = [_velocity_input(node, settings, intake), _landmark_input(node, settings, intake)]
+    imu: list[Input[Any]] = []
     if settings.use_imu:
         qos = _qos(settings.twist_qos, settings.queue_depth)
-        inputs.append(Input(node, 'imu', {IMU: decode_imu}, partial(intake.add, 'imu'), qos))
-    return inputs
+        imu.append(Input(node, 'imu', {IMU: decode_imu}, partial(intake.add, 'imu'), qos))
+    velocity = _velocity_input(node, settings, intake, imu)
+    return [velocity, _landmark_input(node, settings, intake, [velocity, *imu]), *imu]
 
 
-def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+def _velocity_input(
+    node: Node, settings: ObserverNodeSettings, intake: Intake, read_first: list[Input[Any]]
+) -> Input[Any]:
     qos = _qos(settings.twist_qos, settings.queue_depth)
     if settings.velocity_source == 'pose_differences':
         if settings.velocity_type not in (AUTO, 'Odometry'):
@@ -67,23 +70,26 @@ def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
         decoders = _chosen(
             VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
         )
-    return Input(node, 'twist', decoders, partial(intake.add, 'twist'), qos)
+    return Input(node, 'twist', decoders, partial(intake.add, 'twist'), qos, read_first)
 
 
-def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+def _landmark_input(
+    node: Node, settings: ObserverNodeSettings, intake: Intake, read_first: list[Input[Any]]
+) -> Input[Any]:
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
     if settings.landmarks_type == ON_TF:
         decoder = TagDecoder(node, settings.tag_frame_prefix)
-        return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos)
+        return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos, read_first)
     if settings.landmarks_type == 'AprilTagDetectionArray':
         decoders: dict[str, Any] = {APRILTAGS: decode_apriltags}
-        return Input(node, 'landmarks', decoders, partial(intake.add, 'landmarks'), qos)
+        use = partial(intake.add, 'landmarks')
+        return Input(node, 'landmarks', decoders, use, qos, read_first)
     if settings.landmarks_type == AUTO:
         # Not detections: their package, which need not be installed, would be imported unasked.
         decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
-        return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+        return Input(node, 'landmarks', decoders, intake.add_observation, qos, read_first)
     decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
-    return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+    return Input(node, 'landmarks', decoders, intake.add_observation, qos, read_first)
 
 
 def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:

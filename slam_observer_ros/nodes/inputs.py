@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import importlib
 import time
 from typing import Any, Generic, TypeVar
@@ -46,6 +46,10 @@ class Input(Generic[MessageT]):
         Called with each decoded message and the ROS time of its reception in nanoseconds.
     qos : QoSProfile
         Quality of service that is asked for.
+    read_first : sequence of Input
+        Other inputs, of which what was received before a message of this one is read before it.
+        An executor reads one message of each topic in turn, so after the node was busy a slow
+        topic would run far ahead of a fast one.
 
     Attributes
     ----------
@@ -74,11 +78,14 @@ class Input(Generic[MessageT]):
         decoders: Mapping[str, Decoder[MessageT]],
         on_message: Callable[[MessageT, int], None],
         qos: QoSProfile,
+        read_first: Sequence[Input[Any]] = (),
     ) -> None:
         self._node = node
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
+        self._read_first = read_first
+        self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
         self._type_name = ''
         self.topic = node.resolve_topic_name(topic)
@@ -135,7 +142,19 @@ class Input(Generic[MessageT]):
         )
         self._node.get_logger().info(f"receiving {type_name} on '{self.topic}'")
 
+    def read_until(self, received_ns: int) -> None:
+        """Read what waits, up to what DDS has received at a time, nanoseconds."""
+        while (source := self._subscription) is not None and self._received_ns < received_ns:
+            with source.handle:
+                taken = source.handle.take_message(source.msg_type, source.raw)
+            if taken is None:
+                return
+            self._receive(*taken)
+
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
+        self._received_ns = info['received_timestamp']
+        for other in self._read_first:
+            other.read_until(self._received_ns)
         receive_ns = self._reception_ns(info['received_timestamp'])
         self.received += 1
         self.last_received_s = time.monotonic()
