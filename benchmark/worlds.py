@@ -261,6 +261,7 @@ def _measured_velocities(
         np.full(k, dt_s),
         np.zeros(k),
         np.zeros((k, 2)),
+        np.full(2, np.inf),
     )
     variances = np.diagonal(MotionNoise(settings).covariances(held), axis1=1, axis2=2) / dt_s**2
     return velocities + np.sqrt(variances) * rng.standard_normal(velocities.shape)

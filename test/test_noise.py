@@ -22,6 +22,8 @@ from slam_observer_ros.motion.velocity_history import HeldVelocities, VelocityHi
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 
+SECOND = 1_000_000_000
+
 
 def held(velocities, dt_s, gap_s=None, covariances=None):
     velocities = np.array(velocities, dtype=float)
@@ -34,6 +36,7 @@ def held(velocities, dt_s, gap_s=None, covariances=None):
         np.array(dt_s, dtype=float),
         np.zeros(k) if gap_s is None else np.array(gap_s, dtype=float),
         np.zeros((k, 2)),
+        np.full(2, np.inf),
     )
 
 
@@ -188,6 +191,43 @@ def test_the_covariance_of_a_way_is_that_of_its_pieces_composed(rng):
         expected += F @ Q @ F.T
     found = transition_covariance(*way(V), MotionNoise(settings), 0, pieces * dt_ns)
     assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
+
+
+def test_the_error_of_a_message_goes_on_while_none_follows():
+    """As where it has a covariance; however many observations the time is cut into."""
+    settings = Settings(angular_velocity_noise=(0.01,) * 3, linear_velocity_noise=(0.02,) * 3)
+    density, period_s, lost_s = np.repeat([0.01, 0.02], 3), 0.05, 0.6
+    stated = np.diag(density**2 / period_s)
+
+    def grown(covariance, cuts_s):
+        history = VelocityHistory(SECOND)
+        for step in range(20):
+            stamp_ns = round(step * period_s * SECOND)
+            history.append(VelocityEvent(stamp_ns, np.zeros(6), covariance))
+
+        def between(start_s, end_s):
+            held = history.held(round(start_s * SECOND), round(end_s * SECOND))
+            return MotionNoise(settings).covariances(held).sum(axis=0)
+
+        last_s = 19 * period_s
+        ends_s = last_s + np.array([0.0, *cuts_s, lost_s])
+        return between(0.5 * last_s, last_s), sum(map(between, ends_s[:-1], ends_s[1:]))
+
+    for cuts_s in ([], [period_s], [0.02, 0.3]):
+        usual, lost = grown(None, cuts_s)
+        np.testing.assert_allclose(np.diag(usual), density**2 * 9.5 * period_s, rtol=1e-6)
+        np.testing.assert_allclose(np.diag(lost), density**2 * lost_s**2 / period_s, rtol=1e-6)
+        np.testing.assert_allclose(lost, grown(stated, cuts_s)[1], rtol=1e-6, atol=1e-15)
+
+
+def test_commands_that_come_when_they_change_have_no_period():
+    history = VelocityHistory(2 * SECOND)
+    for time_s in (0.0, 0.05, 0.1, 1.3, 1.35, 2.4, 2.45):
+        history.append(VelocityEvent(round(time_s * SECOND), np.ones(6)))
+    settings = Settings(angular_scale_noise=(0.0,) * 3, linear_scale_noise=(0.0,) * 3)
+    (Q,) = MotionNoise(settings).covariances(history.held(round(2.45e9), round(3.45e9)))
+    expected = np.square([*settings.angular_velocity_noise, *settings.linear_velocity_noise])
+    np.testing.assert_allclose(np.diag(Q), expected)
 
 
 @pytest.mark.parametrize('unknown', [slice(0, 3), slice(3, 6)], ids=['angular', 'linear'])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slam_observer_ros.geometry import paths, se3
@@ -11,6 +13,7 @@ from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import HeldVelocities, VelocityHistory
 from slam_observer_ros.types import FloatArray
+from slam_observer_ros.units import to_s
 
 
 def transition(
@@ -72,7 +75,11 @@ def _held(
     velocities: VelocityHistory, calibration: Calibration, start_ns: int, end_ns: int
 ) -> HeldVelocities:
     delay_ns = calibration.delay_ns
-    return velocities.held(start_ns - delay_ns, end_ns - delay_ns)
+    held = velocities.held(start_ns - delay_ns, end_ns - delay_ns)
+    if delay_ns >= 0:
+        return held
+    # The velocities of that time are yet to come: it is no sign that one was lost.
+    return replace(held, usual_s=held.usual_s + to_s(-delay_ns))
 
 
 def _path(start: FloatArray, held: HeldVelocities, calibration: Calibration) -> FloatArray:

@@ -49,7 +49,9 @@ class MotionNoise(Immutable):
 
         *A velocity in force* has white noise: of the stated density, and proportional to speed.
         The speed is the mean over :data:`SPEED_WINDOW_S`, or over all of ``held`` if that is
-        shorter; in a single message it is noisy itself, and its square too large.
+        shorter; in a single message it is noisy itself, and its square too large. The density is
+        that of errors which are new in each message. Held for t, longer than the usual T, one of
+        them has moved the robot by t/T times as much: its variance is t²/T, not t.
 
         *A velocity with a covariance of its own* has one error for as long as it is held, and
         another in the next message: held for t it has moved the robot by t times the error,
@@ -63,7 +65,7 @@ class MotionNoise(Immutable):
         if self._has_scale:
             rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
         dt_s, some_are_stated = held.dt_s[:, None], held.is_stated.any()
-        variances = rates * dt_s
+        variances = rates * _white_s(held)
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         if held.gap_s.any():
@@ -75,3 +77,14 @@ class MotionNoise(Immutable):
             stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
+
+
+def _white_s(held: HeldVelocities) -> FloatArray:
+    """Return what the variances (k, 6) of motions are, over their density: dt, or more of it."""
+    dt_s = held.dt_s[:, None]
+    until_s = held.before_s + dt_s
+    if not (until_s > held.usual_s).any():  # as nearly always
+        return dt_s
+    grown_s = until_s * np.maximum(until_s / held.usual_s, 1.0)
+    grown_s -= held.before_s * np.maximum(held.before_s / held.usual_s, 1.0)
+    return np.repeat(grown_s, 3, axis=1)

@@ -14,6 +14,9 @@ from slam_observer_ros.units import NANOSECONDS_PER_SECOND, to_s
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
 """Stamp of a velocity that timed out before time began, nanoseconds."""
 
+RECENT = 64
+"""Velocities, at most, that tell how long one is held as a rule."""
+
 FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
 
@@ -36,6 +39,8 @@ class HeldVelocities:
         (k,) seconds without a known velocity, as it had timed out; ``dt_s`` is zero then.
     before_s : FloatArray
         (k, 2) seconds that the angular and the linear part of each had been held for before.
+    usual_s : FloatArray
+        (2,) seconds that angular and linear parts are held for as a rule; infinite if unknown.
 
     """
 
@@ -45,6 +50,7 @@ class HeldVelocities:
     dt_s: FloatArray
     gap_s: FloatArray
     before_s: FloatArray
+    usual_s: FloatArray
 
     @classmethod
     def unknown(cls, gap_s: FloatArray) -> HeldVelocities:
@@ -57,6 +63,7 @@ class HeldVelocities:
             np.zeros(k),
             gap_s,
             np.zeros((k, 2)),
+            np.full(2, np.inf),
         )
 
     def with_gaps_apart(self) -> HeldVelocities:
@@ -71,6 +78,7 @@ class HeldVelocities:
             np.where(is_gap, 0.0, self.dt_s[rows]),
             np.where(is_gap, self.gap_s[rows], 0.0),
             self.before_s[rows],
+            self.usual_s,
         )
 
     def averaged(self, window_s: float) -> FloatArray:
@@ -151,6 +159,7 @@ class VelocityHistory:
             to_s(stops - begins),
             to_s(ends - stops),
             to_s(begins[:, None] - joined.since_ns[rows]),
+            self._usual_s(rows.stop),
         )
         return held.with_gaps_apart() if held.gap_s.any() else held
 
@@ -179,6 +188,17 @@ class VelocityHistory:
         begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
         timed_out = self._written().since_ns[first:last, 1] + self._timeout_ns
         return slice(first, last), begins, np.minimum(np.maximum(timed_out, begins), ends), ends
+
+    def _usual_s(self, stop: int) -> FloatArray:
+        """Return for how long parts (2,) have been held lately: but for once, no longer than that.
+
+        Up to the velocity before row ``stop``; the first row is of no message.
+        """
+        since_ns = self._written().since_ns[max(stop - RECENT, 1) : stop]
+        if len(since_ns) < 3:
+            return np.full(2, np.inf)
+        usual_s = to_s(np.partition(np.diff(since_ns, axis=0), -2, axis=0)[-2])
+        return np.where(usual_s > 0.0, usual_s, np.inf)
 
     def _written(self) -> _Joined:
         """Return all velocities, those that have come since the last time among them."""
