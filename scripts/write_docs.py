@@ -59,8 +59,10 @@ OUTPUTS = {
     'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
     'map': 'landmarks seen `confirmations` times or more, with ids; with covariances where the '
     'gains know them',
-    'landmark_estimates': 'the same landmarks for tools that read PointCloud',
-    'markers': 'landmarks with ids and ellipsoids of 3σ, and residuals, for RViz and Foxglove',
+    'landmark_estimates': 'the same landmarks for tools that read PointCloud; none if one of them '
+    'has an id from 2²⁴ on, which it has no room for',
+    'markers': 'landmarks, residuals, and of the first 200 landmarks ids and ellipsoids of 3σ, '
+    'for RViz and Foxglove',
     'lyapunov': 'the Lyapunov value L (34) of the last observation',
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
     'else `map_frame` → `base_frame`',

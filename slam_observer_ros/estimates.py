@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -58,8 +59,9 @@ class CalibrationEstimate:
     unit: str
 
     def __str__(self) -> str:
-        """Write it with its uncertainty."""
-        return f'{self.value:.3f} ± {self.deviation:.3f} {self.unit}'.rstrip()
+        """Write it with its uncertainty, of which at least two digits can be seen."""
+        digits = 3 if self.deviation <= 0.0 else max(3, 1 - math.floor(math.log10(self.deviation)))
+        return f'{self.value:.{digits}f} ± {self.deviation:.{digits}f} {self.unit}'.rstrip()
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 import tempfile
 
-from slam_observer_ros.errors import OutputError, UsageError
+from slam_observer_ros.errors import EvaluationError, OutputError, UsageError
 from slam_observer_ros.output_files import destination
 
 
@@ -127,7 +127,7 @@ def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
         If that fails.
 
     """
-    beside = directory if directory.is_dir() else directory.parent
+    beside, unfinished = directory if directory.is_dir() else directory.parent, ''
     try:
         with tempfile.TemporaryDirectory(dir=beside, prefix='.writing-') as unfinished:
             yield Path(unfinished)
@@ -137,6 +137,8 @@ def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
                 file.replace(destination(directory / file.name))
             for name in set(names) - {file.name for file in files}:
                 (directory / name).unlink(missing_ok=True)
+    except EvaluationError as error:  # which names a directory that is gone by now
+        raise OutputError(str(error).replace(unfinished, str(directory))) from error
     except OSError as error:
         reason = error.strerror or error  # its whole text names a directory that is gone by now
         raise OutputError(f"can't write figures to {directory}: {reason}") from error

@@ -47,7 +47,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         'simulate',
         help="run the paper's simulation",
         description="Run the paper's simulation (section VI): a robot drives a circle of 5 m "
-        'radius and sees landmarks whose first sighting is biased; the observer makes up for it.',
+        'radius and sees landmarks whose first sighting is biased; the observer makes up for it, '
+        "with the paper's constant gains if --gains names no others.",
     )
     parser.add_argument(
         '--duration', type=float, default=80.0, metavar='S', help='simulated seconds (default 80)'

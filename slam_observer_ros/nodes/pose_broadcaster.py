@@ -156,10 +156,13 @@ class PoseBroadcaster:
         behind_ns = self._waiting[-1][0] - known_ns
         if self._child != settings.odom_frame or behind_ns <= LATE_NS:
             return
+        trouble = (
+            'without stamps' if newest_ns == 0 else f'{to_s(behind_ns):.1f} s behind the estimate'
+        )
         self._report(
-            f"'{settings.odom_frame}' to '{settings.base_frame}' on /tf is "
-            f"{to_s(behind_ns):.1f} s behind the estimate: '{settings.map_frame}' to "
-            f"'{settings.odom_frame}' waits for it; look at what publishes it"
+            f"'{settings.odom_frame}' to '{settings.base_frame}' on /tf is {trouble}: "
+            f"'{settings.map_frame}' to '{settings.odom_frame}' waits for it; look at what "
+            'publishes it'
         )
 
     def _report(self, trouble: str) -> None:

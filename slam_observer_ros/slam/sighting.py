@@ -138,7 +138,7 @@ class Outlook:
         return se3.transform(self._observer.pose, event.points), SAME_PLACE * spread_m
 
     def covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
-        """Return the covariances (m, 3, 3) of observed points, body frame, m².
+        """Return what observed points may be off by: (m, 3, 3), body frame, m².
 
         The noise model is told where a landmark should be, not where it was measured: a landmark
         measured too near would be believed more than one measured too far, and all would be
