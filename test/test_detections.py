@@ -50,6 +50,12 @@ def test_detections_have_the_number_in_their_id_or_class():
     assert event.covariances is None, 'not all are known'
 
 
+def test_an_id_and_a_position_are_never_of_different_results():
+    message = detector.detection('', 'car')
+    message.results += detector.detection('', 'reflector_5').results
+    assert_array_equal(detections(message).ids, [-1])
+
+
 def test_what_was_not_measured_is_left_out():
     unmeasured = (np.nan, 0.0, 0.0)
     event = detections(detector.detection('17', centre=unmeasured), detector.detection('18'))

@@ -405,6 +405,7 @@ def bad_events():
         ('wrong_type', ObservationEvent(stamp_ns, good.ids.astype(np.uint64), points)),
         ('wrong_type', VelocityEvent(np.uint64(stamp_ns), BODY_VELOCITY)),
         ('wrong_type', VelocityEvent(np.int32(5), BODY_VELOCITY)),
+        ('wrong_type', VelocityEvent(stamp_ns, BODY_VELOCITY, receive_ns=1.5)),
         ('too_large', ObservationEvent(stamp_ns, np.array([7, 2**32 - 1]), points)),
         ('wrong_type', ObservationEvent(stamp_ns, np.ma.array(good.ids), points)),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, np.ma.array(points))),

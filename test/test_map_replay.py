@@ -16,7 +16,7 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_file import read_map, write_map
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.truth import PoseTruth
+from slam_observer_ros.truth import LandmarkTruth, PoseTruth
 
 BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
 LANDMARKS = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
@@ -38,6 +38,7 @@ def record(
     scale=lambda s: 1.0,
     has_ids=True,
     receive_ns=lambda s: s * 10**8,
+    truth=None,
 ):
     """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
 
@@ -46,6 +47,8 @@ def record(
     """
     random = np.random.default_rng(seed)
     with RecordingWriter(path) as writer:
+        if truth is not None:
+            writer.write_landmarks(stamp_ns(0), truth)
         for step in range(80):
             noise = random.normal(scale=0.01, size=6)
             velocity = VelocityEvent(stamp_ns(step), BODY_VELOCITY + noise)
@@ -124,6 +127,21 @@ def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
     assert again['anees'] is None
     assert again['ate_rmse_m'] is not None
     assert 'ANEES' not in slam_observer(*arguments).output
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_no_anees_of_the_configuration_is_told_in_a_map_that_is_exact(
+    slam_observer, tmp_path, gains
+):
+    path, saved = tmp_path / 'run.mcap', tmp_path / 'map.yaml'
+    record(path, np.eye(4), seed=1, truth=LandmarkTruth(np.arange(50), LANDMARKS))
+    slam_observer.succeed('replay', path, '--map', saved, *SETTINGS)
+    arguments = ('replay', path, '--load-map', saved, '--gains', gains, '--json', *SETTINGS)
+    uncertain = slam_observer(*arguments, '--set', 'localization_mode=uncertain').json
+    assert uncertain['configuration_anees'] is not None
+    fixed = slam_observer(*arguments, '--set', 'localization_mode=fixed').json
+    assert fixed['configuration_anees'] is None
+    assert fixed['configuration_rmse_m'] is not None
 
 
 def test_covariances_of_a_smoothed_map_are_those_in_hindsight(slam_observer, tmp_path):

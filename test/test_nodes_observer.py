@@ -353,6 +353,15 @@ def test_parameter_misspelt_by_a_letter_is_refused_with_the_one_that_may_be_mean
     assert 'Traceback' not in node.output
 
 
+@pytest.mark.parametrize('name', ['observer_node', 'lifecycle_observer_node', 'simulator_node'])
+def test_parameters_that_are_not_given_to_ros_are_not_passed_over(ros, tmp_path, name):
+    node = NodeProcess(name, tmp_path / name, '--', '-p', 'gains:=constant')
+    assert node.wait() == 2
+    assert 'unknown arguments -p gains:=constant: ' in node.output
+    assert 'come after --ros-args' in node.output
+    assert 'Traceback' not in node.output
+
+
 def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path):
     file = tmp_path / 'robot.yaml'
     file.write_text('/**: {ros__parameters: {base_frame_id: body, wheel: {radius: 0.1}}}')

@@ -286,6 +286,12 @@ def test_a_file_without_parameters_is_refused_in_one_line(tmp_path, text, expect
     assert '\n' not in str(error.value)
 
 
+def test_what_is_wrong_with_a_file_is_told_with_its_line(tmp_path):
+    path = write(tmp_path, '/**:\n  ros__parameters:\n    gain_k: [1.0\n    gain_l: 2.0\n')
+    with pytest.raises(ParameterError, match=r"expected ',' or '\]', but got ':' in line 4$"):
+        read_parameter_file(path)
+
+
 @pytest.mark.parametrize('content', [b'\xc3(: 1', b'\x80abc: 1', b'a: "\x00"'])
 def test_a_file_that_is_no_text_is_refused(tmp_path, content):
     path = tmp_path / 'parameters.yaml'

@@ -16,6 +16,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import TopicNames
@@ -376,6 +377,16 @@ class TestTopics:
         assert self.find(tmp_path, messages)['landmarks'] == '/beacons'
         (tmp_path / 'topics.mcap').unlink()
         assert self.find(tmp_path, messages, landmarks='lidar')['landmarks'] == '/lidar'
+
+    def test_clouds_without_ids_are_taken_by_their_type(self, tmp_path):
+        path = tmp_path / 'lidar.mcap'
+        with RecordingWriter(path) as writer:
+            for topic, message in (('/twist', self.TWIST), ('/lidar', self.LIDAR)):
+                writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
+        kind = self.LIDAR.__msgtype__.rsplit('/', 1)[-1]
+        with Recording(path) as recording:
+            selected = recording.find_topics(TopicNames(), InputSettings(landmarks_type=kind))
+        assert selected.landmarks.name == '/lidar'
 
     def test_a_cloud_called_landmarks_needs_no_ids(self, tmp_path):
         messages = {'/twist': self.TWIST, '/landmarks': self.LIDAR, '/beacons': self.CLOUD}

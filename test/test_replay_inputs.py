@@ -153,6 +153,8 @@ class TestMovingMounts:
                 pose = true_pose(stamp_ns)
                 drive.transforms('/tf', stamp_ns, ('map', 'base_link', pose, stamp_ns))
                 drive.landmarks(stamp_ns, se3.inverse(pose), 'map')
+        given = ('--set', 'sensor_pose=[0.2,0.0,0.4,0.0,0.0,0.0]')
+        assert slam_observer('replay', path, '--json', *given).json['landmarks'] == 0
         ended = slam_observer('replay', path, '--json')
         assert ended.json['dropped'] == {'no_transform': 20}
         assert ended.json['landmarks'] == 0
@@ -463,6 +465,21 @@ def test_velocities_without_a_frame_are_those_of_base_link(
     trajectory = read_tum(poses)
     position = true_pose(trajectory.stamps_ns[-1])[:3, 3]
     assert (np.linalg.norm(trajectory.positions[-1] - position) < 0.01) == is_right
+
+
+@pytest.mark.parametrize('frame_id', ['', 'base_link'])
+def test_a_sensor_frame_may_be_the_base_frame_that_no_message_names(
+    slam_observer, tmp_path, frame_id
+):
+    path = tmp_path / 'run.mcap'
+    with RecordingWriter(path) as writer:
+        drive = Drive(writer)
+        for stamp_ns in stamps_ns():
+            drive.write('/cmd_vel', ros.twist(V.tolist()), stamp_ns)
+            drive.landmarks(stamp_ns, frame_id=frame_id)
+    report = slam_observer('replay', path, '--set', 'sensor_frame=base_link', '--json').json
+    assert not report['dropped']
+    assert report['landmarks'] > 0
 
 
 def test_velocities_of_the_odometrys_own_frame_do_not_make_it_the_base(tmp_path):
