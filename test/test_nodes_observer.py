@@ -355,9 +355,9 @@ def test_parameter_misspelt_by_a_letter_is_refused_with_the_one_that_may_be_mean
 
 @pytest.mark.parametrize('name', ['observer_node', 'lifecycle_observer_node', 'simulator_node'])
 def test_parameters_that_are_not_given_to_ros_are_not_passed_over(ros, tmp_path, name):
-    node = NodeProcess(name, tmp_path / name, '--', '-p', 'gains:=constant')
+    node = NodeProcess(name, tmp_path / name, '--', '--params-file', 'robot.yaml')
     assert node.wait() == 2
-    assert 'unknown arguments -p gains:=constant: ' in node.output
+    assert 'unknown arguments --params-file robot.yaml: ' in node.output
     assert 'come after --ros-args' in node.output
     assert 'Traceback' not in node.output
 
