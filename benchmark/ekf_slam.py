@@ -41,9 +41,9 @@ class EkfSlam:
         self._odometry = Odometry(settings)
         self._noise = SightingNoise(settings)
         axes = PLANAR if settings.two_d_mode else SPATIAL
-        self._pose_axes, self._k = axes.pose, axes.point
+        self._pose_axes, self._d, self._k = axes.pose, axes.p, axes.point
         self._pose = np.eye(4) if initial_pose is None else initial_pose
-        self._P = np.zeros((len(axes.pose), len(axes.pose)))
+        self._P = np.zeros((axes.p, axes.p))
         self._rows: dict[int, int] = {}
         self._points = np.empty((0, 3))
 
@@ -66,8 +66,8 @@ class EkfSlam:
     def pose_covariance(self) -> FloatArray:
         """(6, 6) covariance of (θ̃, x̃); zero on axes that are not estimated."""
         covariance = np.zeros((6, 6))
-        d = len(self._pose_axes)
-        covariance[np.ix_(self._pose_axes, self._pose_axes)] = self._P[:d, :d]
+        d = self._d
+        covariance[self._pose_axes, self._pose_axes] = self._P[:d, :d]
         return covariance
 
     @property
@@ -99,7 +99,7 @@ class EkfSlam:
         F[3:, :3] = -so3.hat(R @ motion[:3, 3])
         self._pose = self._pose @ motion
         G = np.kron(np.eye(2), self._pose[:3, :3])
-        axes = np.ix_(self._pose_axes, self._pose_axes)
+        axes = self._pose_axes, self._pose_axes
         F, Q = F[axes], (G @ noise @ G.T)[axes]
         d = len(F)
         self._P[:d] = F @ self._P[:d]
@@ -130,7 +130,7 @@ class EkfSlam:
 
     def _output_matrix(self, rows: IntArray) -> FloatArray:
         """Return (m k, d + n k) derivatives Rᵀ [[p_i − x]×, −I, … I …] of the points seen."""
-        k, d, Rt = self._k, len(self._pose_axes), self._pose[:3, :3].T
+        k, d, Rt = self._k, self._d, self._pose[:3, :3].T
         by_pose = np.empty((len(rows), 3, 6))
         by_pose[:, :, :3] = so3.hat(self._points[rows] - self._pose[:3, 3])
         by_pose[:, :, 3:] = -np.eye(3)
@@ -141,7 +141,7 @@ class EkfSlam:
         return H.reshape(-1, len(self._P))
 
     def _move(self, error: FloatArray, R: FloatArray) -> None:
-        d = len(self._pose_axes)
+        d = self._d
         pose_error = np.zeros(6)
         pose_error[self._pose_axes] = error[:d]
         self._pose = se3.pose(so3.exp(pose_error[:3]) @ R, self._pose[:3, 3] + pose_error[3:])
@@ -150,7 +150,7 @@ class EkfSlam:
     def _initialise(self, ids: IntArray, points: FloatArray, covariances: FloatArray) -> None:
         """Add p_i = x + R y_i, with its dependence on the pose."""
         k, n, R = self._k, len(self._P), self._pose[:3, :3]
-        d = len(self._pose_axes)
+        d = self._d
         by_pose = np.empty((len(ids), 3, 6))
         by_pose[:, :, :3] = -so3.hat(points @ R.T)
         by_pose[:, :, 3:] = np.eye(3)
@@ -167,5 +167,5 @@ class EkfSlam:
 
     def _columns(self, rows: IntArray) -> IntArray:
         """Return the columns (m, k) of P that belong to landmarks (m,)."""
-        columns: IntArray = len(self._pose_axes) + self._k * rows[:, None] + np.arange(self._k)
+        columns: IntArray = self._d + self._k * rows[:, None] + np.arange(self._k)
         return columns

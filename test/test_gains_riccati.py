@@ -134,9 +134,9 @@ def test_predicted_residual_covariance_matches_monte_carlo(two_d_mode):
     axes = PLANAR if two_d_mode else SPATIAL
     runs, pieces, k = 20_000, 5, axes.point
     V = np.zeros((pieces, 6))
-    V[:, axes.pose] = rng.normal(size=(pieces, len(axes.pose)))
+    V[:, axes.pose] = rng.normal(size=(pieces, axes.p))
     Q = np.zeros((6, 6))
-    Q[axes.pose, axes.pose] = 1e-4
+    Q[axes.pose, axes.pose] = 1e-4 * np.eye(axes.p)
     R = np.diag([1e-3, 2e-3, 3e-3])
     point = np.array([[2.0, -1.0, 0.0 if two_d_mode else 0.5]])
     slam = Filter(FullMapGains(replace(PLAIN, two_d_mode=two_d_mode)))

@@ -232,7 +232,7 @@ def test_a_place_that_is_not_found_is_looked_for_again_when_there_is_news(monkey
 
 @pytest.mark.parametrize('axes', [SPATIAL, PLANAR])
 def test_a_frame_that_lies_anyhow_to_robot_and_landmarks_alike_is_no_obstacle(axes):
-    p, k = len(axes.pose), axes.point
+    p, k = axes.p, axes.point
     source = np.random.default_rng(0).uniform(-5, 5, (6, 3)) * ([1, 1, 1] if k == 3 else [1, 1, 0])
     G = np.vstack([np.eye(p), axes.output_matrix(source).reshape(6 * k, p)])
     tilted = G @ G.T + 1e-4 * np.eye(p + 6 * k)  # by 1 rad, in common

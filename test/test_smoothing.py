@@ -56,7 +56,7 @@ class Problem:
 
     def __init__(self, axes, calibrations, seed, is_relative=False, known_landmarks=2):
         rng = np.random.default_rng(seed)
-        d, k, c = len(axes.pose), axes.point, calibrations
+        d, k, c = axes.p, axes.point, calibrations
         self.axes, self.d, self.k, self.c = axes, d, k, c
         motions = se3.exp(self._tangents(0.3 * rng.normal(size=(FRAMES, d))))
         prior_size = d + c + k * known_landmarks
@@ -210,7 +210,7 @@ def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
 @pytest.mark.parametrize('turns_together', [True, False])
 def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_together):
-    d, points = len(axes.pose), axes.full_points(np.arange(4.0 * axes.point))
+    d, points = axes.p, axes.full_points(np.arange(4.0 * axes.point))
     together = np.concatenate([np.eye(d), axes.output_matrix(points).reshape(-1, d)])
     turn, own = (
         np.diag(0.1 * (np.arange(d) < d - axes.point)),
@@ -227,7 +227,7 @@ def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_togethe
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
 def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
     """A stretch without observations reaches the history in pieces."""
-    rng, d, k = np.random.default_rng(0), len(axes.pose), 6
+    rng, d, k = np.random.default_rng(0), axes.p, 6
     settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
     V, dt_s = np.zeros((k, 6)), np.full(k, 0.2)
     V[:, axes.pose] = rng.normal(size=(k, d))
@@ -262,7 +262,7 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
 @given(rng=generators())
 def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
-    d = len(axes.pose)
+    d = axes.p
     settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
     calibration = Calibration(settings, axes)
     c = calibration.count
@@ -280,7 +280,7 @@ def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     history.see(Seen(0, *nothing), path[-1])
     history.see(Seen(1, *nothing), path[-1])  # nothing has moved since
     frames = history.frames()
-    to_body = se3.adjoint(se3.inverse(path[-1]))[np.ix_(axes.pose, axes.pose)]
+    to_body = se3.adjoint(se3.inverse(path[-1]))[axes.pose, axes.pose]
     np.testing.assert_allclose(
         frames.sensitivities, [to_body @ sensitivities.sum(axis=0), np.zeros((d, c))], atol=1e-9
     )

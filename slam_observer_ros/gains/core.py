@@ -58,7 +58,7 @@ class Core:
     def __init__(self, axes: Axes, calibration: Calibration) -> None:
         start = initial_covariance(axes, calibration)
         self._axes, self._calibration = axes, calibration
-        self._p = len(axes.pose)
+        self._p = axes.p
         self._places = len(start) + np.arange(CAPACITY * axes.point).reshape(CAPACITY, axes.point)
         self._unseen = np.full(CAPACITY, NEVER)
         self.rows: IntArray = np.full(CAPACITY, NOBODY)

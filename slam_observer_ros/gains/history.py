@@ -82,7 +82,7 @@ class History:
         self._end = prior.pose
         self._noise, self._sensitivity = self._at_rest()
         # Frames as arrays: those that are summarised, in pieces, and those that are not.
-        self._none = no_frames(len(axes.pose), len(prior.calibration), axes.point)
+        self._none = no_frames(axes.p, len(prior.calibration), axes.point)
         self._summarised: list[Frames] = []
         self._latest = self._none
         self._new: list[_Frame] = []
@@ -190,7 +190,7 @@ class History:
         pose, k, seen = self._axes.pose, self._axes.point, [frame.seen for frame in frames]
         back = se3.inverse(np.array([frame.end for frame in frames]))
         starts = np.array([frame.start for frame in frames])
-        to_body = se3.adjoint(back)[:, pose][:, :, pose]
+        to_body = se3.adjoint(back)[:, pose, pose]
         noises = np.array([frame.noise for frame in frames])
         numbers = np.arange(first, first + len(frames))
         dt_s = np.concatenate([part.dt_s for part in seen])
@@ -219,5 +219,5 @@ class History:
 
     def _at_rest(self) -> tuple[FloatArray, FloatArray]:
         """Return the covariance and the sensitivity of no motion."""
-        d = len(self._axes.pose)
+        d = self._axes.p
         return np.zeros((d, d)), np.zeros((d, len(self._calibration)))

@@ -36,7 +36,7 @@ class JointCovariance:
 
     def __init__(self, axes: Axes, calibration: Calibration, velocity_error: float) -> None:
         self._axes = axes
-        self._p = len(axes.pose)
+        self._p = axes.p
         self._velocity_error = velocity_error
         self._stride = axes.point * (2 if velocity_error > 0.0 else 1)
         self.P = initial_covariance(axes, calibration)
@@ -146,7 +146,7 @@ class JointCovariance:
     def with_pose_error_by(self, A: FloatArray) -> FloatArray:
         """Return the covariance of Ad_A ε and all else."""
         p, pose = self._p, self._axes.pose
-        Ad = se3.adjoint(A)[np.ix_(pose, pose)]
+        Ad = se3.adjoint(A)[pose, pose]
         changed: FloatArray = self.P.copy()
         changed[:p] = Ad @ changed[:p]
         changed[:, :p] = changed[:, :p] @ Ad.T

@@ -99,7 +99,7 @@ class Leaves:
         F, group = self._F[rows], self._group[rows]
         shifts = self._followed(F, group)
         turns = self._axes.turn_matrix(shifts)
-        F[:, :, : len(self._axes.pose)] += turns * (group != CORE)[:, None, None]
+        F[:, :, : self._axes.p] += turns * (group != CORE)[:, None, None]
         N = self._N[rows] + F @ self._V[group] @ transpose(F)
         return F @ self._G[group], N, shifts + self._shifts[rows]
 

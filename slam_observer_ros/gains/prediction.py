@@ -14,7 +14,7 @@ from slam_observer_ros.types import FloatArray
 
 def initial_covariance(axes: Axes, calibration: Calibration) -> FloatArray:
     """Return (p + c, p + c): the pose is the reference, so known; the calibration is not."""
-    return np.diag(np.append(np.zeros(len(axes.pose)), calibration.initial_variances))
+    return np.diag(np.append(np.zeros(axes.p), calibration.initial_variances))
 
 
 def predict(
@@ -39,7 +39,7 @@ def predict(
         (p, c) how the pose error has grown with that of the calibration.
 
     """
-    p = len(axes.pose)
+    p = axes.p
     c = slice(p, p + calibration.count)
     Ad = se3.adjoint(motion.path)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)

@@ -54,7 +54,7 @@ class RiccatiGains(GainDesign):
     ) -> None:
         self._settings = settings
         self._axes = axes_of(settings.two_d_mode)
-        self._p = len(self._axes.pose)
+        self._p = self._axes.p
         self.calibration = calibration
         self._joint = joint
 
@@ -92,7 +92,7 @@ class RiccatiGains(GainDesign):
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
         pose = self._axes.pose
-        self._joint.set_pose(covariance[np.ix_(pose, pose)])
+        self._joint.set_pose(covariance[pose, pose])
 
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each point was given."""

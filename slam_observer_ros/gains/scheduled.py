@@ -73,7 +73,7 @@ class ScheduledGains(GainDesign):
     @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
-        p = len(self._axes.pose)
+        p = self._axes.p
         variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
         return variances
 
@@ -99,12 +99,12 @@ class ScheduledGains(GainDesign):
 
     def set_pose_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
-        self._core.set_pose_covariance(covariance[np.ix_(self._axes.pose, self._axes.pose)])
+        self._core.set_pose_covariance(covariance[self._axes.pose, self._axes.pose])
 
     def joint_covariance(self, rows: IntArray) -> FloatArray:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
         F, N, _ = self._leaves.now(rows)
-        p, q = len(self._axes.pose), len(self._core.P)
+        p, q = self._axes.p, len(self._core.P)
         joint = self._with_landmarks(F, N)
         columns = np.append(np.arange(p), np.arange(q, len(joint)))
         return joint[np.ix_(columns, columns)]
@@ -118,7 +118,7 @@ class ScheduledGains(GainDesign):
         Other landmarks' errors are ã_i = F_i (z − γ) + J_i γ + η_i, the core being the pose alone.
         """
         self._core.dismiss(self._core.rows)
-        everything, p = np.arange(len(self._leaves)), len(self._axes.pose)
+        everything, p = np.arange(len(self._leaves)), self._axes.p
         m, k, q = len(r), self._axes.point, len(self._core.P)
         F, N, _ = self._leaves.now(everything)
         J = self._axes.output_matrix(observer.points)
@@ -187,7 +187,7 @@ class ScheduledGains(GainDesign):
                 break
         shifts = self._axes.full_points((F @ x + N @ pull).ravel())
         F = F + N @ gain_k @ H
-        F[:, :, : len(self._axes.pose)] += self._axes.turn_matrix(shifts)
+        F[:, :, : self._axes.p] += self._axes.turn_matrix(shifts)
         N[passed] = symmetric(N[passed] @ gain_k[passed] @ noise)  # = N − N k N, but positive
         self._core.shrink(H[passed], gain_k[passed])
         self._leaves.shift(x[:, 0])
@@ -234,7 +234,7 @@ class ScheduledGains(GainDesign):
         self, rows: IntArray, x: FloatArray, shifts: FloatArray, a: FloatArray
     ) -> Correction:
         """Return the element that moves the core by x and â_i (m, 3) by ``shifts`` alone."""
-        p = len(self._axes.pose)
+        p = self._axes.p
         self.calibration.shift(x[p : p + self.calibration.count])
         D = se3.exp(self._axes.full_pose(x[:p]))
         return Correction(D, rows, shifts + a - se3.rotate(D, a))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.types import FloatArray, Immutable, IntArray
+from slam_observer_ros.types import FloatArray, Immutable
 
 
 class Axes(Immutable):
@@ -13,17 +13,20 @@ class Axes(Immutable):
 
     Attributes
     ----------
-    pose : IntArray
-        (p,) axes of the pose error ε = (Ω, v).
+    pose : slice
+        Axes of the pose error ε = (Ω, v).
+    p : int
+        How many these are.
     point : int
         Leading axes of a point, 2 or 3.
 
     """
 
-    def __init__(self, pose: IntArray, point: int) -> None:
+    def __init__(self, pose: slice, point: int) -> None:
         self.pose = pose
+        self.p: int = pose.stop - pose.start
         self.point = point
-        self._shape = (-1, point, len(pose))
+        self._shape = (-1, point, self.p)
         turns = np.concatenate([-so3.hat(np.eye(3)), np.zeros((3, 3, 3))], axis=2)
         self._turns = turns[:, :point, pose].reshape(3, -1)
         self._shift = np.eye(3, 6, 3)[:point, pose].ravel()
@@ -48,7 +51,7 @@ class Axes(Immutable):
     def full_pose_covariance(self, covariance: FloatArray) -> FloatArray:
         """Return the covariance (6, 6) of ε with zeros on the axes that are not estimated."""
         full = np.zeros((6, 6))
-        full[np.ix_(self.pose, self.pose)] = covariance
+        full[self.pose, self.pose] = covariance
         return full
 
     def full_points(self, errors: FloatArray) -> FloatArray:
@@ -58,8 +61,8 @@ class Axes(Immutable):
         return full
 
 
-SPATIAL = Axes(np.arange(6), 3)
-PLANAR = Axes(np.array([2, 3, 4]), 2)
+SPATIAL = Axes(slice(0, 6), 3)
+PLANAR = Axes(slice(2, 5), 2)
 
 
 def axes_of(two_d_mode: bool) -> Axes:

@@ -117,10 +117,10 @@ class BaseFrame:
             If the sensor's pose is not known (yet), or the landmarks are told in the map's frame.
 
         """
-        frame_id = self._sensor_frame or frame_id
-        self._refuse_map_frame(frame_id)
         if self._sensor_pose is not None:
             return move_observation(event, self._sensor_pose)
+        frame_id = self._sensor_frame or frame_id
+        self._refuse_map_frame(frame_id)
         return self._moved(move_observation, event, frame_id)
 
     def tags(self, detections: TagDetections) -> ObservationEvent:

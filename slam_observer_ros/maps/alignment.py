@@ -54,7 +54,7 @@ def find_transform(
         robot is turned: of many landmarks some few fit by chance.
 
     """
-    p, k = len(axes.pose), axes.point
+    p, k = axes.p, axes.point
     J = axes.output_matrix(source).reshape(len(source) * k, p)
     G = np.vstack([np.eye(p), J])
     agree = np.ones(len(source), dtype=np.bool_)
@@ -96,7 +96,7 @@ def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: Axes) -
     Parameters are those of :func:`slam_observer_ros.gains.gauge.anchor`, for the pose and the
     landmarks that the map has.
     """
-    turns, rows = len(axes.pose) - axes.point, np.arange(len(axes.pose), len(P))
+    turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
     try:
         _, after = anchor(P, G, rows, there, np.zeros(len(rows)))
     except np.linalg.LinAlgError:

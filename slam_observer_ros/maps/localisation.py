@@ -130,7 +130,7 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     if not isinstance(slam.gains, FullMapGains) or n == 0:
         return slam.landmark_covariances
     joint = slam.gains.joint_covariance(np.arange(n))
-    P = joint[len(axes.pose) :, len(axes.pose) :]
+    P = joint[axes.p :, axes.p :]
     G = axes.output_matrix(observer.y_ref - observer.y_ref.mean(axis=0)).reshape(n * k, -1)
     least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
     information = gauge_information(G, with_variances_above(least_m2, P))
@@ -161,7 +161,7 @@ def _of_constant_gains(slam: Slam, rows: IntArray) -> FloatArray:
 
     The pose is exact; a landmark is as uncertain as it would be if it was seen from here once.
     """
-    p, k = len(slam.axes.pose), slam.axes.point
+    p, k = slam.axes.p, slam.axes.point
     noise = slam.observation_noise.at(slam.observer.body_points(rows))
     covariance = np.zeros((p + k * len(rows),) * 2)
     covariance[p:, p:] = block_diagonal(slam.observer.turned(noise)[:, :k, :k])

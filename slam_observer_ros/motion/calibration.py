@@ -63,7 +63,8 @@ class Calibration:
         scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
         bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
         errors = np.concatenate([scale, bias, [settings.velocity_delay_error]])
-        possible = np.concatenate([axes.pose, 6 + axes.pose, [DELAY]])
+        pose = np.arange(6)[axes.pose]
+        possible = np.concatenate([pose, 6 + pose, [DELAY]])
         self._estimated: IntArray = possible[errors[possible] > 0.0]
         self._scales = int(np.sum(self._estimated < 6))
         self._calibrated = self._estimated[self._estimated < DELAY] % 6

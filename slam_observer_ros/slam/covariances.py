@@ -40,7 +40,7 @@ def of_configuration(
     P = gains.joint_covariance(rows)
     if P is None:
         return None
-    m, k, p = len(rows), axes.point, len(axes.pose)
+    m, k, p = len(rows), axes.point, axes.p
     points = observer.points + gains.postponed_shifts()
     C = axes.output_matrix(points[rows]).reshape(-1, p)
     CP = C @ P[:p] - P[p:]

@@ -191,7 +191,7 @@ class Smoother:
 
     def _linearise(self, solution: Solution) -> Equations:
         c, k, frames = len(solution.calibration), self._axes.point, self._frames
-        S, d, b = len(solution.poses), len(self._axes.pose), c + k * len(solution.points)
+        S, d, b = len(solution.poses), self._axes.p, c + k * len(solution.points)
         H, pull = self._observations(solution)
         poses, landmarks, n = frames.frames + 1, frames.landmarks, len(solution.points)
         columns = landmark_columns(np.arange(n), c, k)
@@ -222,7 +222,7 @@ class Smoother:
             solution.calibration,
             solution.points,
         )
-        d = len(self._axes.pose)
+        d = self._axes.p
         known = len(pull) - d
         equations.diagonal[0] += information[:d, :d]
         equations.first[:, :known] += information[:d, d:]
@@ -233,7 +233,7 @@ class Smoother:
     def _add_motions(self, equations: Equations, solution: Solution) -> None:
         """Add e_s = log((M_s exp(F_s (c − c_s)))⁻¹ Â_{s−1}⁻¹ Â_s) of each motion M_s."""
         frames, pose = self._frames, self._axes.pose
-        d, c = len(pose), len(solution.calibration)
+        d, c = self._axes.p, len(solution.calibration)
         eta = np.zeros((len(frames.motions), 6))
         off = solution.calibration - frames.calibrations
         eta[:, pose] = (frames.sensitivities @ off[:, :, None])[:, :, 0]
@@ -261,7 +261,7 @@ class Smoother:
     def _estimated(self, matrices: FloatArray) -> FloatArray:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""
         pose = self._axes.pose
-        return matrices[:, pose[:, None], pose]
+        return matrices[:, pose, pose]
 
     def _observations(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return the normal equations of R_Âᵀ (p_i − x_Â) − y, with Huber's weight.

@@ -49,7 +49,7 @@ class Prior:
 
         dy_i is Rᵀ dp_i − C_i η, with C_i the output matrix at y_i and R the pose's rotation.
         """
-        d, k, first = len(axes.pose), axes.point, self._first_point(axes)
+        d, k, first = axes.p, axes.point, self._first_point(axes)
         y = se3.transform(se3.inverse(self.pose), self.points)
         C, R = axes.output_matrix(y).reshape(-1, d), self.pose[:k, :k]
         covariance = self.covariance.copy()
@@ -126,12 +126,12 @@ class Prior:
             (4, 4), (c,) and (n + …, 3) estimates.
 
         """
-        d, k, first = len(axes.pose), axes.point, self._first_point(axes)
+        d, k, first = axes.p, axes.point, self._first_point(axes)
         eta = se3.log(se3.inverse(self.pose) @ pose)
         y = self._seen_from(pose, points[: len(self.points)])
         shifts = (y - self._seen_from(self.pose, self.points))[:, :k].ravel()
         error = np.concatenate([eta[axes.pose], calibration - self.calibration, shifts])
-        J_eta = se3.left_jacobian_inverse(-eta)[np.ix_(axes.pose, axes.pose)]
+        J_eta = se3.left_jacobian_inverse(-eta)[axes.pose, axes.pose]
         C, R = np.zeros((len(shifts), d)), np.eye(k)
         if self.is_relative:
             C, R = axes.output_matrix(y).reshape(-1, d), pose[:k, :k]
@@ -152,7 +152,7 @@ class Prior:
 
     def _turns(self, axes: Axes) -> slice:
         """Return the columns of the pose's angles, which come before its shifts."""
-        return slice(len(axes.pose) - axes.point)
+        return slice(axes.p - axes.point)
 
     def _first_point(self, axes: Axes) -> int:
         """Return the first column of the landmarks."""
