@@ -107,6 +107,8 @@ class Calibration:
         were taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6) holds
         the estimated rows of Ad_Â.
         """
+        if not self.count:
+            return np.empty((Ad.shape[1], 0))
         rates = motion.measured_velocities[:, self._calibrated]
         rates[:, self._scales :] = 1.0
         shares = paths.at_poses(rates * motion.dt_s[:, None])

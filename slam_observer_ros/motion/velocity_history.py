@@ -197,8 +197,9 @@ class VelocityHistory:
         since_ns = self._written().since_ns[max(stop - RECENT, 1) : stop]
         if len(since_ns) < 3:
             return np.full(2, np.inf)
-        usual_s = to_s(np.partition(np.diff(since_ns, axis=0), -2, axis=0)[-2])
-        return np.where(usual_s > 0.0, usual_s, np.inf)
+        usual_s: FloatArray = to_s(np.sort(since_ns[1:] - since_ns[:-1], axis=0)[-2])
+        usual_s[usual_s == 0.0] = np.inf
+        return usual_s
 
     def _written(self) -> _Joined:
         """Return all velocities, those that have come since the last time among them."""
