@@ -220,6 +220,21 @@ def test_the_error_of_a_message_goes_on_while_none_follows():
         np.testing.assert_allclose(lost, grown(stated, cuts_s)[1], rtol=1e-6, atol=1e-15)
 
 
+def test_slip_goes_on_as_before_while_no_message_comes():
+    none, slip = (0.0,) * 3, (0.1, 0.0, 0.0)
+    settings = Settings(
+        angular_velocity_noise=none,
+        linear_velocity_noise=none,
+        angular_scale_noise=none,
+        linear_scale_noise=slip,
+    )
+    history = VelocityHistory(SECOND)
+    for step in range(20):
+        history.append(VelocityEvent(step * SECOND // 20, np.array([0, 0, 0, 2.0, 0, 0])))
+    (Q,) = MotionNoise(settings).covariances(history.held(SECOND, SECOND + 6 * SECOND // 10))
+    np.testing.assert_allclose(Q, np.diag([0, 0, 0, (0.1 * 2.0) ** 2 * 0.6, 0, 0]), atol=1e-15)
+
+
 def test_commands_that_come_when_they_change_have_no_period():
     history = VelocityHistory(2 * SECOND)
     for time_s in (0.0, 0.05, 0.1, 1.3, 1.35, 2.4, 2.45):

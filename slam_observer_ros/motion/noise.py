@@ -51,7 +51,8 @@ class MotionNoise(Immutable):
         The speed is the mean over :data:`SPEED_WINDOW_S`, or over all of ``held`` if that is
         shorter; in a single message it is noisy itself, and its square too large. The density is
         that of errors which are new in each message. Held for t, longer than the usual T, one of
-        them has moved the robot by t/T times as much: its variance is t²/T, not t.
+        them has moved the robot by t/T times as much: its variance is t²/T, not t. Slip goes on as
+        before.
 
         *A velocity with a covariance of its own* has one error for as long as it is held, and
         another in the next message: held for t it has moved the robot by t times the error,
@@ -61,11 +62,10 @@ class MotionNoise(Immutable):
         *In a gap* the robot may do anything that ``unknown_*_motion`` allows, within
         :data:`MAX_GAP_ERRORS`.
         """
-        rates = self._density_squared
-        if self._has_scale:
-            rates = rates + (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2
         dt_s, some_are_stated = held.dt_s[:, None], held.is_stated.any()
-        variances = rates * _white_s(held)
+        variances = self._density_squared * _white_s(held)
+        if self._has_scale:
+            variances += (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2 * dt_s
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         if held.gap_s.any():
