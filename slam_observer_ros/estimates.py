@@ -60,7 +60,9 @@ class CalibrationEstimate:
 
     def __str__(self) -> str:
         """Write it with its uncertainty, of which at least two digits can be seen."""
-        digits = 3 if self.deviation <= 0.0 else max(3, 1 - math.floor(math.log10(self.deviation)))
+        digits = 3
+        if 0.0 < self.deviation < math.inf:
+            digits = min(max(digits, 1 - math.floor(math.log10(self.deviation))), 9)
         return f'{self.value:.{digits}f} ± {self.deviation:.{digits}f} {self.unit}'.rstrip()
 
 

@@ -42,6 +42,9 @@ class VelocityEvent:
         part, angular or linear, of which it is all zero is unknown as well.
     receive_ns : int or None
         When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
+    is_mean : bool
+        Whether it is the mean velocity until the next one, as between two poses. Otherwise its
+        error goes on while no other comes.
 
     """
 
@@ -49,6 +52,7 @@ class VelocityEvent:
     body_velocity: FloatArray
     covariance: FloatArray | None = None
     receive_ns: int | None = None
+    is_mean: bool = False
 
 
 @dataclass(frozen=True, slots=True)

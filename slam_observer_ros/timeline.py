@@ -138,10 +138,13 @@ class Timeline:
         """
         state_ns = event.stamp_ns if self.state_ns is None else self.state_ns
         back = self.motion(slam.gains.calibration, state_ns, event.stamp_ns)
-        points = event.points
+        points, sensor = event.points, event.sensor
         if event.velocities is not None:
-            points = points + event.velocities * to_s(state_ns - event.stamp_ns)
-        moved = move_observation(replace(event, stamp_ns=state_ns, points=points), back)
+            shifts = event.velocities * to_s(state_ns - event.stamp_ns)
+            # The sensor with it, so that it was measured from as far.
+            points, sensor = points + shifts, shifts if sensor is None else sensor + shifts
+        shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
+        moved = move_observation(shifted, back)
         Q = transition_covariance(
             self.velocities, slam.gains.calibration, slam.motion_noise, event.stamp_ns, state_ns
         )

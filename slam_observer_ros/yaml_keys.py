@@ -20,8 +20,10 @@ class UniqueKeys:
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
         """Return a mapping; raise a YAMLError if it has a key twice."""
-        keys = (key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        for key, count in Counter(keys).items():
-            if count > 1:
-                raise yaml.YAMLError(f"'{key}' is there {count} times in one entry")
+        keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        counts = Counter(key.value for key in keys)
+        for key in keys:
+            if counts[key.value] > 1:
+                problem = f"'{key.value}' is there {counts[key.value]} times in one entry"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
         return super().construct_mapping(node, deep)  # type: ignore[misc]  # the loader's

@@ -203,6 +203,24 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_
     np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
 
 
+def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen():
+    still = (0.0,) * 3
+    settings = Settings(
+        observation_model='stereo', angular_velocity_noise=still, linear_velocity_noise=still
+    )
+    slam, timeline = Slam(settings, np.eye(4)), Timeline(settings)
+    for step in range(11):
+        timeline.append(velocity(0.1 * step, np.zeros(6)))
+    states = Hypotheses(slam)
+    timeline.advance(states, START_NS + 10**9)
+    seen, speed = np.array([[5.0, 0.0, 0.0]]), np.array([[4.0, 0.0, 0.0]])
+    event = ObservationEvent(START_NS + 10**8, np.array([1]), seen, velocities=speed)
+    carried = timeline.meet(event, states)
+    np.testing.assert_allclose(carried.points, seen + 0.9 * speed, atol=1e-9)
+    expected = slam.observation_noise.at(seen)
+    np.testing.assert_allclose(carried.covariances, expected, rtol=1e-6)
+
+
 def test_landmarks_that_are_always_seen_late_are_not_drawn_towards_the_robot():
     """A stereo camera that measures one too near must not be believed more for that."""
     stereo = Settings(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 
 from gain_worlds import configuration_error_m, drive, estimate, true_velocities
 from hypothesis import given
@@ -12,6 +13,7 @@ import pytest
 from scipy.stats import chi2
 from strategies import generators
 
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.gains.prediction import initial_covariance, predict
@@ -318,3 +320,18 @@ def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
     zero = np.zeros(1)
     carried = Motion(path, np.zeros((1, 6)), zero, zero, np.zeros((1, 6, 6)), None)
     assert not calibration.sensitivity(se3.adjoint(path), carried).any()
+
+
+@pytest.mark.parametrize(
+    ('deviation', 'expected'),
+    [
+        (0.0123, '0.012 ± 0.012 rad/s'),
+        (0.000158, '0.01235 ± 0.00016 rad/s'),
+        (0.0, '0.012 ± 0.000 rad/s'),
+        (math.nan, '0.012 ± nan rad/s'),
+        (math.inf, '0.012 ± inf rad/s'),
+        (1e-30, '0.012345000 ± 0.000000000 rad/s'),
+    ],
+)
+def test_an_estimate_is_told_as_far_as_it_is_known(deviation, expected):
+    assert str(CalibrationEstimate('angular_bias_x', 0.012345, deviation, 'rad/s')) == expected

@@ -11,7 +11,12 @@ import pytest
 from strategies import generators
 
 from slam_observer_ros.estimator import Estimator
-from slam_observer_ros.events import flatten, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    flatten,
+    ObservationEvent,
+    VelocityEvent,
+)
 from slam_observer_ros.extrinsics import move_observation, move_velocity
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import SPATIAL
@@ -218,6 +223,32 @@ def test_the_error_of_a_message_goes_on_while_none_follows():
         np.testing.assert_allclose(np.diag(usual), density**2 * 9.5 * period_s, rtol=1e-6)
         np.testing.assert_allclose(np.diag(lost), density**2 * lost_s**2 / period_s, rtol=1e-6)
         np.testing.assert_allclose(lost, grown(stated, cuts_s)[1], rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize('imu_rate_hz', [50, 200, 1000])
+def test_the_error_of_lost_wheels_goes_on_beside_an_imu(imu_rate_hz):
+    settings = Settings(linear_velocity_noise=(0.02,) * 3)
+    history, end_ns = VelocityHistory(SECOND), 2 * SECOND
+    imu = [AngularVelocityEvent(t, np.zeros(3)) for t in range(0, end_ns, SECOND // imu_rate_hz)]
+    wheels = [VelocityEvent(t, np.zeros(6)) for t in range(0, end_ns, SECOND // 20)]
+    lost_since_ns = 12 * SECOND // 10
+    kept = [event for event in wheels if event.stamp_ns <= lost_since_ns]
+    for event in sorted([*kept, *imu], key=lambda event: event.stamp_ns):
+        history.append(event)
+    Q = MotionNoise(settings).covariances(history.held(lost_since_ns, end_ns)).sum(axis=0)
+    np.testing.assert_allclose(np.diag(Q)[3:], 0.02**2 * 0.8**2 / 0.05, rtol=1e-6)
+    angular = np.square(settings.angular_velocity_noise) * 0.8
+    np.testing.assert_allclose(np.diag(Q)[:3], angular, rtol=1e-6)
+
+
+def test_a_mean_between_two_poses_leads_to_the_second_however_far_that_is():
+    settings, history = Settings(linear_velocity_noise=(0.02,) * 3), VelocityHistory(SECOND)
+    for step in (0, 1, 2, 3, 4, 16, 17):
+        history.append(VelocityEvent(step * SECOND // 20, np.ones(6), is_mean=True))
+    Q = MotionNoise(replace(settings, linear_scale_noise=(0.0,) * 3)).covariances(
+        history.held(4 * SECOND // 20, 16 * SECOND // 20)
+    )
+    np.testing.assert_allclose(np.diag(Q[0])[3:], 0.02**2 * 0.6)
 
 
 def test_slip_goes_on_as_before_while_no_message_comes():

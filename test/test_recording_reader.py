@@ -387,6 +387,17 @@ class TestTopics:
         with Recording(path) as recording:
             selected = recording.find_topics(TopicNames(), InputSettings(landmarks_type=kind))
         assert selected.landmarks.name == '/lidar'
+        path.unlink()
+        with RecordingWriter(path) as writer:
+            for topic, message in (
+                ('/twist', self.TWIST),
+                ('/lidar', self.LIDAR),
+                ('/beacons', self.CLOUD),
+            ):
+                writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
+        with Recording(path) as recording:
+            selected = recording.find_topics(TopicNames(), InputSettings(landmarks_type=kind))
+        assert selected.landmarks.name == '/beacons', 'points with ids come first'
 
     def test_a_cloud_called_landmarks_needs_no_ids(self, tmp_path):
         messages = {'/twist': self.TWIST, '/landmarks': self.LIDAR, '/beacons': self.CLOUD}

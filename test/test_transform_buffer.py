@@ -149,6 +149,13 @@ def test_a_straggler_of_the_lap_before_does_not_make_all_of_the_next_too_old():
     np.testing.assert_array_equal(buffer.lookup('odom', 'base_link', SECOND // 3), np.eye(4))
 
 
+def test_one_old_transform_that_is_repeated_is_no_jump():
+    buffer = TransformBuffer()
+    for stamp_ns in (30 * SECOND, *[5 * SECOND] * 10):
+        buffer.insert('odom', 'base_link', stamp_ns, np.eye(4))
+    assert buffer.newest_ns('odom', 'base_link') == 30 * SECOND
+
+
 def test_transforms_that_come_late_among_others_are_kept():
     buffer = TransformBuffer()
     for step in range(10):

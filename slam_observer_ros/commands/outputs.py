@@ -127,18 +127,19 @@ def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
         If that fails.
 
     """
-    beside, unfinished = directory if directory.is_dir() else directory.parent, ''
+    beside = directory if directory.is_dir() else directory.parent
     try:
         with tempfile.TemporaryDirectory(dir=beside, prefix='.writing-') as unfinished:
-            yield Path(unfinished)
+            try:
+                yield Path(unfinished)
+            except EvaluationError as error:  # which names a directory that is gone then
+                raise OutputError(str(error).replace(unfinished, str(directory))) from error
             directory.mkdir(exist_ok=True)
             files = sorted(Path(unfinished).iterdir())
             for file in files:
                 file.replace(destination(directory / file.name))
             for name in set(names) - {file.name for file in files}:
                 (directory / name).unlink(missing_ok=True)
-    except EvaluationError as error:  # which names a directory that is gone by now
-        raise OutputError(str(error).replace(unfinished, str(directory))) from error
     except OSError as error:
         reason = error.strerror or error  # its whole text names a directory that is gone by now
         raise OutputError(f"can't write figures to {directory}: {reason}") from error

@@ -73,7 +73,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         type=Path,
         metavar='FILE',
         help='known landmarks, as --map writes them: the estimate is then in their frame, and no '
-        'ANEES of the pose is told',
+        'ANEES of the pose is told (of the configuration neither if they are fixed)',
     )
     parser.add_argument(
         '--smooth',

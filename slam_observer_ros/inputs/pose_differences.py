@@ -53,7 +53,7 @@ class PoseDifferences:
         motion = se3.log(se3.inverse(last[1]) @ pose)
         duration_s = to_s(stamp_ns - last[0])
         _check_plausible(motion, duration_s)
-        return VelocityEvent(last[0], motion / duration_s)
+        return VelocityEvent(last[0], motion / duration_s, is_mean=True)
 
 
 def _check_plausible(motion: FloatArray, duration_s: float) -> None:

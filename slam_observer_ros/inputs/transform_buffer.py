@@ -35,7 +35,7 @@ class _Track:
     is_static: bool
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
-    behind: int = 0
+    behind_ns: list[int] = field(default_factory=list)
 
     def insert(self, stamp_ns: int, pose: FloatArray) -> None:
         if not self.is_static:
@@ -48,16 +48,17 @@ class _Track:
         del self.stamps_ns[:outdated], self.poses[:outdated]
 
     def _follow_jump(self, stamp_ns: int) -> None:
-        """Forget what is newer than a stamp that follows others, all of them far behind that.
+        """Forget all if stamps in a row are far behind the newest, one after the other.
 
-        As a straggler of the lap before, when a recording is looped: all to come would be too old.
+        That is a straggler of the lap before, when a recording is looped: what is to come would
+        seem too old.
         """
-        is_behind = bool(self.stamps_ns) and stamp_ns < self.stamps_ns[-1] - NEAR_NS
-        self.behind = self.behind + 1 if is_behind else 0
-        if self.behind >= AGREEING_STAMPS:
-            newer = bisect_left(self.stamps_ns, stamp_ns)
-            del self.stamps_ns[newer:], self.poses[newer:]
-            self.behind = 0
+        if not self.stamps_ns or stamp_ns >= self.stamps_ns[-1] - NEAR_NS:
+            self.behind_ns = []
+        elif not self.behind_ns or stamp_ns > self.behind_ns[-1]:
+            self.behind_ns.append(stamp_ns)
+        if len(self.behind_ns) >= AGREEING_STAMPS:
+            self.stamps_ns, self.poses, self.behind_ns = [], [], []
 
     def pose_at(self, stamp_ns: int) -> FloatArray | None:
         """Interpolate the pose (4, 4); None outside of what is known."""

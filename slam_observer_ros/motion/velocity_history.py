@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections import deque
 from dataclasses import dataclass, fields
+import math
 
 import numpy as np
 
@@ -15,7 +17,7 @@ NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
 """Stamp of a velocity that timed out before time began, nanoseconds."""
 
 RECENT = 64
-"""Velocities, at most, that tell how long one is held as a rule."""
+"""Periods of a sensor, at most, that tell how long its messages are in force as a rule."""
 
 FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
@@ -68,9 +70,9 @@ class HeldVelocities:
 
     def with_gaps_apart(self) -> HeldVelocities:
         """Return the same with each gap as a piece of its own, from where it leaves the robot."""
-        has_gap = self.gap_s > 0.0
+        has_gap = (self.gap_s > 0.0) & (self.dt_s > 0.0)
         rows = np.repeat(np.arange(len(has_gap)), 1 + has_gap)
-        is_gap = np.append(False, rows[1:] == rows[:-1])
+        is_gap = np.append(False, rows[1:] == rows[:-1]) | (self.dt_s[rows] == 0.0)
         return HeldVelocities(
             self.body_velocities[rows],
             self.covariances[rows],
@@ -122,6 +124,8 @@ class VelocityHistory:
         self._unwritten: list[tuple[VelocityEvent, AngularVelocityEvent | None]] = []
         self._velocity: VelocityEvent | None = None
         self._angular: AngularVelocityEvent | None = None
+        # The angular part has its own where another sensor tells it.
+        self._periods = self._angular_periods = _Periods()
 
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
         """Add an event that is not earlier than any other; return whether it leads on.
@@ -129,8 +133,13 @@ class VelocityHistory:
         An angular velocity does not before the first linear one is known: it waits for that.
         """
         if isinstance(event, AngularVelocityEvent):
+            if self._angular is None:
+                self._angular_periods = _Periods()
+            self._angular_periods.add(event.stamp_ns)
             self._angular = event
         else:
+            if not event.is_mean:  # else its error does not go on, however long it is held
+                self._periods.add(event.stamp_ns)
             self._velocity = event
         if self._velocity is None:
             return False
@@ -159,7 +168,7 @@ class VelocityHistory:
             to_s(stops - begins),
             to_s(ends - stops),
             to_s(begins[:, None] - joined.since_ns[rows]),
-            self._usual_s(rows.stop),
+            np.array([self._angular_periods.usual_s, self._periods.usual_s]),
         )
         return held.with_gaps_apart() if held.gap_s.any() else held
 
@@ -189,18 +198,6 @@ class VelocityHistory:
         timed_out = self._written().since_ns[first:last, 1] + self._timeout_ns
         return slice(first, last), begins, np.minimum(np.maximum(timed_out, begins), ends), ends
 
-    def _usual_s(self, stop: int) -> FloatArray:
-        """Return for how long parts (2,) have been held lately: but for once, no longer than that.
-
-        Up to the velocity before row ``stop``; the first row is of no message.
-        """
-        since_ns = self._written().since_ns[max(stop - RECENT, 1) : stop]
-        if len(since_ns) < 3:
-            return np.full(2, np.inf)
-        usual_s: FloatArray = to_s(np.sort(since_ns[1:] - since_ns[:-1], axis=0)[-2])
-        usual_s[usual_s == 0.0] = np.inf
-        return usual_s
-
     def _written(self) -> _Joined:
         """Return all velocities, those that have come since the last time among them."""
         count = len(self._stamps_ns)
@@ -216,6 +213,27 @@ class VelocityHistory:
         if self._is_planar:
             return flatten_velocities(body_velocities)
         return np.array(body_velocities)
+
+
+class _Periods:
+    """For how long messages of one sensor are in force as a rule."""
+
+    def __init__(self) -> None:
+        self._recent_ns: deque[int] = deque(maxlen=RECENT)
+        self._last_ns: int | None = None
+
+    def add(self, stamp_ns: int) -> None:
+        """Take the stamp of the next message."""
+        if self._last_ns is not None:
+            self._recent_ns.append(stamp_ns - self._last_ns)
+        self._last_ns = stamp_ns
+
+    @property
+    def usual_s(self) -> float:
+        """The longest period lately but one, seconds; infinite before there are two."""
+        if len(self._recent_ns) < 2:
+            return math.inf
+        return to_s(sorted(self._recent_ns)[-2]) or math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,7 +49,8 @@ class Input(Generic[MessageT]):
     read_first : sequence of Input
         Other inputs, of which what was received before a message of this one is read before it.
         An executor reads one message of each topic in turn, so after the node was busy a slow
-        topic would run far ahead of a fast one.
+        topic would run far ahead of a fast one. Where the middleware does not tell when it has
+        received a message it does.
 
     Attributes
     ----------
@@ -133,6 +134,7 @@ class Input(Generic[MessageT]):
         """Stop receiving."""
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
+            self._subscription = None
 
     def _subscribe(self, type_name: str) -> None:
         self.close()
@@ -144,7 +146,10 @@ class Input(Generic[MessageT]):
 
     def read_until(self, received_ns: int) -> None:
         """Read what waits, up to what DDS has received at a time, nanoseconds."""
-        while (source := self._subscription) is not None and self._received_ns < received_ns:
+        source = self._subscription
+        for _ in range(self._qos.depth):
+            if source is None or self._received_ns >= received_ns:
+                return
             with source.handle:
                 taken = source.handle.take_message(source.msg_type, source.raw)
             if taken is None:

@@ -66,7 +66,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int
         get_logger('slam_observer_ros').fatal(f'{type(error).__name__}: {reason}')
         return 2
     try:
-        if unknown := remove_ros_args(args)[1:]:
+        if unknown := [arg for arg in remove_ros_args(args)[1:] if arg not in ('', '--')]:
             get_logger('slam_observer_ros').fatal(
                 f'unknown arguments {" ".join(unknown)}: parameters, files of them and remappings '
                 'come after --ros-args'

@@ -132,14 +132,16 @@ def select_topics(
             return topic.message_type in role.all_types
         if topic.message_type not in role.message_types:
             return False
-        is_asked_for = not role.is_truth and inputs.landmarks_type != AUTO
-        return is_asked_for or topic.message_type not in CLOUD_DECODERS or identifies(topic)
+        return topic.message_type not in CLOUD_DECODERS or identifies(topic)
 
     def pick(role: _Role, name: str | None) -> Topic | None:
         if name is not None:
             return _named(topics, role, name)
         right = [topic for topic in used if _is_truth(topic.name) == role.is_truth]
-        return _best([topic for topic in right if fits(topic, role)], role)
+        found = _best([topic for topic in right if fits(topic, role)], role)
+        if found is None and not role.is_truth and inputs.landmarks_type != AUTO:
+            return _best([t for t in right if t.message_type in role.message_types], role)
+        return found
 
     def require(role: _Role, name: str | None) -> Topic:
         return _required(pick(role, name), role, used)
