@@ -16,8 +16,11 @@ from slam_observer_ros.units import NANOSECONDS_PER_SECOND, to_s
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
 """Stamp of a velocity that timed out before time began, nanoseconds."""
 
-RECENT = 64
-"""Periods of a sensor, at most, that tell how long its messages are in force as a rule."""
+BLOCK, BLOCKS = 64, 16
+"""The last 16 times 64 periods of a sensor tell how long its messages are in force as a rule.
+
+So many that they have pauses in them where these are usual, as of commands.
+"""
 
 FIRST_CAPACITY = 64
 """Velocities that there is room for at first."""
@@ -219,21 +222,25 @@ class _Periods:
     """For how long messages of one sensor are in force as a rule."""
 
     def __init__(self) -> None:
-        self._recent_ns: deque[int] = deque(maxlen=RECENT)
+        self._block_ns: list[int] = []
+        # The two longest of each block before: no others are among the two longest of all.
+        self._longest_ns: deque[int] = deque(maxlen=2 * BLOCKS)
         self._last_ns: int | None = None
 
     def add(self, stamp_ns: int) -> None:
         """Take the stamp of the next message."""
         if self._last_ns is not None:
-            self._recent_ns.append(stamp_ns - self._last_ns)
+            self._block_ns.append(stamp_ns - self._last_ns)
         self._last_ns = stamp_ns
+        if len(self._block_ns) == BLOCK:
+            self._longest_ns.extend(sorted(self._block_ns)[-2:])
+            self._block_ns = []
 
     @property
     def usual_s(self) -> float:
         """The longest period lately but one, seconds; infinite before there are two."""
-        if len(self._recent_ns) < 2:
-            return math.inf
-        return to_s(sorted(self._recent_ns)[-2]) or math.inf
+        longest_ns = sorted([*self._longest_ns, *self._block_ns])[-2:]
+        return math.inf if len(longest_ns) < 2 else to_s(longest_ns[0]) or math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
