@@ -66,8 +66,7 @@ class EkfSlam:
     def pose_covariance(self) -> FloatArray:
         """(6, 6) covariance of (θ̃, x̃); zero on axes that are not estimated."""
         covariance = np.zeros((6, 6))
-        d = self._d
-        covariance[self._pose_axes, self._pose_axes] = self._P[:d, :d]
+        covariance[self._pose_axes, self._pose_axes] = self._P[: self._d, : self._d]
         return covariance
 
     @property

@@ -53,7 +53,7 @@ class Odometry:
         held = self._velocities.held(start_ns, stamp_ns)
         path = paths.path(np.eye(4), held.body_velocities * held.dt_s[:, None])
         Ad = se3.adjoint(se3.inverse(path[-1]) @ path)
-        covariances = Ad @ paths.at_poses(self._noise.covariances(held)) @ Ad.swapaxes(1, 2)
+        covariance = paths.summed_noise(Ad, self._noise.covariances(held))
         self._velocities.forget_before(stamp_ns)
         self._stamp_ns = stamp_ns
-        return path[-1], covariances.sum(axis=0)
+        return path[-1], covariance

@@ -11,7 +11,7 @@ import yaml
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import suggestion
-from slam_observer_ros.yaml_keys import reason_of, UniqueKeys
+from slam_observer_ros.yaml_errors import reason_of, UniqueKeys
 
 logger = logging.getLogger(__name__)
 

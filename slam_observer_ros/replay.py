@@ -225,8 +225,8 @@ class _Run:
         true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
         if covered[0]:
             ids = self._estimator.landmark_ids
-            is_due = len(ids) > 0 and update.stamp_ns >= self._next_nees_ns
-            is_due = is_due and not self._in_fixed_map
+            has_errors = len(ids) > 0 and not self._in_fixed_map
+            is_due = has_errors and update.stamp_ns >= self._next_nees_ns
             if is_due:
                 self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
             self._configuration.add(

@@ -401,7 +401,7 @@ def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
     decoders = {'geometry_msgs/msg/Twist': lambda *_: 'velocity'}
     velocities = Input(node, 'busy/twist', decoders, take, qos)
     decoders = {'geometry_msgs/msg/PoseArray': lambda *_: 'landmarks'}
-    Input(node, 'busy/landmarks', decoders, take, qos, [velocities])
+    Input(node, 'busy/landmarks', decoders, take, qos).read_first = [velocities]
     twists = ros.node.create_publisher(Twist, 'busy/twist', qos)
     landmarks = ros.node.create_publisher(PoseArray, 'busy/landmarks', qos)
     executor = SingleThreadedExecutor(context=ros.node.context)

@@ -322,12 +322,18 @@ class TestTopics:
         'geometry_msgs/msg/PoseStamped', ros.header('map'), ros.pose([0.0] * 3, [0, 0, 0, 1.0])
     )
 
-    def find(self, path: Path, messages: dict[str, object], **names: str):
+    def find(
+        self,
+        path: Path,
+        messages: dict[str, object],
+        inputs: InputSettings = InputSettings(),  # it is immutable
+        **names: str,
+    ):
         with RecordingWriter(path / 'topics.mcap') as writer:
             for topic, message in messages.items():
                 writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
         with Recording(path / 'topics.mcap') as recording:
-            selected = recording.find_topics(TopicNames(**names))
+            selected = recording.find_topics(TopicNames(**names), inputs)
         return {
             role: topic.name if topic else None
             for role, topic in (
@@ -379,25 +385,12 @@ class TestTopics:
         assert self.find(tmp_path, messages, landmarks='lidar')['landmarks'] == '/lidar'
 
     def test_clouds_without_ids_are_taken_by_their_type(self, tmp_path):
-        path = tmp_path / 'lidar.mcap'
-        with RecordingWriter(path) as writer:
-            for topic, message in (('/twist', self.TWIST), ('/lidar', self.LIDAR)):
-                writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
-        kind = self.LIDAR.__msgtype__.rsplit('/', 1)[-1]
-        with Recording(path) as recording:
-            selected = recording.find_topics(TopicNames(), InputSettings(landmarks_type=kind))
-        assert selected.landmarks.name == '/lidar'
-        path.unlink()
-        with RecordingWriter(path) as writer:
-            for topic, message in (
-                ('/twist', self.TWIST),
-                ('/lidar', self.LIDAR),
-                ('/beacons', self.CLOUD),
-            ):
-                writer.write(topic, message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
-        with Recording(path) as recording:
-            selected = recording.find_topics(TopicNames(), InputSettings(landmarks_type=kind))
-        assert selected.landmarks.name == '/beacons', 'points with ids come first'
+        inputs = InputSettings(landmarks_type=self.LIDAR.__msgtype__.rsplit('/', 1)[-1])
+        messages = {'/twist': self.TWIST, '/lidar': self.LIDAR}
+        assert self.find(tmp_path, messages, inputs)['landmarks'] == '/lidar'
+        (tmp_path / 'topics.mcap').unlink()
+        found = self.find(tmp_path, {**messages, '/beacons': self.CLOUD}, inputs)
+        assert found['landmarks'] == '/beacons', 'points with ids come first'
 
     def test_a_cloud_called_landmarks_needs_no_ids(self, tmp_path):
         messages = {'/twist': self.TWIST, '/landmarks': self.LIDAR, '/beacons': self.CLOUD}

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.matrices import symmetric, transpose
+from slam_observer_ros.matrices import symmetric
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.types import FloatArray
@@ -43,7 +43,7 @@ def predict(
     c = slice(p, p + calibration.count)
     Ad = se3.adjoint(motion.path)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
-    noise: FloatArray = (Ad @ paths.at_poses(motion.covariances) @ transpose(Ad)).sum(axis=0)
+    noise = paths.summed_noise(Ad, motion.covariances)
     if calibration.count:
         P[:p] += F @ P[c]
         P[:p, :p] += P[:p, c] @ F.T

@@ -45,6 +45,21 @@ def at_poses(pieces: FloatArray) -> FloatArray:
     return shares
 
 
+def summed_noise(Ad: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return ∫ Ad_A Q Ad_Aᵀ along a path (p, p), by the trapezoidal rule.
+
+    Parameters
+    ----------
+    Ad : FloatArray, shape (k + 1, p, 6)
+        Rows of Ad_A at the poses before, between and after k motions.
+    covariances : FloatArray, shape (k, 6, 6)
+        Covariances Q of the motions, body frame, rad² and m².
+
+    """
+    noise: FloatArray = (Ad @ at_poses(covariances) @ transpose(Ad)).sum(axis=0)
+    return noise
+
+
 def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -> FloatArray:
     """Return poses between two: position in a line, rotation about one axis, as tf2 does.
 

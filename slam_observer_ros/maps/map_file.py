@@ -34,7 +34,7 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.output_files import destination, unfinished_file
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
-from slam_observer_ros.yaml_keys import reason_of, UniqueKeys
+from slam_observer_ros.yaml_errors import reason_of, UniqueKeys
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1

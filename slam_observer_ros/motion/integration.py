@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from slam_observer_ros.geometry import paths, se3
-from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
@@ -38,9 +37,7 @@ def transition_covariance(
     """
     held = _held(velocities, calibration, start_ns, end_ns)
     Ad = se3.adjoint(_path(np.eye(4), held, calibration))
-    shares = paths.at_poses(noise.covariances(held))
-    covariance: FloatArray = (Ad @ shares @ transpose(Ad)).sum(axis=0)
-    return covariance
+    return paths.summed_noise(Ad, noise.covariances(held))
 
 
 def integrate(

@@ -127,8 +127,7 @@ class VelocityHistory:
         self._unwritten: list[tuple[VelocityEvent, AngularVelocityEvent | None]] = []
         self._velocity: VelocityEvent | None = None
         self._angular: AngularVelocityEvent | None = None
-        # The angular part has its own where another sensor tells it.
-        self._periods = self._angular_periods = _Periods()
+        self._periods, self._angular_periods = _Periods(), _Periods()
 
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
         """Add an event that is not earlier than any other; return whether it leads on.
@@ -136,8 +135,6 @@ class VelocityHistory:
         An angular velocity does not before the first linear one is known: it waits for that.
         """
         if isinstance(event, AngularVelocityEvent):
-            if self._angular is None:
-                self._angular_periods = _Periods()
             self._angular_periods.add(event.stamp_ns)
             self._angular = event
         else:
@@ -171,7 +168,7 @@ class VelocityHistory:
             to_s(stops - begins),
             to_s(ends - stops),
             to_s(begins[:, None] - joined.since_ns[rows]),
-            np.array([self._angular_periods.usual_s, self._periods.usual_s]),
+            self._usual_s(),
         )
         return held.with_gaps_apart() if held.gap_s.any() else held
 
@@ -200,6 +197,12 @@ class VelocityHistory:
         begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
         timed_out = self._written().since_ns[first:last, 1] + self._timeout_ns
         return slice(first, last), begins, np.minimum(np.maximum(timed_out, begins), ends), ends
+
+    def _usual_s(self) -> FloatArray:
+        """Return for how long the angular and the linear part are held as a rule (2,)."""
+        linear_s = self._periods.usual_s
+        angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
+        return np.array([angular_s, linear_s])
 
     def _written(self) -> _Joined:
         """Return all velocities, those that have come since the last time among them."""

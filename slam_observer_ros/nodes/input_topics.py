@@ -47,17 +47,17 @@ def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> l
         If the package of a message type is not installed.
 
     """
+    velocity = _velocity_input(node, settings, intake)
+    landmarks = _landmark_input(node, settings, intake)
     imu: list[Input[Any]] = []
     if settings.use_imu:
         qos = _qos(settings.twist_qos, settings.queue_depth)
         imu.append(Input(node, 'imu', {IMU: decode_imu}, partial(intake.add, 'imu'), qos))
-    velocity = _velocity_input(node, settings, intake, imu)
-    return [velocity, _landmark_input(node, settings, intake, [velocity, *imu]), *imu]
+    velocity.read_first, landmarks.read_first = imu, [velocity, *imu]
+    return [velocity, landmarks, *imu]
 
 
-def _velocity_input(
-    node: Node, settings: ObserverNodeSettings, intake: Intake, read_first: list[Input[Any]]
-) -> Input[Any]:
+def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
     qos = _qos(settings.twist_qos, settings.queue_depth)
     if settings.velocity_source == 'pose_differences':
         if settings.velocity_type not in (AUTO, 'Odometry'):
@@ -70,26 +70,23 @@ def _velocity_input(
         decoders = _chosen(
             VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
         )
-    return Input(node, 'twist', decoders, partial(intake.add, 'twist'), qos, read_first)
+    return Input(node, 'twist', decoders, partial(intake.add, 'twist'), qos)
 
 
-def _landmark_input(
-    node: Node, settings: ObserverNodeSettings, intake: Intake, read_first: list[Input[Any]]
-) -> Input[Any]:
+def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
     if settings.landmarks_type == ON_TF:
         decoder = TagDecoder(node, settings.tag_frame_prefix)
-        return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos, read_first)
+        return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos)
     if settings.landmarks_type == 'AprilTagDetectionArray':
         decoders: dict[str, Any] = {APRILTAGS: decode_apriltags}
-        use = partial(intake.add, 'landmarks')
-        return Input(node, 'landmarks', decoders, use, qos, read_first)
+        return Input(node, 'landmarks', decoders, partial(intake.add, 'landmarks'), qos)
     if settings.landmarks_type == AUTO:
         # Not detections: their package, which need not be installed, would be imported unasked.
         decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
-        return Input(node, 'landmarks', decoders, intake.add_observation, qos, read_first)
+        return Input(node, 'landmarks', decoders, intake.add_observation, qos)
     decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
-    return Input(node, 'landmarks', decoders, intake.add_observation, qos, read_first)
+    return Input(node, 'landmarks', decoders, intake.add_observation, qos)
 
 
 def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:

@@ -46,11 +46,6 @@ class Input(Generic[MessageT]):
         Called with each decoded message and the ROS time of its reception in nanoseconds.
     qos : QoSProfile
         Quality of service that is asked for.
-    read_first : sequence of Input
-        Other inputs, of which what was received before a message of this one is read before it.
-        An executor reads one message of each topic in turn, so after the node was busy a slow
-        topic would run far ahead of a fast one. Where the middleware does not tell when it has
-        received a message it does.
 
     Attributes
     ----------
@@ -64,6 +59,11 @@ class Input(Generic[MessageT]):
         How long messages wait to be read.
     last_received_s : float or None
         Steady time of the last message, seconds.
+    read_first : sequence of Input
+        Other inputs, of which what was received before a message of this one is read before it.
+        An executor reads one message of each topic in turn, so after the node was busy a slow
+        topic would run far ahead of a fast one. Where the middleware does not tell when it has
+        received a message it does.
 
     Raises
     ------
@@ -79,13 +79,12 @@ class Input(Generic[MessageT]):
         decoders: Mapping[str, Decoder[MessageT]],
         on_message: Callable[[MessageT, int], None],
         qos: QoSProfile,
-        read_first: Sequence[Input[Any]] = (),
     ) -> None:
         self._node = node
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
-        self._read_first = read_first
+        self.read_first: Sequence[Input[Any]] = ()
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
         self._type_name = ''
@@ -158,7 +157,7 @@ class Input(Generic[MessageT]):
 
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
         self._received_ns = info['received_timestamp']
-        for other in self._read_first:
+        for other in self.read_first:
             other.read_until(self._received_ns)
         receive_ns = self._reception_ns(info['received_timestamp'])
         self.received += 1

@@ -91,6 +91,8 @@ class _Role:
     rank: Callable[[str], int]
     types_by_name: Collection[str] = ()
     """Types that hold other things, too: taken only of a topic that the user names."""
+    is_typed: bool = False
+    """Whether the user names the type: clouds without ids are taken where there are no others."""
 
     @property
     def all_types(self) -> tuple[str, ...]:
@@ -139,7 +141,7 @@ def select_topics(
             return _named(topics, role, name)
         right = [topic for topic in used if _is_truth(topic.name) == role.is_truth]
         found = _best([topic for topic in right if fits(topic, role)], role)
-        if found is None and not role.is_truth and inputs.landmarks_type != AUTO:
+        if found is None and role.is_typed:
             return _best([t for t in right if t.message_type in role.message_types], role)
         return found
 
@@ -220,7 +222,7 @@ def _landmark_choice(name: str | None, landmarks_type: str) -> tuple[_Role, str 
     else:
         known = _LANDMARKS.all_types
         types = [known_type for known_type in known if last_part(known_type) == landmarks_type]
-    return replace(_LANDMARKS, message_types=types, types_by_name=()), name
+    return replace(_LANDMARKS, message_types=types, types_by_name=(), is_typed=True), name
 
 
 def _is_truth(name: str) -> bool:

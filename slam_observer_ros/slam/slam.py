@@ -172,7 +172,7 @@ class Slam:
         )
 
     def covariances_of(self, event: ObservationEvent) -> FloatArray:
-        """Return those of the points (m, 3, 3) that would be used, body frame, m²."""
+        """Return what its points would be taken to be off by: (m, 3, 3), body frame, m²."""
         return self._outlook.covariances(event, self.landmarks.rows_of(event.ids))
 
     def look(self, event: ObservationEvent) -> Sighting:
