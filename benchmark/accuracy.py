@@ -16,8 +16,7 @@ from pathlib import Path
 import sys
 from typing import TypeVar
 
-import estimators
-from jobs import GTSAM_JOB, Job, run_job, run_seed, SeedJob
+from jobs import ALL, Job, run_job, run_seed, SeedJob
 import monte_carlo
 import numpy as np
 import report
@@ -95,12 +94,10 @@ def chosen_worlds(part: str) -> list[str]:
 def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:
     """Yield all jobs on the worlds of these names, the longest first."""
     for name in names:
-        yield Job(variants.CLEAN, name, GTSAM_JOB, first_s)
+        yield Job(variants.CLEAN, name, ALL, first_s)
         yield Job(variants.FALSE_POINTS, name, 'riccati', first_s)
         yield Job(variants.NO_IDS, name, 'riccati', first_s)
     for name in names:
-        for column in (*estimators.ONLINE, estimators.SMOOTHED):
-            yield Job(variants.CLEAN, name, column, first_s)
         for column in variants.OUTLIER_COLUMNS:
             yield Job(variants.OUTLIERS, name, column, first_s)
         yield Job(variants.LEFT_OUT, name, 'riccati', first_s)

@@ -106,7 +106,8 @@ so far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs
 id is compared with the true one that it was nearest to most of the time so far. ATE and heading
 are those of the poses right after the observations, after one rigid alignment of their positions.
 CPU time is that of the estimator's own calls, the least of three runs (of one, where ids are left
-out); integrating the velocities, which all but the observer do by the same code, costs what dead
+out), in which the estimators take turns, so that all meet the machine busy and idle alike;
+integrating the velocities, which all but the observer do by the same code, costs what dead
 reckoning costs. `failed`: GTSAM gave up with a singular system, or nothing was mapped. Outliers
 cost something even if each is recognised, since fewer points are left; a column with these very
 points left out shows how much. How much depends on which points they are, so outliers are drawn
