@@ -69,8 +69,10 @@ class EventQueue:
         self._most_known = MIN_KNOWN
         self._strays = 0
         self._stray_ns = 0
-        # The newest stamp that is taken, believed or not; how far the believed one moved last.
-        self._lead_ns = self._step_ns = 0
+        # The newest stamp that is taken, believed or not.
+        self._lead_ns = 0
+        # How far ahead a stamp may be that is believed at once.
+        self._usual_ns = min(self._near_ns, max_jump_ns)
         self._ahead_of_reception_ns: deque[int] = deque(maxlen=RECENT)
         self.newest_ns: int | None = None
 
@@ -88,20 +90,21 @@ class EventQueue:
         if self.newest_ns is None:
             self.newest_ns = self._lead_ns = stamp_ns
         ahead_ns = stamp_ns - self.newest_ns
-        usual_ns = min(max(self._near_ns, 2 * self._step_ns), self._max_jump_ns)
-        is_near = -self._near_ns <= ahead_ns <= usual_ns
         too_late = ahead_ns < -self._reach_ns
-        too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
-        if too_late or too_early:
-            if not is_near and self._is_confirmed(stamp_ns):
-                return True
-            raise _refusal(ahead_ns)
-        self._insert(event)
-        if is_near:
+        if -self._near_ns <= ahead_ns <= self._usual_ns:
+            if too_late:
+                raise _refusal(ahead_ns)
+            self._insert(event)
             self._note_reception(event)
             self._strays = 0
             self._believe(max(self.newest_ns, stamp_ns))
             return False
+        too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
+        if too_late or too_early:
+            if self._is_confirmed(stamp_ns):
+                return True
+            raise _refusal(ahead_ns)
+        self._insert(event)
         self._lead_ns = max(self._lead_ns, stamp_ns)
         if self._is_confirmed(stamp_ns):
             self._note_reception(event)
@@ -155,7 +158,7 @@ class EventQueue:
     def _believe(self, newest_ns: int) -> None:
         step_ns = newest_ns - (self.newest_ns or 0)
         if step_ns > 0:
-            self._step_ns = step_ns
+            self._usual_ns = min(max(self._near_ns, 2 * step_ns), self._max_jump_ns)
         self.newest_ns = self._lead_ns = newest_ns
 
     def _is_confirmed(self, stamp_ns: int) -> bool:

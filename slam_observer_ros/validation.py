@@ -42,24 +42,15 @@ def check_event(event: Event) -> None:
         ``'not_finite'``, ``'too_large'``, ``'negative_id'`` or ``'bad_covariance'``.
 
     """
-    if not isinstance(event, Event):
-        raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
-    if not isinstance(event.stamp_ns, _INTEGERS):
-        reason = f'stamp {event.stamp_ns!r} is no int or np.int64: stamps are in nanoseconds'
-        raise InvalidEventError('wrong_type', reason)
-    if event.stamp_ns < 0:
-        raise InvalidEventError('negative_stamp', f'stamp {event.stamp_ns} ns is negative')
-    if event.stamp_ns > MAX_STAMP_NS:
-        raise InvalidEventError('too_large', f'stamp {event.stamp_ns} ns is beyond 64 bits')
-    if event.receive_ns is not None and not isinstance(event.receive_ns, _INTEGERS):
-        reason = f'receive_ns {event.receive_ns!r} is no int or np.int64'
-        raise InvalidEventError('wrong_type', reason)
     if isinstance(event, VelocityEvent):
         _check_velocity(event.body_velocity, event.covariance, 6)
     elif isinstance(event, AngularVelocityEvent):
         _check_velocity(event.angular_velocity, event.covariance, 3)
-    else:
+    elif isinstance(event, ObservationEvent):
         _check_observation(event)
+    else:
+        raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
+    _check_times(event.stamp_ns, event.receive_ns)
 
 
 def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
@@ -112,6 +103,18 @@ def check_map(landmark_map: LandmarkMap) -> None:
         raise MapError('map counts: one is negative')
     if len(np.unique(ids)) < n:
         raise MapError('an id is there more than once in the map')
+
+
+def _check_times(stamp_ns: int, receive_ns: int | None) -> None:
+    if not isinstance(stamp_ns, _INTEGERS):
+        reason = f'stamp {stamp_ns!r} is no int or np.int64: stamps are in nanoseconds'
+        raise InvalidEventError('wrong_type', reason)
+    if stamp_ns < 0:
+        raise InvalidEventError('negative_stamp', f'stamp {stamp_ns} ns is negative')
+    if stamp_ns > MAX_STAMP_NS:
+        raise InvalidEventError('too_large', f'stamp {stamp_ns} ns is beyond 64 bits')
+    if receive_ns is not None and not isinstance(receive_ns, _INTEGERS):
+        raise InvalidEventError('wrong_type', f'receive_ns {receive_ns!r} is no int or np.int64')
 
 
 def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: int) -> None:
