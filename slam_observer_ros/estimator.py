@@ -56,6 +56,8 @@ class Estimator:
     on_motion : callable, optional
         Called with the velocities and two stamps, nanoseconds, before the state is moved on along
         them from one to the other.
+    on_jump : callable, optional
+        Called when the clock has jumped, and the estimate goes on as ``on_time_jump`` says.
 
     Attributes
     ----------
@@ -80,6 +82,7 @@ class Estimator:
         on_update: Callable[[Update], None] | None = None,
         on_stamp: Callable[[], None] | None = None,
         on_motion: OnMotion | None = None,
+        on_jump: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings = checked(settings)
         self._counts: Counter[str] = Counter()
@@ -87,7 +90,8 @@ class Estimator:
         self.jumps = 0
         self._warnings = EventWarnings()
         self.last_update: Update | None = None
-        self._on_update, self._on_stamp, self._on_motion = on_update, on_stamp, on_motion
+        self._on_update, self._on_stamp = on_update, on_stamp
+        self._on_motion, self._on_jump = on_motion, on_jump
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
         unused = [name for name in self._slam.gains.ignores if np.any(getattr(settings, name))]
@@ -137,6 +141,8 @@ class Estimator:
             self._frame.restart_time()
             self._forget_time()
         self.jumps += 1
+        if self._on_jump is not None:
+            self._on_jump()
 
     def load_map(
         self,

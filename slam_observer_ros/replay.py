@@ -7,9 +7,10 @@ velocities and observations alike, so that stretches in which nothing is seen co
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 import time
+from typing import ParamSpec
 
 import numpy as np
 
@@ -26,6 +27,8 @@ from slam_observer_ros.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_s
+
+P = ParamSpec('P')
 
 NEES_PERIOD_NS = 5_000_000_000
 """Time between two covariances of the configuration, nanoseconds: they cost O(n³)."""
@@ -127,9 +130,10 @@ class _Run:
         self._settings = settings
         self._estimator = Estimator(
             settings,
-            on_update=self._on_update,
-            on_stamp=self._on_stamp,
-            on_motion=self._on_motion,
+            on_update=self._untimed(self._on_update),
+            on_stamp=self._untimed(self._on_stamp),
+            on_motion=self._untimed(self._on_motion),
+            on_jump=self._untimed(self._on_jump),
         )
         self._in_known_map = landmark_map is not None
         self._in_fixed_map = self._in_known_map and settings.localization_mode == 'fixed'
@@ -138,7 +142,7 @@ class _Run:
         self._landmark_tracks = truth.tracks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
         self._observations = self._used_points = 0
-        self._jumps = self._events = 0
+        self._events = 0
         self._seconds = 0.0
         self._start()
 
@@ -156,7 +160,6 @@ class _Run:
         start_s = time.thread_time()
         self._estimator.add(event)
         self._seconds += time.thread_time() - start_s
-        self._note_jump()
 
     def finish(self) -> Replay:
         start_s = time.thread_time()
@@ -182,33 +185,30 @@ class _Run:
             observations=self._observations,
         )
 
+    def _untimed(self, callback: Callable[P, None]) -> Callable[P, None]:
+        """Return what the estimator may call without its time being the estimator's."""
+
+        def call(*args: P.args, **kwargs: P.kwargs) -> None:
+            start_s = time.thread_time()
+            callback(*args, **kwargs)
+            self._seconds -= time.thread_time() - start_s
+
+        return call
+
     def _on_stamp(self) -> None:
-        start_s = time.thread_time()
-        self._note_jump()
         if self._start_ns is None:
             self._start_ns = self._estimator.stamp_ns
         self._sampler.sample()
-        self._seconds -= time.thread_time() - start_s
 
     def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
-        start_s = time.thread_time()
-        self._note_jump()
         self._dead_reckoning.advance(velocities, start_ns, end_ns)
-        self._seconds -= time.thread_time() - start_s
 
     def _on_update(self, update: Update) -> None:
-        start_s = time.thread_time()
-        self._note_jump()
         self._updates.append(update)
         self._note_observation()
         self._compare(update)
-        self._seconds -= time.thread_time() - start_s
 
-    def _note_jump(self) -> None:
-        """Start again if the estimator did."""
-        if self._estimator.jumps == self._jumps:
-            return
-        self._jumps = self._estimator.jumps
+    def _on_jump(self) -> None:
         self._next_nees_ns = 0
         if self._settings.on_time_jump == 'reset':
             self._start()

@@ -52,8 +52,7 @@ class ObserverCore:
         self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
-        self._estimator = Estimator(estimator_settings)
-        self._jumps_followed = 0
+        self._estimator = Estimator(estimator_settings, on_jump=self._follow_jump)
         self._transforms = open_transforms(node, (settings.map_frame, settings.base_frame))
         self._intake = Intake(
             node, settings, self._estimator, BaseFrame(settings, self._transforms)
@@ -119,7 +118,7 @@ class ObserverCore:
             self._node.create_timer(period_s, callback, clock=clock)
             for period_s, callback in (
                 (1.0 / publish_rate_hz, self._publish_state),
-                (OVERVIEW_PERIOD_S, self._publish_overview),
+                (OVERVIEW_PERIOD_S, self._outputs.publish_overview),
                 (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
                 (RETRY_PERIOD_S, self._intake.retry),
                 *((LOOK_PERIOD_S, source.look) for source in self._inputs),
@@ -127,24 +126,15 @@ class ObserverCore:
         ]
 
     def _publish_state(self) -> None:
-        self._follow_jumps()
         self._outputs.publish_state()
         if self._intake.is_paused:
             self._outputs.repeat_transform()
 
-    def _publish_overview(self) -> None:
-        self._follow_jumps()
-        self._outputs.publish_overview()
-
     def _restart_time(self, _jump: object) -> None:
         self._estimator.restart_time()
-        self._follow_jumps()
 
-    def _follow_jumps(self) -> None:
+    def _follow_jump(self) -> None:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""
-        if self._estimator.jumps == self._jumps_followed:
-            return
-        self._jumps_followed = self._estimator.jumps
         self._intake.forget()
         self._transforms.clear()
         self._outputs.begin_anew()
