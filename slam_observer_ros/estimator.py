@@ -335,7 +335,7 @@ class Estimator:
         """
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        covariance = self._slam.pose_covariance(timeline.velocities, start_ns, end_ns)
+        covariance = self._slam.pose_covariance_after(timeline.velocities, start_ns, end_ns)
         doubt = self._frame.states.doubt
         return covariance if covariance is None or doubt is None else covariance + doubt
 

@@ -87,7 +87,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
         F = np.array([error(piece, 1e-6 * w) / 1e-6 for w in np.eye(6)]).T
         expected += F @ Q[piece] @ F.T
     # A rate's noise is taken to act at the piece's beginning, not throughout: hence 2 %.
-    difference = np.linalg.norm(slam.gains.pose_covariance - expected)
+    difference = np.linalg.norm(slam.gains.pose_error_covariance - expected)
     assert difference < 0.02 * np.linalg.norm(expected)
 
 
@@ -168,7 +168,7 @@ def test_observations_never_tell_where_the_worlds_frame_is(rng):
     def run(frame_covariance):
         random = np.random.default_rng(seed)
         slam = Filter(FullMapGains(PLAIN))
-        slam.gains.set_pose_covariance(frame_covariance)
+        slam.gains.set_pose_error_covariance(frame_covariance)
         slam.add(random.normal(scale=4.0, size=(4, 3)), 0.01 * random_covariances(random, 4, 3))
         for _ in range(20):
             slam.step(random, 1e-4, 1e-2)
@@ -221,9 +221,9 @@ def test_an_observation_never_adds_uncertainty(rng):
 def test_removing_landmarks_leaves_the_marginal_of_the_others(rng, removed):
     slam = started(rng)
     kept = np.setdiff1d(np.arange(4), removed)
-    pose, others = slam.gains.pose_covariance, slam.gains.joint_covariance(kept)
+    pose, others = slam.gains.pose_error_covariance, slam.gains.joint_covariance(kept)
     slam.gains.remove_landmarks(np.array(removed))
-    np.testing.assert_array_equal(slam.gains.pose_covariance, pose)
+    np.testing.assert_array_equal(slam.gains.pose_error_covariance, pose)
     np.testing.assert_array_equal(slam.gains.joint_covariance(np.arange(len(kept))), others)
 
 
@@ -242,7 +242,9 @@ def test_a_landmark_that_is_relocated_is_as_new_and_the_others_stay(rng):
         added.gains.joint_covariance(order),
         atol=1e-12,
     )
-    np.testing.assert_array_equal(relocated.gains.pose_covariance, added.gains.pose_covariance)
+    np.testing.assert_array_equal(
+        relocated.gains.pose_error_covariance, added.gains.pose_error_covariance
+    )
 
 
 def tilted(event):
@@ -309,7 +311,7 @@ def test_pose_covariance_is_that_of_rotation_and_position_in_the_world(initial_p
 
     h = 1e-6
     F = np.array([(shift(h * x) - shift(-h * x)) / (2 * h) for x in np.eye(6)]).T
-    expected = F @ slam.gains.pose_covariance @ F.T
+    expected = F @ slam.gains.pose_error_covariance @ F.T
     np.testing.assert_allclose(estimator.pose_covariance, expected, rtol=1e-6, atol=1e-9)
 
 

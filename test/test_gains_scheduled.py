@@ -85,7 +85,7 @@ def test_reading_the_map_changes_no_bit_of_it():
 def landmarks_about_a_robot(rng, n):
     """Filter that has seen n landmarks twice, on a motion that left it unsure of its pose."""
     slam = Filter(ScheduledGains(PLAIN))
-    slam.gains.set_pose_covariance(1e-4 * random_covariances(rng, 1, 6)[0])
+    slam.gains.set_pose_error_covariance(1e-4 * random_covariances(rng, 1, 6)[0])
     slam.add(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
     for _ in range(3):
         slam.step(rng, 1e-4, 1e-2)

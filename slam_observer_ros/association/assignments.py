@@ -146,8 +146,9 @@ def _candidates(slam: Slam, gains: RiccatiGains, seen: _Points) -> tuple[IntArra
 def _pairs_near(slam: Slam, gains: RiccatiGains, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
     C = SPATIAL.output_matrix(seen.points)
-    covariances = C @ gains.pose_covariance @ transpose(C) + seen.noise
-    spread_m = _spread_m(covariances) + np.max(_spread_m(gains.landmark_covariances), initial=0.0)
+    of_points = C @ gains.pose_error_covariance @ transpose(C) + seen.noise
+    of_landmarks = gains.landmark_error_covariances
+    spread_m = _spread_m(of_points) + np.max(_spread_m(of_landmarks), initial=0.0)
     reach_m = slam.settings.rejection_distance * spread_m
     return slam.index.near(slam.observer.points, seen.points, reach_m)
 

@@ -95,9 +95,9 @@ class Hypotheses:
     def _spread(self) -> FloatArray | None:
         likelihoods = np.exp(-0.5 * np.array(self._costs))
         weights, spread = likelihoods / likelihoods.sum(), np.zeros((6, 6))
-        own = self.best.state_covariance
+        own = self.best.pose_covariance
         for slam, weight in zip(self._states[1:], weights[1:].tolist(), strict=True):
-            covariance = slam.state_covariance
+            covariance = slam.pose_covariance
             if own is None or covariance is None:
                 return None
             d = _difference(self.best.observer.pose, slam.observer.pose)

@@ -170,18 +170,18 @@ class GainDesign:
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Account for landmarks from a map with ``covariances`` (m, 3, 3), reference frame, m²."""
 
-    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> GainDesign:
+    def with_fixed_landmarks(self, covariances: FloatArray) -> GainDesign:
         """Return gains that know what these do, and never move a landmark again.
 
-        ``landmark_covariances`` (n, 3, 3), reference frame, m², are what a map says of all
-        landmarks, new ones among them. These gains are not used any more.
+        ``covariances`` (n, 3, 3), reference frame, m², are what a map says of all landmarks, new
+        ones among them. These gains are not used any more.
         """
         raise NotImplementedError
 
     def remove_landmarks(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``; those behind move up."""
 
-    def set_pose_covariance(self, covariance: FloatArray) -> None:
+    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
         """Take ``covariance`` (6, 6) for that of ε, independent of all else."""
 
     def recall(self, observer: Observer, rows: IntArray) -> None:
@@ -234,17 +234,17 @@ class GainDesign:
         return np.empty(0)
 
     @property
-    def pose_covariance(self) -> FloatArray | None:
+    def pose_error_covariance(self) -> FloatArray | None:
         """(6, 6) covariance of the error ε of Â = exp(ε) A, (Ω, v) order; None if unknown."""
         return None
 
-    def pose_covariance_after(self, motion: Motion) -> FloatArray | None:
-        """Return what the pose's covariance (6, 6) will be after a motion yet to be predicted."""
+    def pose_error_covariance_after(self, motion: Motion) -> FloatArray | None:
+        """Return what the same (6, 6) will be after a motion that is yet to be predicted."""
         return None
 
     @property
-    def landmark_covariances(self) -> FloatArray | None:
-        """(n, 3, 3) covariances of the landmarks, reference frame, m²; None if unknown."""
+    def landmark_error_covariances(self) -> FloatArray | None:
+        """(n, 3, 3) covariances of the errors ã_i, reference frame, m²; None if unknown."""
         return None
 
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:

@@ -74,7 +74,7 @@ class ConstantGains(GainDesign):
         """Return the correction that puts the known landmarks where they are known to be."""
         return Correction(np.eye(4), rows, -r)
 
-    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> ConstantGains:
+    def with_fixed_landmarks(self, covariances: FloatArray) -> ConstantGains:
         """Return these gains with l = 0."""
         self._is_fixed = True
         return self

@@ -73,7 +73,7 @@ class Core:
         Phi[: self._p, self._p : self._p + self._calibration.count] = F
         self._tell_leaves(before, Phi)
 
-    def set_pose_covariance(self, covariance: FloatArray) -> None:
+    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (p, p) of ε, independent of all else."""
         before, Phi = self.P.copy(), np.eye(len(self.P))
         Phi[: self._p] = self.P[: self._p] = self.P[:, : self._p] = 0.0

@@ -28,7 +28,7 @@ class FixedMapGains(RiccatiGains):
         Robustness and ``two_d_mode``.
     calibration, joint : Calibration, JointCovariance
         What is known of pose and calibration so far.
-    landmark_covariances : FloatArray
+    covariances : FloatArray
         (n, 3, 3) what the map says of its landmarks, reference frame, m². It is only passed on.
 
     """
@@ -38,19 +38,19 @@ class FixedMapGains(RiccatiGains):
         settings: Settings,
         calibration: Calibration,
         joint: JointCovariance,
-        landmark_covariances: FloatArray,
+        covariances: FloatArray,
     ) -> None:
         super().__init__(settings, calibration, joint.without_landmarks())
-        self._landmark_covariances = landmark_covariances
+        self._covariances = covariances
 
     @property
-    def landmark_covariances(self) -> FloatArray:
+    def landmark_error_covariances(self) -> FloatArray:
         """(n, 3, 3) covariances of the landmarks, as the map has them."""
-        return self._landmark_covariances
+        return self._covariances
 
     def remove_landmarks(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
-        self._landmark_covariances = np.delete(self._landmark_covariances, rows, axis=0)
+        self._covariances = np.delete(self._covariances, rows, axis=0)
 
     def smooth(self, observer: Observer) -> InHindsight:
         """Refuse: in an exact map there is no drift to undo, and nothing is kept of the past."""

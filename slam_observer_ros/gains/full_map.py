@@ -50,7 +50,7 @@ class FullMapGains(RiccatiGains):
         self._hindsight.settings = settings
 
     @property
-    def landmark_covariances(self) -> FloatArray:
+    def landmark_error_covariances(self) -> FloatArray:
         """(n, 3, 3) covariances of the landmark errors ã_i."""
         return self._joint.landmarks
 
@@ -94,9 +94,9 @@ class FullMapGains(RiccatiGains):
         self._hindsight.history.relocate_landmarks(rows)
         self._joint.place_seen(rows, y_ref, covariances)
 
-    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> FixedMapGains:
+    def with_fixed_landmarks(self, covariances: FloatArray) -> FixedMapGains:
         """Return gains that know pose and calibration as well, and never move a landmark."""
-        return FixedMapGains(self._settings, self.calibration, self._joint, landmark_covariances)
+        return FixedMapGains(self._settings, self.calibration, self._joint, covariances)
 
     def add_known_landmarks(self, covariances: FloatArray) -> None:
         """Append landmarks whose errors are independent of all else."""

@@ -69,27 +69,27 @@ class RiccatiGains(GainDesign):
         return variances
 
     @property
-    def pose_covariance(self) -> FloatArray:
+    def pose_error_covariance(self) -> FloatArray:
         """(6, 6) covariance of the pose error ε; zero on axes that are not estimated."""
         return self._axes.full_pose_covariance(self._joint.pose)
 
     @property
-    def landmark_covariances(self) -> FloatArray:
-        """(n, 3, 3) covariances of the landmarks, reference frame, m²."""
+    def landmark_error_covariances(self) -> FloatArray:
+        """(n, 3, 3) covariances of the landmark errors ã_i, reference frame, m²."""
         raise NotImplementedError
 
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
         predict(self._joint.P, self._axes, self.calibration, motion)
 
-    def pose_covariance_after(self, motion: Motion) -> FloatArray:
-        """Return the pose covariance (6, 6) after a motion that is yet to be predicted."""
+    def pose_error_covariance_after(self, motion: Motion) -> FloatArray:
+        """Return what the same (6, 6) will be after a motion that is yet to be predicted."""
         first = self._joint.first
         P = self._joint.P[:first, :first].copy()
         predict(P, self._axes, self.calibration, motion)
         return self._axes.full_pose_covariance(P[: self._p, : self._p])
 
-    def set_pose_covariance(self, covariance: FloatArray) -> None:
+    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
         pose = self._axes.pose
         self._joint.set_pose(covariance[pose, pose])

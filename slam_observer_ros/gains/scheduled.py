@@ -97,9 +97,9 @@ class ScheduledGains(GainDesign):
         N = self._noise(covariances)
         self._leaves.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
 
-    def set_pose_covariance(self, covariance: FloatArray) -> None:
+    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""
-        self._core.set_pose_covariance(covariance[self._axes.pose, self._axes.pose])
+        self._core.set_pose_error_covariance(covariance[self._axes.pose, self._axes.pose])
 
     def joint_covariance(self, rows: IntArray) -> FloatArray:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
@@ -144,9 +144,9 @@ class ScheduledGains(GainDesign):
         self._leaves.update(everything, F, N)
         return self._as_correction(everything, -x[z], shifts, observer.a)
 
-    def with_fixed_landmarks(self, landmark_covariances: FloatArray) -> ScheduledGains:
+    def with_fixed_landmarks(self, covariances: FloatArray) -> ScheduledGains:
         """Return these gains with all landmarks taken for exact."""
-        count, k = len(landmark_covariances), self._axes.point
+        count, k = len(covariances), self._axes.point
         self._core.remove(np.arange(len(self._leaves)))
         self._leaves.add(np.zeros((count, k, len(self._core.P))), np.zeros((count, k, k)))
         return self

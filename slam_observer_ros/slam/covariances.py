@@ -21,7 +21,7 @@ MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
 
 def of_landmarks(observer: Observer, gains: GainDesign) -> FloatArray | None:
     """Return the covariances (n, 3, 3) of the landmarks along the world's axes, m²."""
-    covariances = gains.landmark_covariances
+    covariances = gains.landmark_error_covariances
     if covariances is None:
         return None
     R = observer.reference_pose[:3, :3]

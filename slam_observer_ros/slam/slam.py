@@ -104,22 +104,22 @@ class Slam:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
         return covariances.of_landmarks(self.observer, self.gains)
 
-    def pose_covariance(
+    @property
+    def pose_covariance(self) -> FloatArray | None:
+        """(6, 6) covariance of the pose's rotation vector and position, along the world's axes.
+
+        In rad² and m². None where the gains know none.
+        """
+        now = self.gains.pose_error_covariance
+        return covariances.of_pose(self.observer, now, self.observer.A)
+
+    def pose_covariance_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
     ) -> FloatArray | None:
-        """Return the covariance (6, 6) that the pose will have at ``end_ns``.
-
-        Of its rotation vector and its position along the world's axes, rad² and m². None where
-        the gains know none.
-        """
+        """Return the same (6, 6) as it will be at ``end_ns``."""
         moved = self._motion(velocities, start_ns, end_ns)
-        after = self.gains.pose_covariance_after(moved)
+        after = self.gains.pose_error_covariance_after(moved)
         return covariances.of_pose(self.observer, after, moved.path[-1])
-
-    @property
-    def state_covariance(self) -> FloatArray | None:
-        """(6, 6) the same of the pose as it is."""
-        return covariances.of_pose(self.observer, self.gains.pose_covariance, self.observer.A)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot and keep the map; what they have to do with each other is forgotten.
@@ -129,7 +129,7 @@ class Slam:
         pose : FloatArray
             (4, 4) body to world.
         covariance : FloatArray or None
-            (6, 6) as :meth:`pose_covariance` gives it; None for an exact pose.
+            (6, 6) as :attr:`pose_covariance` has it; None for an exact pose.
 
         """
         observer = self.observer
@@ -138,7 +138,7 @@ class Slam:
             observer.reference_pose = pose
         observer.A = se3.inverse(observer.reference_pose) @ pose
         given = np.zeros((6, 6)) if covariance is None else covariance
-        self.gains.set_pose_covariance(covariances.of_pose_error(observer, given))
+        self.gains.set_pose_error_covariance(covariances.of_pose_error(observer, given))
         self.gains.restart(observer, 'the pose was set')
 
     def restart_time(self) -> None:
