@@ -494,10 +494,10 @@ def looked_at(counts, looks, settled_looks=0, settled_seen=0):
     landmarks.add(FIRST_AUTOMATIC_ID + 1 + np.arange(len(counts)), 0)
     landmarks.counts[1:] = counts
     for look in range(settled_looks):
-        landmarks.look(np.array([0]), np.array([look < settled_seen]))
+        landmarks.note_in_view(np.array([0]), np.array([look < settled_seen]))
     for row, times in enumerate(looks, start=1):
         for _ in range(times):
-            landmarks.look(np.array([row]), np.array([False]))
+            landmarks.note_in_view(np.array([row]), np.array([False]))
     return landmarks
 
 
@@ -516,7 +516,7 @@ def test_what_has_settled_stays_however_long_it_is_not_seen():
     landmarks = looked_at([5], [0], settled_looks=100, settled_seen=100)
     assert landmarks.unsupported(5).tolist() == []
     for _ in range(1000):
-        landmarks.look(np.array([0, 1]), np.array([True, False]))
+        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
     assert landmarks.unsupported(5).tolist() == []
 
 
@@ -529,11 +529,11 @@ def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_be
     """One has settled, and was seen each time; the other one never was but once."""
     landmarks, both = LandmarkTable(), np.array([0, 1])
     landmarks.add(FIRST_AUTOMATIC_ID + both, 0)
-    landmarks.look(both, np.array([True, True]))
+    landmarks.note_in_view(both, np.array([True, True]))
     for look in range(1, 3 * PATIENCE):
         assert landmarks.unsupported(3).tolist() == []
-        landmarks.see(both[:1], look)
-        landmarks.look(both, np.array([True, False]))
+        landmarks.accept(both[:1], look)
+        landmarks.note_in_view(both, np.array([True, False]))
     assert landmarks.counts.tolist() == [3 * PATIENCE, 1]
     assert landmarks.unsupported(3).tolist() == [1]
 
@@ -552,7 +552,7 @@ def test_reflectors_that_are_told_one_a_message_are_all_kept():
 def test_a_landmark_that_was_placed_anew_has_its_chance_again():
     landmarks = looked_at([4], [39], settled_looks=996, settled_seen=499)
     landmarks.restart(np.array([1]), 0)
-    landmarks.look(np.array([1]), np.array([False]))
+    landmarks.note_in_view(np.array([1]), np.array([False]))
     assert landmarks.unsupported(5).tolist() == []
 
 

@@ -122,7 +122,7 @@ def test_another_sensor_that_sees_at_the_same_instant_counts_like_the_first():
 def test_a_landmark_that_was_placed_anew_has_not_been_seen_before():
     landmarks, row = LandmarkTable(), np.array([0])
     landmarks.add(np.array([7]), 0)
-    landmarks.see(row, 10**9)
+    landmarks.accept(row, 10**9)
     assert landmarks.unseen_s(row, 2 * 10**9) == 1.0
     assert landmarks.unseen_s(row, 10**9) == 1.0, 'by another sensor'
     landmarks.restart(row, 3 * 10**9)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -32,7 +35,7 @@ class LandmarkTable:
         (n,) stamp of the latest one before that, nanoseconds; −1 if there was none.
     tentative : BoolArray
         (n,) which have no id of their own, and have yet to be seen often enough to stay.
-    looks : IntArray
+    in_view : IntArray
         (n,) in how many observations without ids each was in view.
 
     """
@@ -44,10 +47,10 @@ class LandmarkTable:
         self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
         self.seen_before_ns: IntArray = np.empty(0, dtype=np.int64)
         self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
-        self.looks: IntArray = np.empty(0, dtype=np.int64)
-        self._settled_looks = 0
-        self._settled_seen = 0
+        self.in_view: IntArray = np.empty(0, dtype=np.int64)
         self._rejected_at: FloatArray = np.empty((0, 3))
+        self._settled_in_view = 0
+        self._settled_seen = 0
         self._order: IntArray = np.empty(0, dtype=np.int64)
 
     def __len__(self) -> int:
@@ -64,14 +67,12 @@ class LandmarkTable:
 
     def add(self, ids: IntArray, stamp_ns: int) -> None:
         """Append landmarks (m,) that are seen for the first time."""
-        self.ids = np.concatenate([self.ids, ids])
-        self.counts = np.concatenate([self.counts, np.ones(len(ids), dtype=np.int64)])
-        self.rejections = np.concatenate([self.rejections, np.zeros(len(ids), dtype=np.int64)])
-        self._rejected_at = np.concatenate([self._rejected_at, np.zeros((len(ids), 3))])
-        self.last_seen_ns = np.concatenate([self.last_seen_ns, np.full(len(ids), stamp_ns)])
-        self.seen_before_ns = np.concatenate([self.seen_before_ns, np.full(len(ids), -1)])
-        self.tentative = np.concatenate([self.tentative, is_automatic(ids)])
-        self.looks = np.concatenate([self.looks, np.zeros(len(ids), dtype=np.int64)])
+        first, m = len(self), len(ids)
+        for name, column in self._columns():
+            room = np.zeros((m, *column.shape[1:]), dtype=column.dtype)
+            setattr(self, name, np.concatenate([column, room]))
+        self.ids[first:] = ids
+        self.restart(np.arange(first, first + m), stamp_ns)
         self._order = np.argsort(self.ids)
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
@@ -92,7 +93,7 @@ class LandmarkTable:
         self.tentative[rows] &= is_automatic(ids)
         self._order = np.argsort(self.ids)
 
-    def see(self, rows: IntArray, stamp_ns: int) -> None:
+    def accept(self, rows: IntArray, stamp_ns: int) -> None:
         """Count one more accepted observation of ``rows`` (m,)."""
         self.counts[rows] += 1
         self.rejections[rows] = 0
@@ -142,17 +143,17 @@ class LandmarkTable:
         needed = np.minimum(self.counts[rows] + 1, max_rejections)
         return np.asarray(rejections >= needed)
 
-    def look(self, rows: IntArray, seen: BoolArray) -> None:
+    def note_in_view(self, rows: IntArray, seen: BoolArray) -> None:
         """Count one more observation that had rows (m,) in view, and which of them it saw."""
         settled = ~self.tentative[rows]
-        self._settled_looks += int(np.sum(settled))
+        self._settled_in_view += int(np.sum(settled))
         self._settled_seen += int(np.sum(settled & seen))
-        self.looks[rows] += 1
+        self.in_view[rows] += 1
 
     @property
     def seen_share(self) -> float:
         """How often a landmark without an id that has settled is seen while in view; else 0."""
-        return self._settled_seen / self._settled_looks if self._settled_looks else 0.0
+        return self._settled_seen / self._settled_in_view if self._settled_in_view else 0.0
 
     def unsupported(self, min_support: int) -> IntArray:
         """Return rows without an id that were seen too seldom to be landmarks.
@@ -161,11 +162,11 @@ class LandmarkTable:
         been seen :data:`PATIENCE` times as often. One that was seen so often has settled.
         """
         settling = self.tentative & (self.counts >= min_support)
-        self._settled_looks += int(np.sum(self.looks[settling]))
+        self._settled_in_view += int(np.sum(self.in_view[settling]))
         self._settled_seen += int(np.sum(self.counts[settling]))
         self.tentative &= ~settling
         # Before any has settled nobody knows how often one is seen.
-        expected = self.looks * self.seen_share
+        expected = self.in_view * self.seen_share
         return np.flatnonzero(self.tentative & (expected >= PATIENCE * min_support))
 
     def unseen_since(self, stamp_ns: int) -> IntArray:
@@ -180,16 +181,14 @@ class LandmarkTable:
         self.counts[rows] = 1
         self.rejections[rows] = 0
         self.tentative[rows] = is_automatic(self.ids[rows])
-        self.looks[rows] = 0
+        self.in_view[rows] = 0
 
     def remove(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""
-        self.ids = np.delete(self.ids, rows)
-        self.counts = np.delete(self.counts, rows)
-        self.rejections = np.delete(self.rejections, rows)
-        self._rejected_at = np.delete(self._rejected_at, rows, axis=0)
-        self.last_seen_ns = np.delete(self.last_seen_ns, rows)
-        self.seen_before_ns = np.delete(self.seen_before_ns, rows)
-        self.tentative = np.delete(self.tentative, rows)
-        self.looks = np.delete(self.looks, rows)
+        for name, column in self._columns():
+            setattr(self, name, np.delete(column, rows, axis=0))
         self._order = np.argsort(self.ids)
+
+    def _columns(self) -> list[tuple[str, NDArray[Any]]]:
+        """Return all that has an entry for each landmark, with its name."""
+        return [item for item in vars(self).items() if isinstance(item[1], np.ndarray)]

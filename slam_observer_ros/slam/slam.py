@@ -259,7 +259,7 @@ class Slam:
         self.gains.settle(self.observer)
         rejected: BoolArray = weights == 0.0
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
-        self.landmarks.see(rows[~rejected], event.stamp_ns)
+        self.landmarks.accept(rows[~rejected], event.stamp_ns)
         if rejected.any():
             places = self._outlook.places(event.select(rejected), residuals.select(rejected))
             self.landmarks.reject(rows[rejected], *places)

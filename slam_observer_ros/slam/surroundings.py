@@ -68,7 +68,7 @@ class Surroundings:
         in_view = seen | self._field_of_view.contains(self._observer.body_points(everything))
         is_strange = not some_have_ids and self._is_strange(event, in_view, seen)
         rows = np.flatnonzero(is_numbered & in_view)
-        landmarks.look(rows, seen[rows])
+        landmarks.note_in_view(rows, seen[rows])
         self._field_of_view.include(event.points)
         return is_strange
 
