@@ -136,7 +136,7 @@ class Estimator:
         else:
             logger.warning('The clock has jumped%s; pose and map are held.', after)
             self.release()
-            self._catch_up()
+            self._timeline.catch_up()
             self._tell_stamp()
             self._frame.restart_time()
             self._forget_time()
@@ -174,7 +174,7 @@ class Estimator:
         check_map(landmark_map)
         if pose is not None:
             check_pose(pose, pose_covariance)
-            self._catch_up()
+            self._timeline.catch_up()
         self._frame.load(landmark_map, pose, pose_covariance, self.stamp_ns is not None)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
@@ -194,7 +194,7 @@ class Estimator:
 
         """
         check_pose(pose, covariance)
-        self._catch_up()
+        self._timeline.catch_up()
         self._frame.set_pose(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
@@ -247,7 +247,7 @@ class Estimator:
         """Use all events that are held back and move on to the last: the recording is over."""
         for ready in self._queue.pop_all():
             self._process(ready)
-        self._catch_up()
+        self._timeline.catch_up()
         self._tell_stamp()
 
     def smooth(self) -> Smoothed:
@@ -323,8 +323,7 @@ class Estimator:
         slam, state_ns = self._slam, self._timeline.state_ns
         if state_ns is None or stamp_ns == state_ns:
             return slam.observer.pose
-        calibration = slam.gains.calibration
-        return slam.observer.pose @ self._timeline.motion(calibration, state_ns, stamp_ns)
+        return slam.observer.pose @ self._timeline.motion(state_ns, stamp_ns)
 
     @property
     def pose_covariance(self) -> FloatArray | None:
@@ -440,13 +439,11 @@ class Estimator:
         if is_late:
             self._counts['late_velocity'] += 1
             self._warnings.late_velocity()
-        if self._timeline.is_full:
-            self._catch_up()
 
     def _process_observation(self, event: ObservationEvent) -> None:
         event = usable_points(event, self.settings, self._counts, self._warnings)
         stamp_ns = event.stamp_ns
-        event = self._timeline.meet(event, self._frame.states)
+        event = self._timeline.meet(event)
         self._counts['late_observation'] += event.stamp_ns > stamp_ns
         if 0 < self.settings.max_landmarks < len(event.ids) and self._slam.is_mapping:
             self._warnings.more_than_max(len(event.ids), self.settings.max_landmarks)
@@ -469,11 +466,6 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self.last_update)
 
-    def _catch_up(self) -> None:
-        """Move the states on to the last event that was used."""
-        if self.stamp_ns is not None:
-            self._timeline.advance(self._frame.states, self.stamp_ns)
-
     def _begin(self) -> None:
         """Wait for the first event."""
         self._forget_time()
@@ -487,4 +479,4 @@ class Estimator:
             max_jump_ns=to_ns(settings.max_stamp_jump),
             late_limit_ns=to_ns(settings.late_limit),
         )
-        self._timeline = Timeline(settings, self._on_motion)
+        self._timeline = Timeline(self._frame, settings, self._on_motion)

@@ -6,18 +6,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.maps.map_frame import MapFrame
 from slam_observer_ros.matrices import transpose
-from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.integration import transition, transition_covariance
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
-from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_ns, to_s
 
@@ -33,6 +31,8 @@ class Timeline:
 
     Parameters
     ----------
+    frame : MapFrame
+        Has the states, which are of no time yet.
     settings : Settings
         ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
     on_motion : callable, optional
@@ -49,7 +49,10 @@ class Timeline:
 
     """
 
-    def __init__(self, settings: Settings, on_motion: OnMotion | None = None) -> None:
+    def __init__(
+        self, frame: MapFrame, settings: Settings, on_motion: OnMotion | None = None
+    ) -> None:
+        self._frame = frame
         timeout_ns = to_ns(settings.velocity_timeout)
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
         self.stamp_ns: int | None = None
@@ -73,7 +76,8 @@ class Timeline:
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
         """Add a velocity; return whether it is in force: an angular one waits for a linear one.
 
-        Where a newer event was used before it, it leads on from there.
+        Where a newer event was used before it, it leads on from there. After many of them the
+        states are moved on without an observation.
 
         Raises
         ------
@@ -91,19 +95,21 @@ class Timeline:
             return False
         self.note_stamp(event.stamp_ns)
         self._pending += 1
+        if self._pending >= MAX_PENDING_VELOCITIES:
+            self.catch_up()
         return True
-
-    @property
-    def is_full(self) -> bool:
-        """Whether no more velocities should wait for an observation."""
-        return self._pending >= MAX_PENDING_VELOCITIES
 
     @property
     def body_velocity(self) -> FloatArray | None:
         """(6,) velocity (Ω, v) in force at ``stamp_ns``; None if none is or it has timed out."""
         return None if self.stamp_ns is None else self.velocities.latest(self.stamp_ns)
 
-    def advance(self, states: Hypotheses, stamp_ns: int) -> None:
+    def catch_up(self) -> None:
+        """Move the states on to the last event that was used."""
+        if self.stamp_ns is not None:
+            self._advance(self.stamp_ns)
+
+    def _advance(self, stamp_ns: int) -> None:
         """Move the states, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
         self._pending = 0
         start_ns = self.state_ns
@@ -111,25 +117,26 @@ class Timeline:
             return
         if self._on_motion is not None:
             self._on_motion(self.velocities, start_ns, stamp_ns)
-        states.advance(self.velocities, start_ns, stamp_ns)
+        self._frame.states.advance(self.velocities, start_ns, stamp_ns)
         self.velocities.forget_before(stamp_ns - self._kept_ns)
         self.state_ns = stamp_ns
 
-    def meet(self, event: ObservationEvent, states: Hypotheses) -> ObservationEvent:
+    def meet(self, event: ObservationEvent) -> ObservationEvent:
         """Move the states on to an observation, or it to them if it is late; return it."""
         self.note_stamp(event.stamp_ns)
         if event.stamp_ns < (self.state_ns or 0):
-            event = self._carried_forward(event, states.best)
-        self.advance(states, event.stamp_ns)
+            event = self._carried_forward(event)
+        self._advance(event.stamp_ns)
         return event
 
-    def motion(self, calibration: Calibration, start_ns: int, end_ns: int) -> FloatArray:
+    def motion(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return how the body moves (4, 4) between two stamps, backwards if need be."""
         if end_ns < start_ns:
-            return se3.inverse(self.motion(calibration, end_ns, start_ns))
+            return se3.inverse(self.motion(end_ns, start_ns))
+        calibration = self._frame.slam.gains.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
 
-    def _carried_forward(self, event: ObservationEvent, slam: Slam) -> ObservationEvent:
+    def _carried_forward(self, event: ObservationEvent) -> ObservationEvent:
         """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
 
         Its points are as uncertain as any seen from there, and as that motion makes them. Its
@@ -137,7 +144,7 @@ class Timeline:
         down.
         """
         state_ns = event.stamp_ns if self.state_ns is None else self.state_ns
-        back = self.motion(slam.gains.calibration, state_ns, event.stamp_ns)
+        slam, back = self._frame.slam, self.motion(state_ns, event.stamp_ns)
         points, sensor = event.points, event.sensor
         if event.velocities is not None:
             shifts = event.velocities * to_s(state_ns - event.stamp_ns)

@@ -13,7 +13,6 @@ from numpy.testing import assert_array_equal
 import pytest
 
 from slam_observer_ros import event_warnings
-from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.counts import used_points
 from slam_observer_ros.errors import MapError, ParameterError
 from slam_observer_ros.estimator import Estimator
@@ -29,8 +28,9 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.maps.map_frame import MapFrame
+from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
 from slam_observer_ros.truth import PoseTruth
 from slam_observer_ros.validation import MAX_MEASURED
@@ -190,15 +190,14 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_
         angular_velocity_noise=(0.0, 0.0, 0.2),
         linear_velocity_noise=(0.3, 0.0, 0.0),
     )
-    slam, timeline = Slam(settings, np.eye(4)), Timeline(settings)
+    timeline = Timeline(MapFrame(settings), settings)
     turning = np.array([0.0, 0.0, 1e-9, 0.0, 0.0, 0.0])
     for step in range(21):
         timeline.append(velocity(0.1 * step, turning))
-    states = Hypotheses(slam)
-    timeline.advance(states, START_NS + 2 * 10**9)
+    timeline.catch_up()
     given_m2 = 0.01 * np.eye(3)[None] if are_given else None
     event = ObservationEvent(START_NS + 10**9, np.array([1]), np.array([[5.0, 0, 0]]), given_m2)
-    carried = timeline.meet(event, states)
+    carried = timeline.meet(event)
     expected = np.diag([0.01 + 0.3**2, 0.01 + (5.0 * 0.2) ** 2, 0.01])
     np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
 
@@ -208,16 +207,15 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen():
     settings = Settings(
         observation_model='stereo', angular_velocity_noise=still, linear_velocity_noise=still
     )
-    slam, timeline = Slam(settings, np.eye(4)), Timeline(settings)
+    timeline = Timeline(MapFrame(settings), settings)
     for step in range(11):
         timeline.append(velocity(0.1 * step, np.zeros(6)))
-    states = Hypotheses(slam)
-    timeline.advance(states, START_NS + 10**9)
+    timeline.catch_up()
     seen, speed = np.array([[5.0, 0.0, 0.0]]), np.array([[4.0, 0.0, 0.0]])
     event = ObservationEvent(START_NS + 10**8, np.array([1]), seen, velocities=speed)
-    carried = timeline.meet(event, states)
+    carried = timeline.meet(event)
     np.testing.assert_allclose(carried.points, seen + 0.9 * speed, atol=1e-9)
-    expected = slam.observation_noise.at(seen)
+    expected = ObservationNoise(settings).at(seen)
     np.testing.assert_allclose(carried.covariances, expected, rtol=1e-6)
 
 
