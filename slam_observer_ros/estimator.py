@@ -25,6 +25,7 @@ from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.parameters import checked, table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
+from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
@@ -441,30 +442,37 @@ class Estimator:
             self._warnings.late_velocity()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        event = usable_points(event, self.settings, self._counts, self._warnings)
-        stamp_ns = event.stamp_ns
-        event = self._timeline.meet(event)
-        self._counts['late_observation'] += event.stamp_ns > stamp_ns
-        if 0 < self.settings.max_landmarks < len(event.ids) and self._slam.is_mapping:
-            self._warnings.more_than_max(len(event.ids), self.settings.max_landmarks)
+        usable = usable_points(event, self.settings, self._counts, self._warnings)
+        event = self._timeline.meet(usable)
         outcome = self._frame.observe(event)
-        if len(outcome.moved_ids):
-            self._warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
-        self._warnings.lost_places(self._frame.counts)
         self._counts['observation'] += 1
-        if self.settings.gains == 'riccati':
-            self._warnings.large_map(len(self._slam.landmarks))
+        self._counts['late_observation'] += event.stamp_ns > usable.stamp_ns
+        self._warn_of(event, outcome)
+        self.last_update = self._update(event.stamp_ns, outcome)
+        if self._on_update is not None:
+            self._on_update(self.last_update)
+
+    def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
+        """Tell what is amiss with an observation, with what came of it, or with the map."""
+        settings, warnings = self.settings, self._warnings
+        if 0 < settings.max_landmarks < len(event.ids) and self._slam.is_mapping:
+            warnings.more_than_max(len(event.ids), settings.max_landmarks)
+        if len(outcome.moved_ids):
+            warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
+        warnings.lost_places(self._frame.counts)
+        if settings.gains == 'riccati':
+            warnings.large_map(len(self._slam.landmarks))
+
+    def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
         observer = self._slam.observer
-        self.last_update = Update(
-            event.stamp_ns,
+        return Update(
+            stamp_ns,
             observer.pose,
             outcome.ids,
             se3.rotate(observer.reference_pose, outcome.residuals),
             outcome.rejected,
             lyapunov(self.settings.gain_k, outcome.residuals),
         )
-        if self._on_update is not None:
-            self._on_update(self.last_update)
 
     def _begin(self) -> None:
         """Wait for the first event."""
