@@ -132,9 +132,8 @@ class Hypotheses:
         """Use an observation made at the states' instant; return what the best one makes of it."""
         self._doubt = None
         is_unknown = event.ids == UNKNOWN_ID
-        some_are_unknown = bool(is_unknown.any())
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
-        if len(self._states) == 1 and not some_are_unknown:
+        if len(self._states) == 1 and not is_unknown.any():
             sighting = self.best.look(event)
             is_clear = self._limit == 1 or not is_ambiguous(self.best, sighting)
             if is_clear and not may_name(self.best, event):
@@ -145,21 +144,26 @@ class Hypotheses:
         for number, reading in possible:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
-            slam.landmarks.renumber(reading.named_rows, reading.names)
-            if reading.has_slipped:
-                slip(slam, slam.look(reading.event))
-            outcome = slam.observe(slam.look(reading.event))
-            if some_are_unknown:
-                slam.note_surroundings(reading.event, self._some_have_ids)
-            slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
-            if not any(_are_one(slam, reading, other) for other in followed):
-                followed.append(_Followed(slam, reading, outcome))
+            state = _Followed(slam, reading, self._follow(slam, reading, event))
+            if not any(_are_one(state, other) for other in followed):
+                followed.append(state)
             if len(followed) == self._limit:
                 break
         least = followed[0].reading.cost
         self._costs = [state.reading.cost - least for state in followed]
         self._states = [state.slam for state in followed]
         return followed[0].outcome
+
+    def _follow(self, slam: Slam, reading: Reading, event: ObservationEvent) -> Outcome:
+        """Let a state use an observation as one reading has it; return what it makes of it."""
+        slam.landmarks.renumber(reading.named_rows, reading.names)
+        if reading.has_slipped:
+            slip(slam, slam.look(reading.event))
+        outcome = slam.observe(slam.look(reading.event))
+        if (event.ids == UNKNOWN_ID).any():
+            slam.note_surroundings(reading.event, self._some_have_ids)
+        slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
+        return outcome
 
     def _possible(self, event: ObservationEvent) -> list[tuple[int, Reading]]:
         """Return what each state may take an observation for, by the number of the state.
@@ -187,7 +191,7 @@ def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
     return np.concatenate([turn, other[:3, 3] - pose[:3, 3]])
 
 
-def _are_one(slam: Slam, reading: Reading, other: _Followed) -> bool:
-    """Return whether a state has the robot and the landmarks seen where another one has them."""
-    same_ids = np.array_equal(reading.event.ids, other.reading.event.ids)
-    return same_ids and are_one(slam, other.slam, reading.event)
+def _are_one(state: _Followed, other: _Followed) -> bool:
+    """Return whether two states have the robot and the landmarks seen at the same places."""
+    same_ids = np.array_equal(state.reading.event.ids, other.reading.event.ids)
+    return same_ids and are_one(state.slam, other.slam, state.reading.event)
