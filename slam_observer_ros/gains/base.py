@@ -204,9 +204,10 @@ class GainDesign:
         return False
 
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
-        """Note what was seen; where the design looks back, move the observer's reference.
+        """Note what was seen, and look back if it is time; only for those that do at all.
 
-        ``in_doubt`` asks it to look back now, as a landmark seems to have moved.
+        The observer's reference is moved then. ``in_doubt`` asks for it now, as a landmark seems
+        to have moved.
         """
 
     def smooth(self, observer: Observer) -> InHindsight:

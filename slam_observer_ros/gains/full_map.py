@@ -159,7 +159,7 @@ class FullMapGains(RiccatiGains):
     def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise it anew."""
         # An empty frame tells nothing: the motions before and after it add up.
-        if self.looks_back and len(seen.rows):
+        if len(seen.rows):
             self._hindsight.look_back(observer, seen, in_doubt)
 
     def smooth(self, observer: Observer) -> InHindsight:

@@ -211,7 +211,6 @@ def _fix(slam: Slam, known: LandmarkMap) -> None:
     y_ref, covariances = _in_reference_frame(slam, known.select(rows))
     slam.observer.fix_landmarks(y_ref)
     slam.gains = slam.gains.with_fixed_landmarks(covariances)
-    slam.is_fixed = True
 
 
 def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:

@@ -49,8 +49,6 @@ class Slam:
         Ids and counts of the n known landmarks.
     is_mapping : bool
         Whether landmarks are added, and taken to have moved if they are rejected too often.
-    is_fixed : bool
-        Whether the landmarks are those of a map that is exact, and at rest.
     motion_noise : MotionNoise
         Noise of velocities.
     observation_noise : ObservationNoise
@@ -71,7 +69,6 @@ class Slam:
         self.gains = make_gains(settings)
         self.landmarks = LandmarkTable()
         self.is_mapping = True
-        self.is_fixed = False
         self.counts: Counter[str] = Counter()
         self.rejected_in_a_row = 0
         self.motion_noise = MotionNoise(settings)
@@ -81,6 +78,11 @@ class Slam:
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
         self._surroundings = Surroundings(self.observer, self.landmarks, self.axes.point)
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the landmarks are those of a map that is exact, and at rest."""
+        return not self.is_mapping and self.settings.localization_mode == 'fixed'
 
     @property
     def confirmed(self) -> IntArray:
@@ -286,7 +288,7 @@ class Slam:
         """
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
-        if some_are or self.gains.looks_back:
+        if self.gains.looks_back:
             self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
         if some_are:
             return self._relocate(event.select(in_doubt), rows[in_doubt])
