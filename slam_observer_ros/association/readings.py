@@ -4,7 +4,7 @@ After a long blind stretch the gate is wide, and a wrong id passes it. Taken for
 it names, such a point would close a loop where there is none and throw the pose. So it is read
 both ways, as what it says and as an outlier, and later observations decide.
 
-So is an observation all of which the gate rejects. It may be garbled, or of landmarks that have
+So is an observation most of which the gate rejects. It may be garbled, or of landmarks that have
 moved; or the robot is not where odometry has it, since its wheels slipped or someone carried it,
 and would be lost if it went on without what it sees.
 """
@@ -13,11 +13,17 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
 
 from slam_observer_ros.association.assignments import Assignment, find_assignments
-from slam_observer_ros.association.joint_compatibility import joint_cost, RESOLUTION, unpaired_cost
+from slam_observer_ros.association.joint_compatibility import (
+    huber_loss,
+    joint_cost,
+    RESOLUTION,
+    unpaired_cost,
+)
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
@@ -27,7 +33,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.matrices import mahalanobis, with_blocks
 from slam_observer_ros.slam.sighting import Sighting
 from slam_observer_ros.slam.slam import Slam
-from slam_observer_ros.types import BoolArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 SLIP_COST = 20.0
 """What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
@@ -95,8 +101,8 @@ def readings(
     sighting = slam.look(event)
     residuals, m = sighting.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
-    if not some_are_unknown and _are_all_rejected(slam, residuals):
-        return _rejected_or_slipped(slam, sighting, event)
+    if not some_are_unknown and _are_most_rejected(slam, residuals):
+        return _rejected_or_slipped(slam, gains, sighting, event)
     suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals)]]
     if some_are_unknown or may_name(slam, event):
         return _named(slam, gains, event, new_ids, suspects, budget)
@@ -115,7 +121,7 @@ def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     gains, residuals = slam.gains, sighting.residuals
     if not isinstance(gains, RiccatiGains) or _are_all_near(slam, residuals):
         return False
-    return bool(_suspects(slam, gains, residuals).any()) or _are_all_rejected(slam, residuals)
+    return bool(_suspects(slam, gains, residuals).any()) or _are_most_rejected(slam, residuals)
 
 
 def may_name(slam: Slam, event: ObservationEvent) -> bool:
@@ -125,42 +131,73 @@ def may_name(slam: Slam, event: ObservationEvent) -> bool:
     return bool((slam.landmarks.rows_of(event.ids) < 0).any())
 
 
-def _rejected_or_slipped(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
-    """Return the readings of an observation all of whose known landmarks are rejected."""
-    m, rejected, causes = len(event.ids), len(sighting.residuals.rows), _causes(slam, sighting)
-    more = min(rejected - causes, MAX_OF_ONE_CAUSE)
-    each = unpaired_cost(slam.settings.rejection_distance)
-    as_rejected = Reading(event, (m - rejected + causes) * each + more * SAME_CAUSE_COST)
-    return [as_rejected, *(_after_slip(slam, sighting, event) if causes else ())]
+def _rejected_or_slipped(
+    slam: Slam, gains: RiccatiGains, sighting: Sighting, event: ObservationEvent
+) -> list[Reading]:
+    """Return the readings of an observation most of whose known landmarks are rejected.
 
-
-def _causes(slam: Slam, sighting: Sighting) -> int:
-    """Return how many reasons there must be to reject all landmarks, beside those known before.
-
-    At first one is enough: the observation is garbled. The next time it is not, and each landmark
-    has moved for a reason of its own. From then on there is nothing new in it: landmarks that have
-    moved must not throw the pose, however often they are seen.
+    If all are where a single motion would have put them, that is as unlikely of a garbled message
+    as of a robot that has made this motion.
     """
-    again = slam.are_rejected_again(sighting)
-    second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
-    new = int(np.sum(~again))
-    of_new = new if slam.rejected_in_a_row else min(new, 1)
-    return of_new + max(int(np.sum(second)) - 1, 0)
+    residuals, m = sighting.residuals, len(event.ids)
+    rejected = _are_rejected(slam, residuals)
+    cost, is_news = _rejection_cost(slam, sighting, rejected)
+    as_told = _cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
+    slipped = _after_slip(slam, sighting, event) if is_news else None
+    if slipped is None:
+        return [Reading(event, as_told + cost)]
+    if not slam.was_contradicted:
+        each = unpaired_cost(slam.settings.rejection_distance)
+        cost = max(cost, min(slipped - as_told, np.sum(rejected) * each))
+    return [
+        Reading(event, as_told + cost),
+        Reading(event, SLIP_COST + slipped, has_slipped=True),
+    ]
 
 
-def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> list[Reading]:
-    """Return the reading that the robot has slipped, if that explains all that is seen."""
+def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tuple[float, bool]:
+    """Return what it costs to reject landmarks, and whether there is a new reason for it.
+
+    At first one reason is enough: the observation is garbled. The next time it is not, and each
+    landmark has moved for a reason of its own. From then on there is nothing new in it but how
+    well it is seen where it was: landmarks that have moved must not throw the pose, however often
+    they are seen.
+    """
+    each = unpaired_cost(slam.settings.rejection_distance)
+    again = rejected & slam.are_rejected_again(sighting)
+    is_second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
+    new = int(np.sum(rejected & ~again))
+    reasons = new if slam.was_contradicted else min(new, 1)
+    cost = reasons * each + min(new - reasons, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
+    # Of those that are rejected for the second time all but one, the least sure to have stayed.
+    of_moved = max(int(np.sum(is_second)) - 1, 0)
+    staying = np.sort(_staying_costs(slam, sighting)[again])[: int(np.sum(again)) - of_moved]
+    return cost + of_moved * each + float(staying.sum()), reasons + of_moved > 0
+
+
+def _staying_costs(slam: Slam, sighting: Sighting) -> FloatArray:
+    """Return what it costs (m,) to see landmarks where they were when they were rejected first.
+
+    That place is known as well as the sensor tells. To be another outlier costs no more than that.
+    """
+    k, noise = slam.axes.point, 2.0 * sighting.residuals.covariances
+    shifts = slam.shifts_since_rejected(sighting)
+    costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
+    return np.minimum(costs, unpaired_cost(slam.settings.rejection_distance))
+
+
+def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> float | None:
+    """Return what it costs to see this after a slip; None if that does not explain all of it."""
     settings = slam.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
-        return []
+        return None
     slipped = deepcopy(slam)
-    slip(slipped, sighting)
+    cost = slip(slipped, sighting)
     residuals, gains = slipped.look(event).residuals, slipped.gains
     explained = gains.distances(residuals) <= settings.rejection_distance
     if not isinstance(gains, RiccatiGains) or not explained.all():
-        return []
-    cost = SLIP_COST + _cost(slipped, gains, len(event.ids), residuals)
-    return [Reading(event, cost, has_slipped=True)]
+        return None
+    return cost + _cost(slipped, gains, len(event.ids), residuals)
 
 
 def _are_all_near(slam: Slam, residuals: Residuals) -> bool:
@@ -173,10 +210,14 @@ def _are_all_near(slam: Slam, residuals: Residuals) -> bool:
     return bool((own <= slam.settings.rejection_distance).all())
 
 
-def _are_all_rejected(slam: Slam, residuals: Residuals) -> bool:
-    """Return whether there are points seen, and the gate rejects them all."""
-    gate = slam.settings.rejection_distance
-    return len(residuals.r) > 0 and bool((slam.gains.distances(residuals) > gate).all())
+def _are_most_rejected(slam: Slam, residuals: Residuals) -> bool:
+    """Return whether the gate rejects more than half of the points seen."""
+    return bool(2 * np.sum(_are_rejected(slam, residuals)) > len(residuals.r))
+
+
+def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:
+    """Return which points (m,) the gate rejects."""
+    return np.asarray(slam.gains.distances(residuals) > slam.settings.rejection_distance)
 
 
 def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> BoolArray:

@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.association.joint_compatibility import huber_loss
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.slam.sighting import Sighting
@@ -20,23 +22,24 @@ MAX_DURATION_S = 4.0
 LARGE_TURN_RAD = 0.3
 """Turn, radians, that a correction, which is linear in it, does not find well."""
 
-MIN_SPREAD = 10.0
-"""Least extent of landmarks, in standard deviations, that tells how the robot has turned."""
+ITERATIONS = 10
+"""Gauss-Newton steps to the likeliest pose; the last ones hardly move it."""
 
 MIN_VARIANCE_M2 = 1e-6
 """Variance, m², at least, of where a robot without odometry sees what it does after a second."""
 
 
-def slip(slam: Slam, sighting: Sighting) -> None:
+def slip(slam: Slam, sighting: Sighting) -> float:
     """Let the robot have slipped in a way that explains what it sees.
 
     It is then known as badly as if odometry had told nothing for as long as that takes, and what
-    it sees is yet to be used.
+    it sees is yet to be used. Return what it costs that it went where it was put.
     """
     observer, start = slam.observer, slam.observer.A
-    needed_s = _duration_s(slam, sighting)
-    observer.propagate(np.array([start, _pose_after(slam, sighting)]))
-    stray = HeldVelocities.unknown(np.array([0.0, min(needed_s, MAX_DURATION_S)]))
+    needed_s = min(_duration_s(slam, sighting), MAX_DURATION_S)
+    variances = _variances(slam, needed_s)
+    observer.propagate(np.array([start, _pose_after(slam, sighting, variances)]))
+    stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
     moved = Motion(
         path=np.array([start, observer.A, observer.A]),
         measured_velocities=stray.body_velocities,
@@ -47,6 +50,8 @@ def slip(slam: Slam, sighting: Sighting) -> None:
     )
     slam.gains.predict(observer, moved)
     slam.counts['slip'] += 1
+    strayed = se3.log(se3.inverse(start) @ observer.A)[slam.axes.pose]
+    return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
 
 
 def _duration_s(slam: Slam, sighting: Sighting) -> float:
@@ -59,21 +64,34 @@ def _duration_s(slam: Slam, sighting: Sighting) -> float:
     return float(np.mean(needed_s))
 
 
-def _pose_after(slam: Slam, sighting: Sighting) -> FloatArray:
-    """Return Â (4, 4) from which landmarks are where they are seen, if that is far from here.
+def _variances(slam: Slam, needed_s: float) -> FloatArray:
+    """Return the variances (p,) of where a robot gets that odometry tells nothing of."""
+    settings = slam.settings
+    unknown = np.repeat([settings.unknown_angular_motion, settings.unknown_linear_motion], 3)
+    return np.maximum(unknown[slam.axes.pose] ** 2 * needed_s, MIN_VARIANCE_M2)
 
-    If it is not, or can't be told, the correction that follows finds it better.
+
+def _pose_after(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatArray:
+    """Return the likeliest Â (4, 4) after a motion of these ``variances``, if it is far from here.
+
+    If it is not, the correction that follows, which is linear, finds it as well.
     """
-    A, residuals = slam.observer.A, sighting.residuals
-    k, rows = slam.axes.point, residuals.rows
-    landmarks = slam.observer.points[rows]
-    weights = 1.0 / np.trace(residuals.covariances, axis1=1, axis2=2)
-    offsets = landmarks - np.average(landmarks, axis=0, weights=weights)
-    spreads = np.linalg.svd(np.sqrt(weights)[:, None] * offsets, compute_uv=False)
-    if len(rows) < k or spreads[k - 2] < MIN_SPREAD:
-        return A
-    seen = se3.transform(A, sighting.event.points[sighting.known])
-    found = rigid_alignment(seen, landmarks, weights) @ A
+    A, axes = slam.observer.A, slam.axes
+    landmarks = slam.observer.points[sighting.residuals.rows]
+    points = sighting.event.points[sighting.known]
+    W = np.linalg.inv(sighting.covariances[sighting.known][:, : axes.point, : axes.point])
+    found = A
+    if len(points) >= axes.point:
+        weights = np.trace(W, axis1=1, axis2=2)
+        found = rigid_alignment(se3.transform(A, points), landmarks, weights) @ A
+    for _ in range(ITERATIONS):
+        expected = se3.transform(se3.inverse(found), landmarks)
+        C = axes.output_matrix(expected)
+        CW, left = transpose(C) @ W, (points - expected)[:, : axes.point, None]
+        strayed = se3.log(se3.inverse(A) @ found)[axes.pose]
+        H = np.diag(1.0 / variances) + np.sum(CW @ C, axis=0)
+        gradient = strayed / variances + np.sum(CW @ left, axis=0)[:, 0]
+        found = found @ se3.exp(-axes.full_pose(np.linalg.solve(H, gradient)))
     turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
     shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
     reach_m = slam.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)

@@ -29,6 +29,8 @@ class LandmarkTable:
         (n,) in how many observations each was seen and accepted.
     rejections : IntArray
         (n,) how many observations in a row were rejected at one place, up to now.
+    rejected_at : FloatArray
+        (n, 3) where each was at the first of these, metres, world.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
     seen_before_ns : IntArray
@@ -48,7 +50,7 @@ class LandmarkTable:
         self.seen_before_ns: IntArray = np.empty(0, dtype=np.int64)
         self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
         self.in_view: IntArray = np.empty(0, dtype=np.int64)
-        self._rejected_at: FloatArray = np.empty((0, 3))
+        self.rejected_at: FloatArray = np.empty((0, 3))
         self._settled_in_view = 0
         self._settled_seen = 0
         self._order: IntArray = np.empty(0, dtype=np.int64)
@@ -122,13 +124,13 @@ class LandmarkTable:
         """
         same_place = self.are_rejected_again(rows, world_points, tolerances_m)
         self.rejections[rows] = np.where(same_place, self.rejections[rows] + 1, 1)
-        self._rejected_at[rows[~same_place]] = world_points[~same_place]
+        self.rejected_at[rows[~same_place]] = world_points[~same_place]
 
     def are_rejected_again(
         self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray
     ) -> BoolArray:
         """Return which rows (m,) were rejected the last time, and at the same place."""
-        shifts_m = np.linalg.norm(world_points - self._rejected_at[rows], axis=1)
+        shifts_m = np.linalg.norm(world_points - self.rejected_at[rows], axis=1)
         return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
 
     def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:

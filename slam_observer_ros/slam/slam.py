@@ -59,6 +59,8 @@ class Slam:
         How many landmarks were rejected, have moved, were forgotten and so on.
     rejected_in_a_row : int
         Observations since the last one of which a known landmark was not rejected.
+    was_contradicted : bool
+        Whether of the latest observation of known landmarks most were rejected.
 
     """
 
@@ -71,6 +73,7 @@ class Slam:
         self.is_mapping = True
         self.counts: Counter[str] = Counter()
         self.rejected_in_a_row = 0
+        self.was_contradicted = False
         self.motion_noise = MotionNoise(settings)
         self.observation_noise = ObservationNoise(settings)
         self._outlook = Outlook(self.observer, self.landmarks, self.observation_noise, settings)
@@ -217,6 +220,17 @@ class Slam:
         places = self._outlook.places(event, sighting.residuals)
         return self.landmarks.are_rejected_again(sighting.residuals.rows, *places)
 
+    def shifts_since_rejected(self, sighting: Sighting) -> FloatArray:
+        """Return how far known landmarks (m, 3) in it are from where they were rejected first.
+
+        Metres, reference frame.
+        """
+        event = sighting.event.select(sighting.known)
+        points, _ = self._outlook.places(event, sighting.residuals)
+        shifts = points - self.landmarks.rejected_at[sighting.residuals.rows]
+        turned: FloatArray = shifts @ self.observer.reference_pose[:3, :3]
+        return turned
+
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; see :meth:`.GainDesign.smooth`."""
         found, rows = self.gains.smooth(self.observer), self.confirmed
@@ -261,6 +275,7 @@ class Slam:
         self.gains.settle(self.observer)
         rejected: BoolArray = weights == 0.0
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
+        self.was_contradicted = bool(2 * np.sum(rejected) > len(rejected))
         self.landmarks.accept(rows[~rejected], event.stamp_ns)
         if rejected.any():
             places = self._outlook.places(event.select(rejected), residuals.select(rejected))
