@@ -160,6 +160,8 @@ class Hypotheses:
         if reading.has_slipped:
             slip(slam, slam.look(reading.event))
         outcome = slam.observe(slam.look(reading.event))
+        if reading.disbelieved is not None:
+            slam.disbelieve(reading.disbelieved)
         if (event.ids == UNKNOWN_ID).any():
             slam.note_surroundings(reading.event, self._some_have_ids)
         slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)

@@ -61,6 +61,9 @@ class Reading:
         −2 ln of its likelihood, up to what all readings of the observation share.
     has_slipped : bool
         Whether the robot may have moved in any way since the observation before.
+    disbelieved : ObservationEvent or None
+        Of the points that were left out though the gate lets them pass, those of landmarks that
+        were seen so seldom that these may be the outliers.
     named_rows, names : IntArray
         (j,) landmarks that had no id of their own so far, and the ids that they have now.
 
@@ -69,6 +72,7 @@ class Reading:
     event: ObservationEvent
     cost: float
     has_slipped: bool = False
+    disbelieved: ObservationEvent | None = None
     named_rows: IntArray = field(default_factory=_none)
     names: IntArray = field(default_factory=_none)
 
@@ -106,14 +110,35 @@ def readings(
     suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals)]]
     if some_are_unknown or may_name(slam, event):
         return _named(slam, gains, event, new_ids, suspects, budget)
-    trusting = _cost(slam, gains, m, residuals)
-    found = [Reading(event, trusting)]
+    trusting = Reading(event, _cost(slam, gains, m, residuals))
     left_out = [suspects] if len(suspects) > 1 else []
-    for ids in [*suspects[:, None], *left_out]:
-        kept = ~np.isin(slam.landmarks.ids[residuals.rows], ids)
-        cost = max(trusting, _cost(slam, gains, m, residuals.select(kept)))
-        found.append(Reading(event.select(~np.isin(event.ids, ids)), cost))
-    return found
+    without = [
+        _without(ids, slam, gains, sighting, trusting) for ids in [*suspects[:, None], *left_out]
+    ]
+    return [trusting, *without]
+
+
+def _without(
+    ids: IntArray, slam: Slam, gains: RiccatiGains, sighting: Sighting, trusting: Reading
+) -> Reading:
+    """Return the reading that points with some ids are outliers: no cheaper than trusting them.
+
+    But for what is seen once more at one place, in place of a landmark that was seen so seldom
+    that it may itself be the outlier.
+    """
+    event, residuals = trusting.event, sighting.residuals
+    each = unpaired_cost(slam.settings.rejection_distance)
+    out = np.isin(slam.landmarks.ids[residuals.rows], ids)
+    cost = max(trusting.cost, _cost(slam, gains, len(event.ids), residuals.select(~out)))
+    doubtful = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
+    again = doubtful & slam.are_rejected_again(sighting)
+    saved = float(np.sum(each - _staying_costs(slam, sighting)[again]))
+    doubtful_ids = slam.landmarks.ids[residuals.rows[doubtful]]
+    return Reading(
+        event.select(~np.isin(event.ids, ids)),
+        cost - saved,
+        disbelieved=event.select(np.isin(event.ids, doubtful_ids)),
+    )
 
 
 def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:

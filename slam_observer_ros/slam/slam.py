@@ -214,6 +214,18 @@ class Slam:
         moved_ids = self._look_back(event, rows)
         return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
 
+    def disbelieve(self, event: ObservationEvent) -> None:
+        """Count points as rejected although the gate lets them pass.
+
+        Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
+        """
+        rows = self.landmarks.rows_of(event.ids)
+        residuals = self._outlook.residuals(event, rows, self.observation_noise.covariances(event))
+        self.landmarks.reject(rows, *self._outlook.places(event, residuals))
+        in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
+        if in_doubt.any():
+            self.remove(rows[in_doubt])
+
     def are_rejected_again(self, sighting: Sighting) -> BoolArray:
         """Return which known landmarks (m,) in it were rejected before where they are seen now."""
         event = sighting.event.select(sighting.known)
