@@ -169,7 +169,8 @@ class EventQueue:
         newest_ns = self.newest_ns or 0
         same_side = (stamp_ns > newest_ns) == (self._stray_ns > newest_ns)
         agrees = same_side and abs(stamp_ns - self._stray_ns) <= self._max_jump_ns
-        self._strays = self._strays + (stamp_ns != self._stray_ns) if agrees else 1
+        is_next = agrees and self._strays > 0
+        self._strays = self._strays + (stamp_ns != self._stray_ns) if is_next else 1
         self._stray_ns = stamp_ns
         if self._strays < AGREEING_STAMPS:
             return False

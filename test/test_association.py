@@ -37,6 +37,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.observer import Observer
 from slam_observer_ros.parameter_file import read_parameter_file
 from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
@@ -45,6 +46,7 @@ from slam_observer_ros.slam.field_of_view import FieldOfView
 from slam_observer_ros.slam.landmark_index import LandmarkIndex
 from slam_observer_ros.slam.landmark_table import LandmarkTable, PATIENCE
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.surroundings import Surroundings
 
 CONFIG = Path(__file__).resolve().parent.parent / 'config' / 'wheeled_bearing_range.yaml'
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
@@ -536,6 +538,24 @@ def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_be
         landmarks.note_in_view(both, np.array([True, False]))
     assert landmarks.counts.tolist() == [3 * PATIENCE, 1]
     assert landmarks.unsupported(3).tolist() == [1]
+
+
+def test_before_it_is_known_where_a_sensor_looks_no_place_is_strange_to_it():
+    observer, landmarks = Observer(np.eye(4)), LandmarkTable()
+    observer.add_reference_landmarks(5.0 * np.eye(3))
+    landmarks.add_known(FIRST_AUTOMATIC_ID + np.arange(3), np.full(3, 100))
+    surroundings = Surroundings(observer, landmarks, 2)
+    for look in range(200):
+        straight_ahead = ObservationEvent(
+            look, np.array([UNKNOWN_ID]), np.array([[1.0, 0.0, 0.0]])
+        )
+        assert not surroundings.note(straight_ahead, some_have_ids=False)
+
+
+def test_a_landmark_that_was_given_its_id_needs_no_support_any_more():
+    landmarks = looked_at([1, 1], [40, 40], settled_looks=10, settled_seen=10)
+    landmarks.renumber(np.array([1]), np.array([7]))
+    assert landmarks.unsupported(5).tolist() == [2]
 
 
 def test_reflectors_that_are_told_one_a_message_are_all_kept():

@@ -412,6 +412,8 @@ def bad_events():
     good = observation(5.0, [0, 1])
     stamp_ns = good.stamp_ns
     points, eyes = good.points, np.tile(np.eye(3), (2, 1, 1))
+    one_is_negative, one_is_skew = eyes.copy(), eyes.copy()
+    one_is_negative[1, 0, 0] = one_is_skew[1, 0, 1] = -0.5
     return [
         ('negative_stamp', VelocityEvent(-1, BODY_VELOCITY)),
         ('wrong_type', VelocityEvent(stamp_ns * 1e-9, BODY_VELOCITY)),
@@ -450,6 +452,8 @@ def bad_events():
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points, np.ones((2, 3)))),
         ('not_finite', ObservationEvent(stamp_ns, good.ids, points, np.full((2, 3, 3), np.nan))),
         ('bad_covariance', ObservationEvent(stamp_ns, good.ids, points, covariances=-eyes)),
+        ('bad_covariance', ObservationEvent(stamp_ns, good.ids, points, one_is_negative)),
+        ('bad_covariance', ObservationEvent(stamp_ns, good.ids, points, one_is_skew)),
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points, velocities=points[:1])),
         ('wrong_type', ObservationEvent(stamp_ns, good.ids, points, velocities=points.tolist())),
         ('not_finite', ObservationEvent(stamp_ns, good.ids, points, velocities=points * np.nan)),
@@ -628,6 +632,13 @@ def test_an_empty_observation_moves_the_state_on_and_nothing_else():
     np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
 
 
+def test_while_there_is_room_no_landmark_makes_room_for_a_new_one():
+    events = [observation(0.1 * landmark, [landmark]) for landmark in range(4)]
+    estimator = run([velocity(0.0), *events], max_landmarks=5)
+    assert estimator.landmark_ids.tolist() == [0, 1, 2, 3]
+    assert estimator.counts['forgotten_landmark'] == 0
+
+
 def test_a_full_map_forgets_the_landmark_seen_least_often_never_one_in_view():
     events = [observation(0.0, [0, 1, 2]), observation(0.1, [0, 2]), observation(0.2, [0, 1, 3])]
     estimator = run([velocity(0.0), *events], max_landmarks=3)
@@ -727,6 +738,19 @@ def test_moving_landmarks_are_where_they_are_at_the_stamp_of_the_pose(gains):
         estimator.add(velocity(0.02 * step, np.zeros(6)))
         expected = LANDMARKS + 0.02 * step * speed
         np.testing.assert_allclose(estimator.world_points, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_landmark_out_of_view_moves_on_while_others_are_seen_at_rest(gains):
+    estimator = Estimator(Settings(gains=gains, confirmations=1, reorder_window=0.0))
+    speed = np.array([[0.0, 2.0, 0.0]])
+    estimator.add(velocity(0.0, np.zeros(6)))
+    estimator.add(ObservationEvent(START_NS, np.array([0]), LANDMARKS[:1], None, speed))
+    at_rest = ObservationEvent(START_NS, np.array([1]), LANDMARKS[1:2], None, 0.0 * speed)
+    estimator.add(at_rest)
+    estimator.add(replace(at_rest, stamp_ns=START_NS + 4 * 10**8))
+    expected = [LANDMARKS[0] + 0.4 * speed[0], LANDMARKS[1]]
+    np.testing.assert_allclose(estimator.world_points, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize('gap_s', [1e2, 1e4, 1e7])

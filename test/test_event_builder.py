@@ -139,6 +139,13 @@ def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
         BaseFrame(settings, everything_placed()).observation(event, 'camera')
 
 
+def test_tags_are_those_of_the_sensor_that_a_parameter_names():
+    camera, other = (TagDetections(0, frame, (3,), ('tag36h11',)) for frame in ('camera', 'lens'))
+    expected = BaseFrame(InputSettings(), everything_placed()).tags(camera)
+    base_frame = BaseFrame(InputSettings(sensor_frame='camera'), everything_placed())
+    assert_allclose(base_frame.tags(other).points, expected.points)
+
+
 def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used():
     event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
     base_frame = BaseFrame(InputSettings(), everything_placed())

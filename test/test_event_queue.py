@@ -207,6 +207,18 @@ def test_a_stamp_ahead_waits_after_a_silence_and_is_refused_where_there_was_none
         filled(*before).push(received(velocity(12 * SECOND), SECOND))
 
 
+@pytest.mark.parametrize('is_first_received', [False, True])
+def test_a_time_of_reception_that_some_events_lack_tells_of_no_silence(is_first_received):
+    first, ahead = velocity(0), velocity(20 * SECOND)
+    if is_first_received:
+        queue = filled(received(first, 0))
+    else:
+        queue, ahead = filled(first), received(ahead, 20 * SECOND)
+    with pytest.raises(InvalidEventError) as error:
+        queue.push(ahead)
+    assert error.value.reason == 'stamp_jump'
+
+
 def test_stamps_that_go_on_further_than_time_does_are_a_jump_of_the_clock():
     before, after = before_and_after_a_silence(received_before_ns=LONG_NS - 5 * SECOND)
     queue = filled(*before)
@@ -223,6 +235,14 @@ def test_where_events_come_seldom_none_waits_for_others():
     for event in events[1 + AGREEING_STAMPS :]:
         assert not queue.push(event)
         assert queue.pop_ready() == [event]
+
+
+def test_where_events_come_seldom_but_two_at_once_none_waits_for_others():
+    queue = filled(*dense(30 * SECOND, step_ns=5 * SECOND), window_ns=0)
+    for stamp_ns in range(30 * SECOND, 60 * SECOND, 5 * SECOND):
+        assert not queue.push(velocity(stamp_ns))
+        assert not queue.push(observation(stamp_ns))
+        assert queue.newest_ns == START_NS + stamp_ns
 
 
 def test_events_of_one_message_do_not_confirm_each_other():
@@ -247,7 +267,7 @@ def test_stamps_that_do_not_agree_confirm_no_jump():
             queue.push(velocity(far_s * SECOND))
 
 
-@pytest.mark.parametrize('jump_ns', [10**15, -(10**15), -3 * SECOND])
+@pytest.mark.parametrize('jump_ns', [10**15, -(10**15), -3 * SECOND, -START_NS])
 def test_a_jump_of_the_clock_is_believed_when_enough_events_agree(jump_ns):
     queue = filled(velocity(0))
     for k in range(AGREEING_STAMPS - 1):

@@ -142,6 +142,21 @@ def test_wrong_ids_after_a_blind_stretch_do_not_throw_the_pose(two_d_mode, wrong
     assert estimator.counts['moved_landmark'] == 0
 
 
+@modes
+def test_a_wrong_id_among_right_ones_after_a_blind_stretch_does_not_throw_the_pose(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode, unknown_linear_motion=1.0)
+    estimator, ahead_m = Estimator(settings), np.array([4.0, 0.0, 0.0])
+    for step in range(20):
+        stamp_ns = (100 + step) * 100_000_000 + (step >= 10) * 8_000_000_000
+        named = {0: 1, 2: 2, 3: 3} if step == 10 else {0: 0, 1: 1, 2: 2, 3: 3}
+        points = POSTS[[*named]] - ahead_m * (step >= 10)
+        assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        assert estimator.add(ObservationEvent(stamp_ns, np.array([*named.values()]), points))
+    estimator.flush()
+    assert np.linalg.norm(estimator.pose[:3, 3] - ahead_m) < 0.2
+    assert estimator.counts['rejected_landmark'] == 1
+
+
 def test_with_a_single_hypothesis_a_wrong_id_is_believed_for_good():
     errors_m, _ = drive_on_blindly(Settings(two_d_mode=True, max_hypotheses=1), {2: 0})
     assert min(errors_m[10:]) > 1.0

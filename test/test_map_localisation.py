@@ -25,8 +25,9 @@ from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.maps import map_frame
 from slam_observer_ros.maps.alignment import _contradictions, find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
-from slam_observer_ros.maps.localisation import is_lost
+from slam_observer_ros.maps.localisation import CONFIRMING_VOTES, is_lost, PoseTrial
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.sighting import Outcome
 
 POINT_NOISE_M = 0.05
 MAP_NOISE_M = 0.03
@@ -315,6 +316,33 @@ def test_a_pose_that_is_set_moves_the_robot_and_keeps_the_map():
     assert_allclose(estimator.pose_covariance, covariance, atol=1e-12)
     assert_allclose(estimator.world_points, points, atol=1e-12)
     assert_allclose(estimator.landmark_covariances, covariances, atol=1e-12)
+
+
+def votes(known, often):
+    """A function that takes the vote of an observation on a place in a map that was told."""
+    trial, ids = PoseTrial(known), known.ids
+
+    def is_contradicted(by_all):
+        rejected = np.full(len(ids), by_all)
+        outcome = Outcome(ids, np.zeros((len(ids), 3)), rejected, ids[:0])
+        return trial.is_contradicted(outcome, often)
+
+    return is_contradicted
+
+
+@pytest.mark.parametrize('confirming', [CONFIRMING_VOTES - 1, CONFIRMING_VOTES])
+def test_a_place_that_was_told_is_on_trial_until_so_many_observations_confirm_it(confirming):
+    is_contradicted = votes(World().map(range(4)), often=3)
+    assert not any(is_contradicted(by_all=False) for _ in range(confirming))
+    is_given_up = any(is_contradicted(by_all=True) for _ in range(2 * CONFIRMING_VOTES))
+    assert is_given_up == (confirming < CONFIRMING_VOTES)
+
+
+def test_a_place_that_as_many_observations_contradict_as_confirm_stays_on_trial():
+    often = 2 * CONFIRMING_VOTES
+    is_contradicted = votes(World().map(range(4)), often)
+    assert not any(is_contradicted(by_all) for by_all in [True, False] * CONFIRMING_VOTES)
+    assert any(is_contradicted(by_all=True) for _ in range(often))
 
 
 class TestRightPoseThatIsTold:

@@ -18,9 +18,11 @@ from slam_observer_ros.errors import RecordingError
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.sources import BagSource, SplitSource
 from slam_observer_ros.recording.topics import TopicNames
-from slam_observer_ros.recording.truth import LandmarkTracks
+from slam_observer_ros.recording.truth import frames_beside, LandmarkTracks
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.truth import LandmarkTruth
 
@@ -124,6 +126,7 @@ class TestDamage:
             assert f'only the {len(events)} messages before that' in recording.warning
             assert 'can not be read' not in recording.warning
             assert recording.event_count(selected) == len(events)
+            assert recording.duration_s == pytest.approx(1e-9 * (len(events) - 2))
         assert len(whole) // 3 < len(events) < len(whole)
         assert_same_events(events, whole[: len(events)])
 
@@ -140,6 +143,14 @@ class TestDamage:
         (tmp_path / 'whole.db3').rename(directory / 'killed_0.db3')
         with Recording(directory) as recording:
             assert recording.warning is None
+
+    def test_the_only_file_of_a_directory_is_read_though_its_metadata_is_damaged(
+        self, tmp_path, paths
+    ):
+        shutil.copy(paths['mcap file'], tmp_path / 'run_0.mcap')
+        (tmp_path / 'metadata.yaml').touch()
+        with Recording(tmp_path) as recording, Recording(paths['mcap file']) as whole:
+            assert recording.message_count == whole.message_count
 
     def test_several_files_without_metadata_can_not_be_put_together(self, tmp_path, paths):
         for index in range(2):
@@ -233,6 +244,25 @@ class TestDamage:
             assert len(list(recording.events(recording.find_topics()))) == 2
             assert recording.malformed == {'/twist': 2}
         assert 'too short' in caplog.text
+
+
+def test_a_split_recording_lasts_from_the_start_of_the_first_file_to_the_end_of_the_last(tmp_path):
+    for index in range(2):
+        with RecordingWriter(tmp_path / f'{index}.mcap') as writer:
+            for count in range(3):
+                writer.write_velocity(VelocityEvent(10 * index + count, np.zeros(6)))
+    source = SplitSource([BagSource(tmp_path / f'{index}.mcap') for index in (1, 0)])
+    assert (source.start_ns, source.end_ns) == (0, 12)
+    received = [raw.receive_stamp_ns for raw in source.messages(source.topics)]
+    assert received == [0, 1, 2, 10, 11, 12]
+    source.close()
+
+
+@pytest.mark.parametrize(('base_frame', 'expected'), [('', set()), ('base_link', {'wheels'})])
+def test_true_poses_are_of_another_frame_only_where_the_robots_has_a_name(base_frame, expected):
+    frames = ('', 'wheels', '/base_link')
+    poses = [PoseMessage(0, 'map', frame, np.zeros(3), np.eye(4)[3]) for frame in frames]
+    assert frames_beside(base_frame, poses) == expected
 
 
 @pytest.mark.parametrize('count', [500, 501])

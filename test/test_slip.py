@@ -9,6 +9,7 @@ from gain_worlds import START_NS
 import numpy as np
 import pytest
 
+from slam_observer_ros.association.slip import slip
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3
@@ -60,6 +61,23 @@ def test_a_slip_is_found_out_by_the_second_landmark_that_contradicts_odometry(se
     assert max(error_m for time_s, error_m in errors_m.items() if time_s > 50.0) < 0.25
     _, lost_m = run(world, replace(PLANAR, max_hypotheses=1))
     assert max(lost_m.values()) > 3.0
+
+
+@modes
+def test_after_a_slip_the_pose_is_as_uncertain_as_the_slip_was_large_up_to_a_limit(settings):
+    settings = replace(settings, unknown_angular_motion=0.0)
+
+    def variance_m2(shift_m):
+        estimator, ids, point = Estimator(settings), np.array([1]), np.array([[2.0, 0.0, 0.0]])
+        for step in range(5):
+            estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+            estimator.add(ObservationEvent(step * 10**8, ids, point))
+        slam, seen = estimator._slam, point + [[shift_m, 0.0, 0.0]]
+        slip(slam, slam.look(ObservationEvent(4 * 10**8, ids, seen)))
+        return np.trace(slam.pose_covariance[3:, 3:])
+
+    assert 2.0 * variance_m2(0.3) < variance_m2(0.6) < 0.5 * variance_m2(2.0)
+    assert variance_m2(3.0) == pytest.approx(variance_m2(2.0), rel=0.01)
 
 
 def carried(settings, seed, landmarks=12):

@@ -92,6 +92,21 @@ def test_a_new_parent_and_a_later_message_with_one_stamp_replace_what_was_known(
         buffer.lookup('old', 'base', SECOND)
 
 
+def test_what_was_replaced_takes_no_part_in_what_lies_between():
+    buffer, moved = TransformBuffer(), se3.pose(np.eye(3), np.ones(3))
+    for stamp_ns, pose in ((SECOND, np.eye(4)), (SECOND, moved), (2 * SECOND, moved)):
+        buffer.insert('odom', 'base', stamp_ns, pose)
+    assert_allclose(buffer.lookup('odom', 'base', SECOND * 3 // 2), moved)
+
+
+def test_of_static_transforms_the_one_told_last_holds_whatever_its_stamp():
+    buffer = TransformBuffer()
+    for stamp_ns in (5 * SECOND, 7 * SECOND, 3 * SECOND):
+        placed = se3.pose(np.eye(3), np.full(3, 1e-9 * stamp_ns))
+        buffer.insert('base', 'camera', stamp_ns, placed, is_static=True)
+        assert_allclose(buffer.lookup('base', 'camera', 0), placed)
+
+
 @pytest.mark.parametrize(
     ('position', 'quaternion', 'reason'),
     [

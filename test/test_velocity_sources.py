@@ -111,6 +111,18 @@ def test_imu_replaces_the_angular_part_while_it_is_in_time():
     assert_array_equal(held.body_velocities[4], V, 'the IMU has timed out')
 
 
+def test_errors_of_two_sensors_have_nothing_to_do_with_each_other():
+    history = VelocityHistory(SECOND)
+    correlated = np.eye(6) + 0.5
+    assert not history.append(AngularVelocityEvent(0, np.zeros(3), 0.01 * np.eye(3)))
+    assert history.append(VelocityEvent(0, np.zeros(6), correlated))
+    (covariance,) = history.held(0, SECOND // 10).covariances
+    assert_array_equal(covariance[:3, :3], 0.01 * np.eye(3))
+    assert_array_equal(covariance[3:, 3:], correlated[3:, 3:])
+    assert not covariance[:3, 3:].any()
+    assert not covariance[3:, :3].any()
+
+
 def test_a_velocity_is_in_force_until_its_timeout_has_passed():
     history = VelocityHistory(SECOND)
     assert history.latest(0) is None

@@ -161,8 +161,8 @@ def _rejected_or_slipped(
 ) -> list[Reading]:
     """Return the readings of an observation most of whose known landmarks are rejected.
 
-    If all are where a single motion would have put them, that is as unlikely of a garbled message
-    as of a robot that has made this motion.
+    If a single motion would have put all where they are seen, that is as unlikely of a garbled
+    message as of a robot that has made this motion.
     """
     residuals, m = sighting.residuals, len(event.ids)
     rejected = _are_rejected(slam, residuals)
@@ -171,11 +171,13 @@ def _rejected_or_slipped(
     slipped = _after_slip(slam, sighting, event) if is_news else None
     if slipped is None:
         return [Reading(event, as_told + cost)]
-    if not slam.was_contradicted:
+    if slam.was_contradicted:
+        as_rejected = as_told + cost
+    else:
         each = unpaired_cost(slam.settings.rejection_distance)
-        cost = max(cost, min(slipped - as_told, np.sum(rejected) * each))
+        as_rejected = max(cost, min(slipped, as_told + float(np.sum(rejected)) * each))
     return [
-        Reading(event, as_told + cost),
+        Reading(event, as_rejected),
         Reading(event, SLIP_COST + slipped, has_slipped=True),
     ]
 
