@@ -127,6 +127,7 @@ class Estimator:
         """
         newest_ns = self.newest_stamp_ns
         after = '' if newest_ns is None else f' after {to_s(newest_ns):.3f} s'
+        self.release()
         if self.settings.on_time_jump == 'reset':
             logger.warning(
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
@@ -136,7 +137,6 @@ class Estimator:
             self._begin()
         else:
             logger.warning('The clock has jumped%s; pose and map are held.', after)
-            self.release()
             self._timeline.catch_up()
             self._tell_stamp()
             self._frame.restart_time()

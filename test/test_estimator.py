@@ -827,6 +827,31 @@ def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():
     np.testing.assert_allclose(estimator.landmark_velocities, speed, atol=0.03)
 
 
+def test_a_landmark_that_is_placed_anew_moves_as_its_sensor_says_from_then_on():
+    estimator, point = Estimator(Settings(reorder_window=0.0, confirmations=1)), np.ones((1, 3))
+    for step in range(40):
+        has_jumped, speed = step >= 20, np.array([[0.5, 0.0, 0.0]])
+        others = np.concatenate([LANDMARKS, point + 0.05 * step * speed + 2.0 * has_jumped])
+        speeds = np.concatenate([np.zeros_like(LANDMARKS), speed])
+        estimator.add(velocity(0.05 * step, np.zeros(6)))
+        stamp_ns = START_NS + step * 50_000_000
+        estimator.add(ObservationEvent(stamp_ns, np.arange(6), others, velocities=speeds))
+        np.testing.assert_allclose(estimator.landmark_velocities[-1], speed[0], atol=1e-3)
+    assert estimator.counts['moved_landmark'] == 1
+
+
+@pytest.mark.parametrize('on_time_jump', ['hold', 'reset'])
+def test_what_waits_for_late_events_is_used_before_the_clock_jumps(on_time_jump):
+    estimator, added = Estimator(Settings(on_time_jump=on_time_jump, reorder_window=0.5)), 0
+    for _ in range(2):
+        for step in range(200):
+            estimator.add(velocity(100.0 + 0.05 * step, np.zeros(6)))
+            added += 1
+    estimator.flush()
+    assert estimator.jumps == 1
+    assert estimator.counts['velocity'] + estimator.dropped.total() == added
+
+
 @pytest.mark.parametrize('gains', GAINS)
 def test_after_a_jump_back_in_time_pose_and_map_are_held_if_asked(gains):
     events = drive()

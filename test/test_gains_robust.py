@@ -157,6 +157,29 @@ def test_a_wrong_id_among_right_ones_after_a_blind_stretch_does_not_throw_the_po
     assert estimator.counts['rejected_landmark'] == 1
 
 
+@modes
+@pytest.mark.parametrize('off_m', [[0.0, -6.0, 0.0], [-3.0, -6.0, 0.0], [3.0, -4.0, 0.0]], ids=str)
+def test_a_landmark_that_one_wrong_id_has_placed_does_not_throw_the_pose_for_good(
+    two_d_mode, off_m
+):
+    """It is what is seen first after a blind stretch; later the others tell where the robot is."""
+    estimator = Estimator(Settings(two_d_mode=two_d_mode, unknown_linear_motion=1.0))
+    for step in range(60):
+        stamp_ns = (100 + step) * 100_000_000 + (step >= 10) * 8_000_000_000
+        ahead_m = np.array([4.0 * (step >= 10), 0.0, 0.0])
+        ids = np.array([0, 1] if step < 10 else [2, 3] if step < 35 else [0, 1, 2, 3])
+        points = POSTS[ids] - ahead_m
+        if step == 5:
+            ids, points = np.append(ids, 2), np.vstack([points, POSTS[2] + off_m])
+        assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        assert estimator.add(ObservationEvent(stamp_ns, ids, points))
+    estimator.flush()
+    assert np.linalg.norm(estimator.pose[:3, 3] - ahead_m) < 0.1
+    order = np.argsort(estimator.landmark_ids)
+    np.testing.assert_allclose(estimator.world_points[order], POSTS, atol=0.1)
+    assert estimator.counts['moved_landmark'] == 0
+
+
 def test_with_a_single_hypothesis_a_wrong_id_is_believed_for_good():
     errors_m, _ = drive_on_blindly(Settings(two_d_mode=True, max_hypotheses=1), {2: 0})
     assert min(errors_m[10:]) > 1.0

@@ -519,6 +519,19 @@ def test_how_the_map_lies_to_the_start_is_no_error_of_the_map():
     assert np.sqrt(np.median(in_own_frame)) < 0.1
 
 
+def test_before_the_place_in_a_map_is_found_a_map_is_saved_as_if_there_was_none():
+    world, saved = World(17), []
+    known, events = world.map().select(np.arange(3)), world.drive(0.0, 3.0, count=8)
+    for has_map in (False, True):
+        estimator = Estimator(world.settings())
+        if has_map:
+            estimator.load_map(replace(known, ids=known.ids + 500))
+        add(estimator, events)
+        saved.append(estimator.landmark_map)
+    assert not estimator.is_localised
+    assert_array_equal(saved[0].covariances, saved[1].covariances)
+
+
 def test_a_fixed_map_is_saved_as_it_was_loaded():
     world = World(13)
     known = world.map()

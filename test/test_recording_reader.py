@@ -130,6 +130,23 @@ class TestDamage:
         assert len(whole) // 3 < len(events) < len(whole)
         assert_same_events(events, whole[: len(events)])
 
+    def test_what_is_left_of_a_truncated_mcap_comes_as_received_though_written_otherwise(
+        self, tmp_path
+    ):
+        order = np.random.default_rng(1).permutation(200)
+        path = tmp_path / 'untidy.mcap'
+        with RecordingWriter(path) as writer:
+            for index in order.tolist():
+                writer.write_velocity(VelocityEvent(ros.STAMP_NS + index, np.zeros(6)))
+            writer.write_observation(
+                ObservationEvent(ros.STAMP_NS + 200, np.array([1]), np.zeros((1, 3)))
+            )
+        path.write_bytes(path.read_bytes()[:-100])
+        with Recording(path) as recording:
+            assert 'cut off or damaged' in recording.warning
+            events = list(recording.events(recording.find_topics()))
+        assert [event.stamp_ns - ros.STAMP_NS for event in events] == list(range(201))
+
     def test_killed_recorder_leaves_a_directory_without_metadata(self, tmp_path, paths):
         shutil.copy(write_big_mcap(tmp_path / 'big.mcap'), tmp_path / 'killed_0.mcap')
         directory = tmp_path / 'killed'
@@ -195,6 +212,23 @@ class TestDamage:
         os.truncate(directory / '0.mcap', size)
         with pytest.raises(RecordingError, match=f'{directory / "0.mcap"}: .* no whole message'):
             Recording(directory)
+
+    def test_of_a_split_recording_whose_files_overlap_events_come_as_received(self, tmp_path):
+        for part in range(2):
+            with RecordingWriter(tmp_path / f'{part}.mcap') as writer:
+                writer.write_observation(
+                    ObservationEvent(ros.STAMP_NS, np.array([part]), np.zeros((1, 3)))
+                )
+                for index in range(part * 50, 100 + part * 50, 2):
+                    writer.write_velocity(VelocityEvent(ros.STAMP_NS + index + part, np.zeros(6)))
+        (tmp_path / 'metadata.yaml').write_text(
+            'rosbag2_bagfile_information: {relative_file_paths: [0.mcap, 1.mcap]}'
+        )
+        with Recording(tmp_path) as recording:
+            events = list(recording.events(recording.find_topics()))
+        stamps_ns = [event.stamp_ns for event in events]
+        assert len(stamps_ns) == 102
+        assert stamps_ns == sorted(stamps_ns)
 
     def test_of_a_split_recording_a_file_that_is_missing_is_named(self, split):
         directory, _ = split

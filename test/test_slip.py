@@ -80,6 +80,24 @@ def test_after_a_slip_the_pose_is_as_uncertain_as_the_slip_was_large_up_to_a_lim
     assert variance_m2(3.0) == pytest.approx(variance_m2(2.0), rel=0.01)
 
 
+@seeds
+@pytest.mark.parametrize('axis', range(3))
+def test_a_gyroscope_that_is_wrong_once_by_a_radian_costs_one_observation(seed, axis):
+    """Also where landmarks near its axis are seen where they should be."""
+    world = gain_worlds.drive(SPATIAL, 30.0, seed, noise=0.5, landmarks=20, seen=7)
+    wrong = np.eye(6)[axis] / gain_worlds.STEP_S
+
+    def with_outlier(event):
+        is_wrong = isinstance(event, VelocityEvent) and abs(seconds(event) - 20.05) < 0.01
+        return replace(event, body_velocity=event.body_velocity + wrong) if is_wrong else event
+
+    events = [with_outlier(event) for event in world.events]
+    estimator, errors_m = run(replace(world, events=events), SPATIAL)
+    assert estimator.counts['slip'] == 1
+    assert estimator.counts['moved_landmark'] == 0
+    assert max(error_m for time_s, error_m in errors_m.items() if time_s > 20.3) < 0.25
+
+
 def carried(settings, seed, landmarks=12):
     """A world in which someone carries the robot after 20 s; and where to, as a motion before."""
     world = gain_worlds.drive(settings, 40.0, seed, noise=0.5, landmarks=landmarks)

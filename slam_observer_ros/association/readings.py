@@ -2,7 +2,8 @@
 
 After a long blind stretch the gate is wide, and a wrong id passes it. Taken for the landmark that
 it names, such a point would close a loop where there is none and throw the pose. So it is read
-both ways, as what it says and as an outlier, and later observations decide.
+both ways, as what it says and as an outlier, and later observations decide. It may also be the
+landmark that is wrong, if it was placed by such a point itself.
 
 So is an observation most of which the gate rejects. It may be garbled, or of landmarks that have
 moved; or the robot is not where odometry has it, since its wheels slipped or someone carried it,

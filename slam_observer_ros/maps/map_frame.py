@@ -91,7 +91,8 @@ class MapFrame:
         """The present map; see :attr:`slam_observer_ros.estimator.Estimator.landmark_map`."""
         slam, rows = self.slam, self.slam.confirmed
         rows = rows[np.linalg.norm(slam.observer.u[rows], axis=1) < MOVING_SPEED]
-        covariances = shape_covariances(slam) if self.loaded is None else slam.landmark_covariances
+        is_own_frame = self.loaded is None or not self.is_localised
+        covariances = shape_covariances(slam) if is_own_frame else slam.landmark_covariances
         return LandmarkMap(
             slam.landmarks.ids[rows],
             slam.world_points[rows],

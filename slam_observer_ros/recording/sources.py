@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+import heapq
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -144,22 +145,28 @@ class SalvagedMcap:
     def __init__(self, path: Path) -> None:
         self._path = path
         counts: Counter[tuple[str, str]] = Counter()
-        self.start_ns = self.end_ns = 0
+        self.start_ns = self.end_ns = self._disorder_ns = 0
         for name, message_type, message in self._records():
             if not counts:
                 self.start_ns = self.end_ns = message.log_time
             counts[name, message_type] += 1
             self.start_ns = min(self.start_ns, message.log_time)
             self.end_ns = max(self.end_ns, message.log_time)
+            self._disorder_ns = max(self._disorder_ns, self.end_ns - message.log_time)
         self._topics = {key: Topic(*key, count) for key, count in counts.items()}
         self.topics = tuple(self._topics.values())
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
-        for name, message_type, message in self._records():
-            topic = self._topics[name, message_type]
+        held: list[tuple[int, int, RawMessage]] = []
+        for number, (name, message_type, message) in enumerate(self._records()):
+            topic, stamp_ns = self._topics[name, message_type], message.log_time
             if topic in topics:
-                yield RawMessage(topic, message.log_time, message.data)
+                raw = RawMessage(topic, stamp_ns, message.data)
+                heapq.heappush(held, (stamp_ns, number, raw))
+            while held and held[0][0] <= stamp_ns - self._disorder_ns:
+                yield heapq.heappop(held)[-1]
+        yield from (raw for *_, raw in sorted(held))
 
     def close(self) -> None:
         """Do nothing: the file is open only while it is read."""
@@ -202,16 +209,19 @@ class SplitSource:
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
-        for part in self._parts:
-            whole = {topic: self._topics[topic.name, topic.message_type] for topic in part.topics}
-            wanted = [topic for topic in part.topics if whole[topic] in topics]
-            for raw in part.messages(wanted):
-                yield raw._replace(topic=whole[raw.topic])
+        parts = [self._messages_of(part, topics) for part in self._parts]
+        return heapq.merge(*parts, key=lambda raw: raw.receive_stamp_ns)
 
     def close(self) -> None:
         """Close the files."""
         for part in self._parts:
             part.close()
+
+    def _messages_of(self, part: MessageSource, topics: Collection[Topic]) -> Iterator[RawMessage]:
+        whole = {topic: self._topics[topic.name, topic.message_type] for topic in part.topics}
+        wanted = [topic for topic in part.topics if whole[topic] in topics]
+        for raw in part.messages(wanted):
+            yield raw._replace(topic=whole[raw.topic])
 
 
 @contextmanager

@@ -210,8 +210,8 @@ class Slam:
             self._initialise(event.select(~known), sighting.covariances[~known])
             rows = self.landmarks.rows_of(event.ids)
             event, rows = event.select(rows >= 0), rows[rows >= 0]
-        self._note_velocities(event, rows, seen_before.ids[rejected])
         moved_ids = self._look_back(event, rows)
+        self._note_velocities(event, rows)
         return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
 
     def disbelieve(self, event: ObservationEvent) -> None:
@@ -295,16 +295,14 @@ class Slam:
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return rejected
 
-    def _note_velocities(
-        self, event: ObservationEvent, rows: IntArray, rejected_ids: IntArray
-    ) -> None:
+    def _note_velocities(self, event: ObservationEvent, rows: IntArray) -> None:
         """Let landmarks move as the sensor says; by one that says nothing they are static."""
         velocities = event.velocities
         if velocities is None and self.settings.landmark_velocity_error == 0.0:
             velocities = np.zeros((len(rows), 3)) if self.observer.have_moved else None
         if velocities is None or self.is_fixed:
             return
-        used = ~np.isin(event.ids, rejected_ids)
+        used = self.landmarks.rejections[rows] == 0
         self.observer.set_landmark_velocities(rows[used], velocities[used])
 
     def _look_back(self, event: ObservationEvent, rows: IntArray) -> IntArray:
