@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterator
 from concurrent.futures import as_completed, Future, ProcessPoolExecutor
 import json
 import logging
+import math
 import multiprocessing
 import os
 from pathlib import Path
@@ -47,10 +48,11 @@ def main() -> None:
             worlds.data_folder(),
         )
     chosen = chosen_worlds(args.only)
-    loops = [] if args.only else list(monte_carlo.LOOPS)
+    loops = [] if args.only or args.skip else list(monte_carlo.LOOPS)
     seeds = range(args.seed, args.seed + (QUICK_RUNS if args.quick else RUNS))
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
-        tables = run_jobs(pool, list(list_jobs(chosen, QUICK_S if args.quick else None)))
+        until_s = args.skip + QUICK_S if args.quick else math.inf
+        tables = run_jobs(pool, list(list_jobs(chosen, args.skip, until_s)))
         consistency = run_monte_carlo(pool, loops, seeds)
     results = report.Results(tables, consistency, len(seeds))
     sys.stdout.write(report.tables(results))
@@ -73,14 +75,21 @@ def parse_arguments() -> argparse.Namespace:
         '--quick', action='store_true', help='only the first minute and few Monte Carlo runs'
     )
     parser.add_argument(
+        '--skip',
+        type=float,
+        default=0.0,
+        metavar='S',
+        help='begin S seconds later, as if these were other recordings',
+    )
+    parser.add_argument(
         '--seed', type=int, default=0, metavar='N', help='seed of the first Monte Carlo run'
     )
     parser.add_argument(
         '--write-docs', action='store_true', help='write docs/benchmark.md and its figure anew'
     )
     args = parser.parse_args()
-    if args.write_docs and (args.only or args.quick):
-        parser.error('--write-docs takes the whole benchmark, without --only or --quick')
+    if args.write_docs and (args.only or args.quick or args.skip):
+        parser.error('--write-docs takes the whole benchmark, without --only, --quick or --skip')
     if not chosen_worlds(args.only):
         parser.error(f"--only '{args.only}' fits no data set: {', '.join(worlds.names())}")
     return args
@@ -91,16 +100,16 @@ def chosen_worlds(part: str) -> list[str]:
     return [name for name in worlds.names() if part.lower() in name.lower()]
 
 
-def list_jobs(names: list[str], first_s: float | None) -> Iterator[Job]:
-    """Yield all jobs on the worlds of these names, the longest first."""
+def list_jobs(names: list[str], from_s: float, to_s: float) -> Iterator[Job]:
+    """Yield all jobs on this part of the worlds of these names, the longest first."""
     for name in names:
-        yield Job(variants.CLEAN, name, ALL, first_s)
-        yield Job(variants.FALSE_POINTS, name, 'riccati', first_s)
-        yield Job(variants.NO_IDS, name, 'riccati', first_s)
+        yield Job(variants.CLEAN, name, ALL, from_s, to_s)
+        yield Job(variants.FALSE_POINTS, name, 'riccati', from_s, to_s)
+        yield Job(variants.NO_IDS, name, 'riccati', from_s, to_s)
     for name in names:
         for column in variants.OUTLIER_COLUMNS:
-            yield Job(variants.OUTLIERS, name, column, first_s)
-        yield Job(variants.LEFT_OUT, name, 'riccati', first_s)
+            yield Job(variants.OUTLIERS, name, column, from_s, to_s)
+        yield Job(variants.LEFT_OUT, name, 'riccati', from_s, to_s)
 
 
 def run_jobs(pool: ProcessPoolExecutor, jobs: list[Job]) -> report.Tables:

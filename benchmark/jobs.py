@@ -44,15 +44,16 @@ class Job:
         The table that the scores go to.
     world, column : str
         Names of the world and of the estimator, or :data:`ALL`.
-    first_s : float or None
-        Only so many seconds of the world.
+    from_s, to_s : float
+        The part of the world, seconds since its start.
 
     """
 
     variant: str
     world: str
     column: str
-    first_s: float | None
+    from_s: float
+    to_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,10 @@ class SeedJob:
 def run_job(job: Job) -> dict[str, Scores]:
     """Return the scores by column."""
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
-    world = _load(job.world) if job.first_s is None else _load(job.world).first(job.first_s)
+    world = _load(job.world).part(job.from_s, job.to_s)
+    if not world.events:
+        logger.warning('%s lasts less than %g s', job.world, job.from_s)
+        return dict.fromkeys(estimators.COLUMNS if job.column == ALL else (job.column,), FAILED)
     if job.variant == variants.NO_IDS:
         return {job.column: _score_without_ids(outliers.without_ids(world))}
     if job.variant == variants.FALSE_POINTS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 import math
 import os
 from pathlib import Path
@@ -68,10 +69,11 @@ class World:
     truth: Trajectory
     landmarks: LandmarkTruth
 
-    def first(self, duration_s: float) -> World:
-        """Return only the beginning of the run."""
-        end_ns = self.events[0].stamp_ns + round(duration_s * 1e9)
-        return replace(self, events=[event for event in self.events if event.stamp_ns <= end_ns])
+    def part(self, from_s: float, to_s: float) -> World:
+        """Return what is between two times since the start of the run."""
+        start_ns = self.events[0].stamp_ns
+        is_within = [from_s <= (event.stamp_ns - start_ns) * 1e-9 <= to_s for event in self.events]
+        return replace(self, events=list(compress(self.events, is_within)))
 
 
 @dataclass(frozen=True, slots=True)
