@@ -122,8 +122,9 @@ class Estimator:
     def restart_time(self) -> None:
         """Begin anew in time, after a jump of the clock, as ``on_time_jump`` says.
 
-        ``reset`` starts again where the run began; in a loaded map where the settings say, or
-        anywhere. ``hold`` keeps pose and map, and goes on from there.
+        What is held back for late events is used before. ``reset`` starts again where the run
+        began; in a loaded map where the settings say, or anywhere. ``hold`` keeps pose and map,
+        and goes on from there.
         """
         newest_ns = self.newest_stamp_ns
         after = '' if newest_ns is None else f' after {to_s(newest_ns):.3f} s'

@@ -180,6 +180,24 @@ def test_a_landmark_that_one_wrong_id_has_placed_does_not_throw_the_pose_for_goo
     assert estimator.counts['moved_landmark'] == 0
 
 
+def test_a_landmark_that_is_disbelieved_may_have_made_room_for_a_new_one():
+    settings = Settings(two_d_mode=True, unknown_linear_motion=1.0, max_landmarks=3)
+    estimator = Estimator(settings)
+    for step in range(16):
+        stamp_ns = (100 + step) * 100_000_000 + (step >= 10) * 8_000_000_000
+        ahead_m = np.array([4.0 * (step >= 10), 0.0, 0.0])
+        ids = np.array([0, 1] if step < 10 else [2, 3])
+        points = POSTS[ids] - ahead_m
+        if step == 5:
+            ids, points = np.append(ids, 2), np.vstack([points, POSTS[2] - [0.0, 6.0, 0.0]])
+        assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        assert estimator.add(ObservationEvent(stamp_ns, ids, points))
+    estimator.flush()
+    for slam in estimator._frame.states._states:
+        assert len(slam.landmarks) <= 3
+        assert np.all(slam.landmarks.rejections[slam.landmarks.ids == 3] == 0)
+
+
 def test_with_a_single_hypothesis_a_wrong_id_is_believed_for_good():
     errors_m, _ = drive_on_blindly(Settings(two_d_mode=True, max_hypotheses=1), {2: 0})
     assert min(errors_m[10:]) > 1.0

@@ -297,6 +297,22 @@ def test_landmarks_in_a_row_do_not_tell_how_far_a_robot_has_rolled(seed):
     assert tilt_rad < 0.2
 
 
+@pytest.mark.parametrize('placed', ['by hand', 'in another time'])
+def test_a_garbled_observation_after_a_robot_was_placed_is_the_first_one_again(placed):
+    world = gain_worlds.drive(SPATIAL, 30.0, 0, noise=0.5, landmarks=20, seen=7)
+    estimator = Estimator(replace(SPATIAL, on_time_jump='hold'))
+    for event in world.events:
+        if isinstance(event, ObservationEvent) and seconds(event) in (20.0, 20.25):
+            off = se3.exp(np.array([0.0, 0.0, 0.5, 2.0, 20.0 * (seconds(event) - 20.1), 0.0]))
+            event = replace(event, points=se3.transform(off, event.points))
+            if seconds(event) == 20.25 and placed == 'by hand':
+                estimator.set_pose(estimator.pose, 1e-4 * np.eye(6))
+            elif seconds(event) == 20.25:
+                estimator.restart_time()
+        assert estimator.add(event)
+    assert estimator.counts['slip'] == 0
+
+
 def test_a_robot_that_never_moves_by_itself_never_slips():
     settings = replace(PLANAR, unknown_linear_motion=0.0, unknown_angular_motion=0.0)
     world = with_slip(gain_worlds.drive(settings, 50.0, 1, noise=0.5), 0.8)

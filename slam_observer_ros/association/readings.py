@@ -64,7 +64,7 @@ class Reading:
         Whether the robot may have moved in any way since the observation before.
     disbelieved : ObservationEvent or None
         Of the points that were left out though the gate lets them pass, those of landmarks that
-        were seen so seldom that these may be the outliers.
+        were seen so seldom that these may be the outliers; None or empty if there are none.
     named_rows, names : IntArray
         (j,) landmarks that had no id of their own so far, and the ids that they have now.
 
@@ -106,17 +106,19 @@ def readings(
     sighting = slam.look(event)
     residuals, m = sighting.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
-    if not some_are_unknown and _are_most_rejected(slam, residuals):
-        return _rejected_or_slipped(slam, gains, sighting, event)
+    is_contradicted = not some_are_unknown and _are_most_rejected(slam, residuals)
     suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals)]]
-    if some_are_unknown or may_name(slam, event):
+    if not is_contradicted and (some_are_unknown or may_name(slam, event)):
         return _named(slam, gains, event, new_ids, suspects, budget)
-    trusting = Reading(event, _cost(slam, gains, m, residuals))
+    if is_contradicted:
+        trusting, *slipped = _rejected_or_slipped(slam, gains, sighting, event)
+    else:
+        trusting, slipped = Reading(event, _cost(slam, gains, m, residuals)), []
     left_out = [suspects] if len(suspects) > 1 else []
     without = [
         _without(ids, slam, gains, sighting, trusting) for ids in [*suspects[:, None], *left_out]
     ]
-    return [trusting, *without]
+    return [trusting, *without, *slipped]
 
 
 def _without(
@@ -128,17 +130,16 @@ def _without(
     that it may itself be the outlier.
     """
     event, residuals = trusting.event, sighting.residuals
-    each = unpaired_cost(slam.settings.rejection_distance)
     out = np.isin(slam.landmarks.ids[residuals.rows], ids)
     cost = max(trusting.cost, _cost(slam, gains, len(event.ids), residuals.select(~out)))
-    doubtful = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
-    again = doubtful & slam.are_rejected_again(sighting)
-    saved = float(np.sum(each - _staying_costs(slam, sighting)[again]))
-    doubtful_ids = slam.landmarks.ids[residuals.rows[doubtful]]
+    unconfirmed = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
+    again = unconfirmed & slam.are_rejected_again(sighting)
+    saved = float(np.sum(_outlier_cost(slam) - _staying_costs(slam, sighting)[again]))
+    unconfirmed_ids = slam.landmarks.ids[residuals.rows[unconfirmed]]
     return Reading(
         event.select(~np.isin(event.ids, ids)),
         cost - saved,
-        disbelieved=event.select(np.isin(event.ids, doubtful_ids)),
+        disbelieved=event.select(np.isin(event.ids, unconfirmed_ids)),
     )
 
 
@@ -172,15 +173,13 @@ def _rejected_or_slipped(
     slipped = _after_slip(slam, sighting, event) if is_news else None
     if slipped is None:
         return [Reading(event, as_told + cost)]
+    after_slip = Reading(event, SLIP_COST + slipped, has_slipped=True)
     if slam.was_contradicted:
-        as_rejected = as_told + cost
-    else:
-        each = unpaired_cost(slam.settings.rejection_distance)
-        as_rejected = max(cost, min(slipped, as_told + float(np.sum(rejected)) * each))
-    return [
-        Reading(event, as_rejected),
-        Reading(event, SLIP_COST + slipped, has_slipped=True),
-    ]
+        return [Reading(event, as_told + cost), after_slip]
+    as_outliers = as_told + float(np.sum(rejected)) * _outlier_cost(slam)
+    # A garbled message explains what happens to be where it should be, too.
+    garbled = max(cost, min(slipped, as_outliers))
+    return [Reading(event, garbled), after_slip]
 
 
 def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tuple[float, bool]:
@@ -191,16 +190,16 @@ def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tupl
     well it is seen where it was: landmarks that have moved must not throw the pose, however often
     they are seen.
     """
-    each = unpaired_cost(slam.settings.rejection_distance)
     again = rejected & slam.are_rejected_again(sighting)
     is_second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
-    new = int(np.sum(rejected & ~again))
-    reasons = new if slam.was_contradicted else min(new, 1)
-    cost = reasons * each + min(new - reasons, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
-    # Of those that are rejected for the second time all but one, the least sure to have stayed.
-    of_moved = max(int(np.sum(is_second)) - 1, 0)
-    staying = np.sort(_staying_costs(slam, sighting)[again])[: int(np.sum(again)) - of_moved]
-    return cost + of_moved * each + float(staying.sum()), reasons + of_moved > 0
+    staying, new = _staying_costs(slam, sighting), int(np.sum(rejected & ~again))
+    causes = new if slam.was_contradicted else min(new, 1)
+    same_cause = min(new - causes, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
+    # One of these may be of a garbled message once more: the one that is surest to have stayed.
+    moved = np.sort(staying[is_second])[1:]
+    causes += len(moved)
+    stayed = float(staying[again].sum() - moved.sum())
+    return causes * _outlier_cost(slam) + same_cause + stayed, causes > 0
 
 
 def _staying_costs(slam: Slam, sighting: Sighting) -> FloatArray:
@@ -211,7 +210,12 @@ def _staying_costs(slam: Slam, sighting: Sighting) -> FloatArray:
     k, noise = slam.axes.point, 2.0 * sighting.residuals.covariances
     shifts = slam.shifts_since_rejected(sighting)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
-    return np.minimum(costs, unpaired_cost(slam.settings.rejection_distance))
+    return np.minimum(costs, _outlier_cost(slam))
+
+
+def _outlier_cost(slam: Slam) -> float:
+    """Return what it costs that a point is of no landmark that is known."""
+    return unpaired_cost(slam.settings.rejection_distance)
 
 
 def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> float | None:
@@ -239,7 +243,7 @@ def _are_all_near(slam: Slam, residuals: Residuals) -> bool:
 
 
 def _are_most_rejected(slam: Slam, residuals: Residuals) -> bool:
-    """Return whether the gate rejects more than half of the points seen."""
+    """Return whether the gate rejects more than half of the known landmarks seen."""
     return bool(2 * np.sum(_are_rejected(slam, residuals)) > len(residuals.r))
 
 

@@ -25,8 +25,8 @@ LARGE_TURN_RAD = 0.3
 ITERATIONS = 10
 """Gauss-Newton steps to the likeliest pose; the last ones hardly move it."""
 
-MIN_VARIANCE_M2 = 1e-6
-"""Variance, m², at least, of where a robot without odometry sees what it does after a second."""
+MIN_VARIANCE = 1e-6
+"""Least variance of where a robot without odometry gets and sees what it does, rad² or m²."""
 
 
 def slip(slam: Slam, sighting: Sighting) -> float:
@@ -60,7 +60,7 @@ def _duration_s(slam: Slam, sighting: Sighting) -> float:
     points = sighting.event.points[sighting.known]
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
-    needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE_M2)
+    needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE)
     return float(np.mean(needed_s))
 
 
@@ -68,13 +68,14 @@ def _variances(slam: Slam, needed_s: float) -> FloatArray:
     """Return the variances (p,) of where a robot gets that odometry tells nothing of."""
     settings = slam.settings
     unknown = np.repeat([settings.unknown_angular_motion, settings.unknown_linear_motion], 3)
-    return np.maximum(unknown[slam.axes.pose] ** 2 * needed_s, MIN_VARIANCE_M2)
+    return np.maximum(unknown[slam.axes.pose] ** 2 * needed_s, MIN_VARIANCE)
 
 
 def _pose_after(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatArray:
     """Return the likeliest Â (4, 4) after a motion of these ``variances``, if it is far from here.
 
-    If it is not, the correction that follows, which is linear, finds it as well.
+    As if the landmarks and the start were known exactly. If it is not far, the correction that
+    follows, which is linear, finds it as well.
     """
     A, axes = slam.observer.A, slam.axes
     landmarks = slam.observer.points[sighting.residuals.rows]

@@ -105,8 +105,7 @@ class Intake:
         if timed is not measured:
             text = f'stamps are zero on {source}: the time of reception is taken instead'
             self._warn(f'stamps of {source}', text)
-        for event in self._builder.add(timed, time.monotonic_ns()):
-            self._use(event)
+        self._use(self._builder.add(timed, time.monotonic_ns()))
 
     def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
         """Take landmarks, unless they are a lidar's scan."""
@@ -125,8 +124,7 @@ class Intake:
 
     def retry(self) -> None:
         """Try again what waits for a transform; call it often."""
-        for event in self._builder.retry(time.monotonic_ns()):
-            self._use(event)
+        self._use(self._builder.retry(time.monotonic_ns()))
 
     def forget(self) -> None:
         """Drop what waits, and what is known of clocks, as after a jump of the clock."""
@@ -154,16 +152,20 @@ class Intake:
         self._processing_s, self._processed = 0.0, 0
         return mean_s * 1e3
 
-    def _use(self, event: Event) -> None:
+    def _use(self, events: list[Event]) -> None:
+        # All before the first is used: if that shows a jump of the clock, offsets are forgotten.
+        for event in [self._by_own_clock(event) for event in events]:
+            start_s = time.perf_counter()
+            self._estimator.add(event)
+            self._processing_s += time.perf_counter() - start_s
+            self._processed += 1
+
+    def _by_own_clock(self, event: Event) -> Event:
         stamp_ns = event.stamp_ns
         if self._settings.correct_clock_offset:
             # Not before: what places the sensor on /tf has, as a rule, stamps of the same clock.
             stamp_ns += self.clocks[SOURCES[type(event)]].correction_ns
-        event = replace(event, stamp_ns=stamp_ns, receive_ns=time.monotonic_ns())
-        start_s = time.perf_counter()
-        self._estimator.add(event)
-        self._processing_s += time.perf_counter() - start_s
-        self._processed += 1
+        return replace(event, stamp_ns=stamp_ns, receive_ns=time.monotonic_ns())
 
     def _drop_measured(self, error: DropError) -> None:
         is_unplaced = isinstance(error, TransformError)

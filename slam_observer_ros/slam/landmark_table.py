@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -16,6 +13,17 @@ PATIENCE = 4
 
 Some are seen more seldom than others: from afar, or from one side only.
 """
+
+_COLUMNS = (
+    'ids',
+    'counts',
+    'rejections',
+    'rejected_at',
+    'last_seen_ns',
+    'seen_before_ns',
+    'tentative',
+    'in_view',
+)
 
 
 class LandmarkTable:
@@ -30,7 +38,7 @@ class LandmarkTable:
     rejections : IntArray
         (n,) how many observations in a row were rejected at one place, up to now.
     rejected_at : FloatArray
-        (n, 3) where each was at the first of these, metres, world.
+        (n, 3) where each was at the first of these, metres, reference frame.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
     seen_before_ns : IntArray
@@ -70,7 +78,8 @@ class LandmarkTable:
     def add(self, ids: IntArray, stamp_ns: int) -> None:
         """Append landmarks (m,) that are seen for the first time."""
         first, m = len(self), len(ids)
-        for name, column in self._columns():
+        for name in _COLUMNS:
+            column = getattr(self, name)
             room = np.zeros((m, *column.shape[1:]), dtype=column.dtype)
             setattr(self, name, np.concatenate([column, room]))
         self.ids[first:] = ids
@@ -116,21 +125,21 @@ class LandmarkTable:
         unseen_s: FloatArray = np.where(since_ns < 0, np.inf, to_s(stamp_ns - since_ns))
         return unseen_s
 
-    def reject(self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray) -> None:
+    def reject(self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray) -> None:
         """Count one more rejected observation of ``rows`` (m,).
 
-        Only rejections in a row and at one place add up: ``world_points`` (m, 3) within
+        Only rejections in a row and at one place add up: ``points`` (m, 3) within
         ``tolerances_m`` (m,) of where the first of them was, metres.
         """
-        same_place = self.are_rejected_again(rows, world_points, tolerances_m)
+        same_place = self.are_rejected_again(rows, points, tolerances_m)
         self.rejections[rows] = np.where(same_place, self.rejections[rows] + 1, 1)
-        self.rejected_at[rows[~same_place]] = world_points[~same_place]
+        self.rejected_at[rows[~same_place]] = points[~same_place]
 
     def are_rejected_again(
-        self, rows: IntArray, world_points: FloatArray, tolerances_m: FloatArray
+        self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray
     ) -> BoolArray:
         """Return which rows (m,) were rejected the last time, and at the same place."""
-        shifts_m = np.linalg.norm(world_points - self.rejected_at[rows], axis=1)
+        shifts_m = np.linalg.norm(points - self.rejected_at[rows], axis=1)
         return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
 
     def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
@@ -187,10 +196,6 @@ class LandmarkTable:
 
     def remove(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""
-        for name, column in self._columns():
-            setattr(self, name, np.delete(column, rows, axis=0))
+        for name in _COLUMNS:
+            setattr(self, name, np.delete(getattr(self, name), rows, axis=0))
         self._order = np.argsort(self.ids)
-
-    def _columns(self) -> list[tuple[str, NDArray[Any]]]:
-        """Return all that has an entry for each landmark, with its name."""
-        return [item for item in vars(self).items() if isinstance(item[1], np.ndarray)]

@@ -133,9 +133,12 @@ class Outlook:
     def places(
         self, event: ObservationEvent, residuals: Residuals
     ) -> tuple[FloatArray, FloatArray]:
-        """Return where points seem to be (m, 3), world, and within what they are at one place."""
+        """Return where points seem to be (m, 3), and within what they are at one place, metres.
+
+        In the reference frame.
+        """
         spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
-        return se3.transform(self._observer.pose, event.points), SAME_PLACE * spread_m
+        return se3.transform(self._observer.A, event.points), SAME_PLACE * spread_m
 
     def covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return what observed points may be off by: (m, 3, 3), body frame, m².

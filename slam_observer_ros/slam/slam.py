@@ -142,6 +142,7 @@ class Slam:
             # Else ε would turn about an origin that may be kilometres away.
             observer.reference_pose = pose
         observer.A = se3.inverse(observer.reference_pose) @ pose
+        self.was_contradicted = False
         given = np.zeros((6, 6)) if covariance is None else covariance
         self.gains.set_pose_error_covariance(covariances.of_pose_error(observer, given))
         self.gains.restart(observer, 'the pose was set')
@@ -149,6 +150,7 @@ class Slam:
     def restart_time(self) -> None:
         """Go on from here at any other time; what was seen before can't be looked back at."""
         self._end_velocity = None
+        self.was_contradicted = False
         self.landmarks.restart_time()
         self.gains.restart(self.observer, 'the clock jumped')
 
@@ -220,6 +222,7 @@ class Slam:
         Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
         """
         rows = self.landmarks.rows_of(event.ids)
+        event, rows = event.select(rows >= 0), rows[rows >= 0]  # one may have made room
         residuals = self._outlook.residuals(event, rows, self.observation_noise.covariances(event))
         self.landmarks.reject(rows, *self._outlook.places(event, residuals))
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
@@ -239,9 +242,8 @@ class Slam:
         """
         event = sighting.event.select(sighting.known)
         points, _ = self._outlook.places(event, sighting.residuals)
-        shifts = points - self.landmarks.rejected_at[sighting.residuals.rows]
-        turned: FloatArray = shifts @ self.observer.reference_pose[:3, :3]
-        return turned
+        shifts: FloatArray = points - self.landmarks.rejected_at[sighting.residuals.rows]
+        return shifts
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; see :meth:`.GainDesign.smooth`."""
