@@ -842,13 +842,15 @@ def test_a_landmark_that_is_placed_anew_moves_as_its_sensor_says_from_then_on():
 
 @pytest.mark.parametrize('on_time_jump', ['hold', 'reset'])
 def test_what_waits_for_late_events_is_used_before_the_clock_jumps(on_time_jump):
-    estimator, added = Estimator(Settings(on_time_jump=on_time_jump, reorder_window=0.5)), 0
+    settings, told, added = Settings(on_time_jump=on_time_jump, reorder_window=0.5), [], 0
+    estimator = Estimator(settings, on_jump=lambda: told.append(estimator.stamp_ns))
     for _ in range(2):
         for step in range(200):
             estimator.add(velocity(100.0 + 0.05 * step, np.zeros(6)))
             added += 1
     estimator.flush()
     assert estimator.jumps == 1
+    assert told == [None], 'once, before anything of the new time is used'
     assert estimator.counts['velocity'] + estimator.dropped.total() == added
 
 

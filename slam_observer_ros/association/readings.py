@@ -183,10 +183,10 @@ def _rejected_or_slipped(
 
 
 def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tuple[float, bool]:
-    """Return what it costs to reject landmarks, and whether there is a new reason for it.
+    """Return what it costs to reject landmarks, and whether there is a new cause for it.
 
-    At first one reason is enough: the observation is garbled. The next time it is not, and each
-    landmark has moved for a reason of its own. From then on there is nothing new in it but how
+    At first one cause is enough: the observation is garbled. The next time it is not, and each
+    landmark has moved for a cause of its own. From then on there is nothing new in it but how
     well it is seen where it was: landmarks that have moved must not throw the pose, however often
     they are seen.
     """

@@ -74,9 +74,17 @@ def _variances(slam: Slam, needed_s: float) -> FloatArray:
 def _pose_after(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatArray:
     """Return the likeliest Â (4, 4) after a motion of these ``variances``, if it is far from here.
 
-    As if the landmarks and the start were known exactly. If it is not far, the correction that
-    follows, which is linear, finds it as well.
+    If it is not, the correction that follows, which is linear, finds it as well.
     """
+    A, found = slam.observer.A, _likeliest_pose(slam, sighting, variances)
+    turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
+    shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
+    reach_m = slam.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)
+    return found if turn_rad > LARGE_TURN_RAD or shift_m > reach_m else A
+
+
+def _likeliest_pose(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatArray:
+    """Return Â (4, 4) by Gauss-Newton steps, as if landmarks and start were known exactly."""
     A, axes = slam.observer.A, slam.axes
     landmarks = slam.observer.points[sighting.residuals.rows]
     points = sighting.event.points[sighting.known]
@@ -93,7 +101,4 @@ def _pose_after(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatA
         H = np.diag(1.0 / variances) + np.sum(CW @ C, axis=0)
         gradient = strayed / variances + np.sum(CW @ left, axis=0)[:, 0]
         found = found @ se3.exp(-axes.full_pose(np.linalg.solve(H, gradient)))
-    turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
-    shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
-    reach_m = slam.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)
-    return found if turn_rad > LARGE_TURN_RAD or shift_m > reach_m else A
+    return found
