@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 import logging
+from operator import attrgetter
 
 import estimators
 from estimators import Run
@@ -127,15 +128,15 @@ def _score_all(name: str, world: World) -> dict[str, Scores]:
 
     They take turns: whatever slows the machine for a while then slows no column's every run.
     """
-    rounds = [
-        {column: score(run, world) for column, run in _run_all(name, world).items()}
-        for _ in range(TIMED_RUNS)
-    ]
-    fastest = {
-        column: replace(scores, cpu_s=min(one[column].cpu_s for one in rounds))
-        for column, scores in rounds[0].items()
-    }
-    return dict.fromkeys(estimators.COLUMNS, FAILED) | fastest
+    runs = _run_all(name, world)
+    for _ in range(TIMED_RUNS - 1):
+        again = _run_all(name, world)
+        runs = {
+            column: min(run, again[column], key=attrgetter('cpu_s'))
+            for column, run in runs.items()
+        }
+    scores = {column: score(run, world) for column, run in runs.items()}
+    return dict.fromkeys(estimators.COLUMNS, FAILED) | scores
 
 
 def _run_all(name: str, world: World) -> dict[str, Run]:

@@ -32,7 +32,7 @@ from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import are_far, far_from_the_others, gated
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.matrices import mahalanobis, with_blocks
-from slam_observer_ros.slam.sighting import Sighting
+from slam_observer_ros.slam.sighting import is_contradiction, Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -106,12 +106,13 @@ def readings(
     sighting = slam.look(event)
     residuals, m = sighting.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
-    is_contradicted = not some_are_unknown and _are_most_rejected(slam, residuals)
+    rejected = _are_rejected(slam, residuals)
+    is_contradicted = not some_are_unknown and is_contradiction(rejected)
     suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals)]]
     if not is_contradicted and (some_are_unknown or may_name(slam, event)):
         return _named(slam, gains, event, new_ids, suspects, budget)
     if is_contradicted:
-        trusting, *slipped = _rejected_or_slipped(slam, gains, sighting, event)
+        trusting, *slipped = _rejected_or_slipped(slam, gains, sighting, event, rejected)
     else:
         trusting, slipped = Reading(event, _cost(slam, gains, m, residuals)), []
     left_out = [suspects] if len(suspects) > 1 else []
@@ -133,8 +134,8 @@ def _without(
     out = np.isin(slam.landmarks.ids[residuals.rows], ids)
     cost = max(trusting.cost, _cost(slam, gains, len(event.ids), residuals.select(~out)))
     unconfirmed = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
-    again = unconfirmed & slam.are_rejected_again(sighting)
-    saved = float(np.sum(_outlier_cost(slam) - _staying_costs(slam, sighting)[again]))
+    again, staying = _rejected_before(slam, sighting)
+    saved = float(np.sum(_outlier_cost(slam) - staying[again & unconfirmed]))
     unconfirmed_ids = slam.landmarks.ids[residuals.rows[unconfirmed]]
     return Reading(
         event.select(~np.isin(event.ids, ids)),
@@ -148,7 +149,8 @@ def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     gains, residuals = slam.gains, sighting.residuals
     if not isinstance(gains, RiccatiGains) or _are_all_near(slam, residuals):
         return False
-    return bool(_suspects(slam, gains, residuals).any()) or _are_most_rejected(slam, residuals)
+    some_are_suspect = bool(_suspects(slam, gains, residuals).any())
+    return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
 
 
 def may_name(slam: Slam, event: ObservationEvent) -> bool:
@@ -159,7 +161,11 @@ def may_name(slam: Slam, event: ObservationEvent) -> bool:
 
 
 def _rejected_or_slipped(
-    slam: Slam, gains: RiccatiGains, sighting: Sighting, event: ObservationEvent
+    slam: Slam,
+    gains: RiccatiGains,
+    sighting: Sighting,
+    event: ObservationEvent,
+    rejected: BoolArray,
 ) -> list[Reading]:
     """Return the readings of an observation most of whose known landmarks are rejected.
 
@@ -167,7 +173,6 @@ def _rejected_or_slipped(
     message as of a robot that has made this motion.
     """
     residuals, m = sighting.residuals, len(event.ids)
-    rejected = _are_rejected(slam, residuals)
     cost, is_news = _rejection_cost(slam, sighting, rejected)
     as_told = _cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
     slipped = _after_slip(slam, sighting, event) if is_news else None
@@ -190,9 +195,10 @@ def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tupl
     well it is seen where it was: landmarks that have moved must not throw the pose, however often
     they are seen.
     """
-    again = rejected & slam.are_rejected_again(sighting)
+    again, staying = _rejected_before(slam, sighting)
+    again &= rejected
     is_second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
-    staying, new = _staying_costs(slam, sighting), int(np.sum(rejected & ~again))
+    new = int(np.sum(rejected & ~again))
     causes = new if slam.was_contradicted else min(new, 1)
     same_cause = min(new - causes, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
     # One of these may be of a garbled message once more: the one that is surest to have stayed.
@@ -202,15 +208,16 @@ def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tupl
     return causes * _outlier_cost(slam) + same_cause + stayed, causes > 0
 
 
-def _staying_costs(slam: Slam, sighting: Sighting) -> FloatArray:
-    """Return what it costs (m,) to see landmarks where they were when they were rejected first.
+def _rejected_before(slam: Slam, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
+    """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
 
-    That place is known as well as the sensor tells. To be another outlier costs no more than that.
+    Where they were rejected first is known as well as the sensor tells. No landmark costs more
+    than another outlier.
     """
     k, noise = slam.axes.point, 2.0 * sighting.residuals.covariances
-    shifts = slam.shifts_since_rejected(sighting)
+    again, shifts = slam.rejected_before(sighting)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
-    return np.minimum(costs, _outlier_cost(slam))
+    return again, np.minimum(costs, _outlier_cost(slam))
 
 
 def _outlier_cost(slam: Slam) -> float:
@@ -226,8 +233,7 @@ def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> floa
     slipped = deepcopy(slam)
     cost = slip(slipped, sighting)
     residuals, gains = slipped.look(event).residuals, slipped.gains
-    explained = gains.distances(residuals) <= settings.rejection_distance
-    if not isinstance(gains, RiccatiGains) or not explained.all():
+    if not isinstance(gains, RiccatiGains) or _are_rejected(slipped, residuals).any():
         return None
     return cost + _cost(slipped, gains, len(event.ids), residuals)
 
@@ -240,11 +246,6 @@ def _are_all_near(slam: Slam, residuals: Residuals) -> bool:
     k = slam.axes.point
     own = mahalanobis(residuals.r[:, :k], residuals.covariances[:, :k, :k])
     return bool((own <= slam.settings.rejection_distance).all())
-
-
-def _are_most_rejected(slam: Slam, residuals: Residuals) -> bool:
-    """Return whether the gate rejects more than half of the known landmarks seen."""
-    return bool(2 * np.sum(_are_rejected(slam, residuals)) > len(residuals.r))
 
 
 def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:

@@ -37,15 +37,16 @@ def slip(slam: Slam, sighting: Sighting) -> float:
     """
     observer, start = slam.observer, slam.observer.A
     needed_s = min(_duration_s(slam, sighting), MAX_DURATION_S)
-    variances = _variances(slam, needed_s)
-    observer.propagate(np.array([start, _pose_after(slam, sighting, variances)]))
     stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
+    noise = slam.motion_noise.covariances(stray)
+    variances = np.maximum(np.diagonal(noise[1])[slam.axes.pose], MIN_VARIANCE)
+    observer.propagate(np.array([start, _pose_after(slam, sighting, variances)]))
     moved = Motion(
         path=np.array([start, observer.A, observer.A]),
         measured_velocities=stray.body_velocities,
         dt_s=stray.dt_s,
         gap_s=np.zeros(2),
-        covariances=slam.motion_noise.covariances(stray),
+        covariances=noise,
         at_ends=None,
     )
     slam.gains.predict(observer, moved)
@@ -64,15 +65,8 @@ def _duration_s(slam: Slam, sighting: Sighting) -> float:
     return float(np.mean(needed_s))
 
 
-def _variances(slam: Slam, needed_s: float) -> FloatArray:
-    """Return the variances (p,) of where a robot gets that odometry tells nothing of."""
-    settings = slam.settings
-    unknown = np.repeat([settings.unknown_angular_motion, settings.unknown_linear_motion], 3)
-    return np.maximum(unknown[slam.axes.pose] ** 2 * needed_s, MIN_VARIANCE)
-
-
 def _pose_after(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatArray:
-    """Return the likeliest Â (4, 4) after a motion of these ``variances``, if it is far from here.
+    """Return the likeliest Â (4, 4) after a motion of ``variances`` (p,), if it is far from here.
 
     If it is not, the correction that follows, which is linear, finds it as well.
     """

@@ -74,6 +74,11 @@ class Outcome:
     moved_ids: IntArray
 
 
+def is_contradiction(rejected: BoolArray) -> bool:
+    """Return whether most of the known landmarks (m,) seen are rejected: the pose may be wrong."""
+    return bool(2 * np.sum(rejected) > len(rejected))
+
+
 class Outlook:
     """Where a state expects its landmarks, and what comes of comparing that with what is seen.
 
@@ -130,15 +135,14 @@ class Outlook:
         dt_s = self._landmarks.unseen_s(rows, event.stamp_ns)
         return Seen(event.stamp_ns, rows, event.points, sights, stated, dt_s)
 
-    def places(
-        self, event: ObservationEvent, residuals: Residuals
-    ) -> tuple[FloatArray, FloatArray]:
+    def places(self, points: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where points seem to be (m, 3), and within what they are at one place, metres.
 
-        In the reference frame.
+        They are given in the body frame, with ``covariances`` along any axes, and returned in the
+        reference frame.
         """
-        spread_m = np.sqrt(np.trace(residuals.covariances, axis1=1, axis2=2))
-        return se3.transform(self._observer.A, event.points), SAME_PLACE * spread_m
+        spread_m = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        return se3.transform(self._observer.A, points), SAME_PLACE * spread_m
 
     def covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return what observed points may be off by: (m, 3, 3), body frame, m².

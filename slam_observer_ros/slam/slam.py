@@ -22,7 +22,7 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
 from slam_observer_ros.slam.landmark_index import LandmarkIndex
 from slam_observer_ros.slam.landmark_table import LandmarkTable
-from slam_observer_ros.slam.sighting import Outcome, Outlook, Sighting
+from slam_observer_ros.slam.sighting import is_contradiction, Outcome, Outlook, Sighting
 from slam_observer_ros.slam.surroundings import Surroundings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -223,27 +223,22 @@ class Slam:
         """
         rows = self.landmarks.rows_of(event.ids)
         event, rows = event.select(rows >= 0), rows[rows >= 0]  # one may have made room
-        residuals = self._outlook.residuals(event, rows, self.observation_noise.covariances(event))
-        self.landmarks.reject(rows, *self._outlook.places(event, residuals))
+        noise = self.observation_noise.covariances(event)
+        self.landmarks.reject(rows, *self._outlook.places(event.points, noise))
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         if in_doubt.any():
             self.remove(rows[in_doubt])
 
-    def are_rejected_again(self, sighting: Sighting) -> BoolArray:
-        """Return which known landmarks (m,) in it were rejected before where they are seen now."""
-        event = sighting.event.select(sighting.known)
-        places = self._outlook.places(event, sighting.residuals)
-        return self.landmarks.are_rejected_again(sighting.residuals.rows, *places)
+    def rejected_before(self, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
+        """Return which known landmarks (m,) in it were rejected before where they are seen now.
 
-    def shifts_since_rejected(self, sighting: Sighting) -> FloatArray:
-        """Return how far known landmarks (m, 3) in it are from where they were rejected first.
-
-        Metres, reference frame.
+        And how far all of them (m, 3) are from where they were rejected first, metres, reference
+        frame.
         """
-        event = sighting.event.select(sighting.known)
-        points, _ = self._outlook.places(event, sighting.residuals)
-        shifts: FloatArray = points - self.landmarks.rejected_at[sighting.residuals.rows]
-        return shifts
+        rows, seen = sighting.residuals.rows, sighting.event.points[sighting.known]
+        points, tolerances_m = self._outlook.places(seen, sighting.residuals.covariances)
+        again = self.landmarks.are_rejected_again(rows, points, tolerances_m)
+        return again, points - self.landmarks.rejected_at[rows]
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; see :meth:`.GainDesign.smooth`."""
@@ -289,10 +284,11 @@ class Slam:
         self.gains.settle(self.observer)
         rejected: BoolArray = weights == 0.0
         self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
-        self.was_contradicted = bool(2 * np.sum(rejected) > len(rejected))
+        self.was_contradicted = is_contradiction(rejected)
         self.landmarks.accept(rows[~rejected], event.stamp_ns)
         if rejected.any():
-            places = self._outlook.places(event.select(rejected), residuals.select(rejected))
+            noise = residuals.covariances[rejected]
+            places = self._outlook.places(event.points[rejected], noise)
             self.landmarks.reject(rows[rejected], *places)
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return rejected
