@@ -8,16 +8,10 @@ import heapq
 from typing import TypeAlias
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.events import Event, ObservationEvent
+from slam_observer_ros.events import AGREEING_STAMPS, Event, NEAR_NS, ObservationEvent
 from slam_observer_ros.units import to_s
 
 Key: TypeAlias = tuple[int, bool, bytes]
-
-AGREEING_STAMPS = 5
-"""How many stamps in a row must agree before a pause or a jump of the clock is believed."""
-
-NEAR_NS = 1_000_000_000
-"""Stamps nearer than this to the newest one tell of no pause or jump, nanoseconds."""
 
 RECENT = 1000
 """Events that tell how far ahead of their reception stamps are.
@@ -101,12 +95,12 @@ class EventQueue:
             return False
         too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
         if too_late or too_early:
-            if self._is_confirmed(stamp_ns):
+            if self._count_stray(stamp_ns):
                 return True
             raise _refusal(ahead_ns)
         self._insert(event)
         self._lead_ns = max(self._lead_ns, stamp_ns)
-        if self._is_confirmed(stamp_ns):
+        if self._count_stray(stamp_ns):
             self._note_reception(event)
             self._believe(self._lead_ns)
         return False
@@ -132,7 +126,7 @@ class EventQueue:
     def _insert(self, event: Event) -> None:
         key = _key(event)
         if key in self._known:
-            raise InvalidEventError('duplicate', 'an event with this stamp is already known')
+            raise InvalidEventError('duplicate', 'this event is already known')
         self._known.add(key)
         heapq.heappush(self._heap, (key, event))
         if len(self._known) > self._most_known:
@@ -161,7 +155,7 @@ class EventQueue:
             self._usual_ns = min(max(self._near_ns, 2 * step_ns), self._max_jump_ns)
         self.newest_ns = self._lead_ns = newest_ns
 
-    def _is_confirmed(self, stamp_ns: int) -> bool:
+    def _count_stray(self, stamp_ns: int) -> bool:
         """Count a stamp far from the newest one; return whether enough have agreed on it now.
 
         Events of one stamp count once: they may be of one message.

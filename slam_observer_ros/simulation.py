@@ -189,7 +189,7 @@ class Simulation:
         delayed: list[Delivery] = []
         for delivery in self._deliveries_in_stamp_order():
             heapq.heappush(delayed, delivery)
-            while delayed and delayed[0].arrival_ns <= _stamp_ns(delivery):
+            while delayed and delayed[0].arrival_ns <= delivery.event.stamp_ns:
                 yield heapq.heappop(delayed)
         while delayed:
             yield heapq.heappop(delayed)
@@ -273,10 +273,6 @@ class Simulation:
 
     def _elapsed_s(self, stamp_ns: int | IntArray) -> FloatArray:
         return to_s(np.asarray(stamp_ns, dtype=np.int64) - self.start_ns)
-
-
-def _stamp_ns(delivery: Delivery) -> int:
-    return delivery.event.stamp_ns
 
 
 def _split_seed(seed: int) -> tuple[np.random.Generator, np.random.SeedSequence]:

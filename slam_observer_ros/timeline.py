@@ -67,11 +67,12 @@ class Timeline:
         """Return whether a newer event was used already."""
         return event.stamp_ns < (self.stamp_ns or 0)
 
-    def note_stamp(self, stamp_ns: int) -> None:
-        """Note the stamp of an event that is about to be used."""
+    def _begin(self, stamp_ns: int) -> int:
+        """Note the stamp of an event that is about to be used; return ``state_ns``."""
         self.stamp_ns = max(stamp_ns, self.stamp_ns or stamp_ns)
         if self.state_ns is None:
             self.state_ns = stamp_ns
+        return self.state_ns
 
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
         """Add a velocity; return whether it is in force: an angular one waits for a linear one.
@@ -93,7 +94,7 @@ class Timeline:
             event = replace(event, stamp_ns=self.stamp_ns or 0)
         if not self.velocities.append(event):
             return False
-        self.note_stamp(event.stamp_ns)
+        self._begin(event.stamp_ns)
         self._pending += 1
         if self._pending >= MAX_PENDING_VELOCITIES:
             self.catch_up()
@@ -123,9 +124,9 @@ class Timeline:
 
     def meet(self, event: ObservationEvent) -> ObservationEvent:
         """Move the states on to an observation, or it to them if it is late; return it."""
-        self.note_stamp(event.stamp_ns)
-        if event.stamp_ns < (self.state_ns or 0):
-            event = self._carried_forward(event)
+        state_ns = self._begin(event.stamp_ns)
+        if event.stamp_ns < state_ns:
+            event = self._carried_forward(event, state_ns)
         self._advance(event.stamp_ns)
         return event
 
@@ -136,14 +137,13 @@ class Timeline:
         calibration = self._frame.slam.gains.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
 
-    def _carried_forward(self, event: ObservationEvent) -> ObservationEvent:
+    def _carried_forward(self, event: ObservationEvent, state_ns: int) -> ObservationEvent:
         """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
 
         Its points are as uncertain as any seen from there, and as that motion makes them. Its
         error is one and the same for all m, but is given to each as its own: m would average it
         down.
         """
-        state_ns = event.stamp_ns if self.state_ns is None else self.state_ns
         slam, back = self._frame.slam, self.motion(state_ns, event.stamp_ns)
         points, sensor = event.points, event.sensor
         if event.velocities is not None:

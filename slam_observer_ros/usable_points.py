@@ -27,6 +27,9 @@ def usable_points(
         repeated = np.isin(event.ids, repeated_ids)
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
-    if settings.gains != 'riccati' and (event.ids == UNKNOWN_ID).any():
+    unknown = event.ids == UNKNOWN_ID
+    if settings.gains != 'riccati' and unknown.any():
         warnings.unknown_ids(settings.gains)
+        counts['unknown_id'] += int(np.sum(unknown))
+        event = event.select(~unknown)
     return event

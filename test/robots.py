@@ -9,8 +9,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import PointCloud, PointCloud2
 
-from slam_observer_ros.event_queue import AGREEING_STAMPS
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import AGREEING_STAMPS, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes.conversions import (

@@ -257,6 +257,19 @@ def test_gains_without_a_joint_covariance_leave_points_without_id_out(gains):
     assert estimator.counts['unknown_id'] == 1
 
 
+@pytest.mark.parametrize('gains', ['constant', 'scheduled'])
+def test_points_that_gains_leave_out_tell_nothing_of_the_place(gains):
+    known = np.random.default_rng(0).uniform(-5.0, 5.0, (12, 3))
+    estimator = Estimator(replace(SPATIAL, gains=gains, localization_mode='uncertain'))
+    unseen = np.zeros(len(known), dtype=np.int64)
+    estimator.load_map(LandmarkMap(np.arange(12), known, None, unseen), pose=np.eye(4))
+    for second in range(40):
+        stand(estimator, float(second))
+        observe(estimator, float(second), known, np.full(12, UNKNOWN_ID))
+    assert estimator.counts['unknown_id'] == 12 * 40
+    assert estimator.counts['strange_place'] == 0
+
+
 @pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
 def test_a_robot_finds_its_way_in_a_map_by_reflectors_that_all_look_alike(mode):
     rng = np.random.default_rng(1)

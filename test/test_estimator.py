@@ -18,8 +18,8 @@ from slam_observer_ros.errors import MapError, ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
-from slam_observer_ros.event_queue import AGREEING_STAMPS
 from slam_observer_ros.events import (
+    AGREEING_STAMPS,
     FIRST_AUTOMATIC_ID,
     LAST_AUTOMATIC_ID,
     ObservationEvent,

@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 
 from slam_observer_ros.errors import InvalidEventError
-from slam_observer_ros.event_queue import AGREEING_STAMPS, EventQueue, MIN_KNOWN
-from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
+from slam_observer_ros.event_queue import EventQueue, MIN_KNOWN
+from slam_observer_ros.events import (
+    AGREEING_STAMPS,
+    AngularVelocityEvent,
+    ObservationEvent,
+    VelocityEvent,
+)
 
 SECOND = 1_000_000_000
 START_NS = 1_700_000_000 * SECOND

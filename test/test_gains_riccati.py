@@ -107,7 +107,7 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
         slam.move(V, dt_s, Q)
         rows = np.array([0])
         residuals = slam.residuals(rows, slam.expected(rows), np.zeros((1, 3, 3)))
-        return slam.gains.predicted(residuals)[1]
+        return slam.gains.predicted(residuals)
 
     at_rest = predicted(start + 2.0 * velocity, np.zeros((1, 3)))
     np.testing.assert_allclose(predicted(start, velocity), at_rest, atol=1e-12)

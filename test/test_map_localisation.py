@@ -325,7 +325,7 @@ def votes(known, often):
     def is_contradicted(by_all):
         rejected = np.full(len(ids), by_all)
         outcome = Outcome(ids, np.zeros((len(ids), 3)), rejected, ids[:0])
-        return trial.is_contradicted(outcome, often)
+        return trial.vote(outcome, often)
 
     return is_contradicted
 

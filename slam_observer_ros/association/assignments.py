@@ -80,8 +80,8 @@ def find_assignments(
     seen = _Points(slam, event)
     at, rows = _candidates(slam, gains, seen)
     residuals = _as_residuals(slam.observer, seen, at, rows)
-    PC, CPC = gains.predicted(residuals)
-    r, noise = residuals.r[:, : axes.point], residuals.covariances[:, : axes.point, : axes.point]
+    PC, CPC = gains.predicted_with_pose(residuals)
+    r, noise = residuals.on(axes)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
     gate_cost = unpaired_cost(slam.settings.rejection_distance)

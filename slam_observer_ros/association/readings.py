@@ -115,10 +115,8 @@ def readings(
         trusting, *slipped = _rejected_or_slipped(slam, gains, sighting, event, rejected)
     else:
         trusting, slipped = Reading(event, _cost(slam, gains, m, residuals)), []
-    left_out = [suspects] if len(suspects) > 1 else []
-    without = [
-        _without(ids, slam, gains, sighting, trusting) for ids in [*suspects[:, None], *left_out]
-    ]
+    doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
+    without = [_without(ids, slam, gains, sighting, trusting) for ids in doubted]
     return [trusting, *without, *slipped]
 
 
@@ -134,7 +132,7 @@ def _without(
     out = np.isin(slam.landmarks.ids[residuals.rows], ids)
     cost = max(trusting.cost, _cost(slam, gains, len(event.ids), residuals.select(~out)))
     unconfirmed = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
-    again, staying = _rejected_before(slam, sighting)
+    again, staying = _cost_of_staying(slam, sighting)
     saved = float(np.sum(_outlier_cost(slam) - staying[again & unconfirmed]))
     unconfirmed_ids = slam.landmarks.ids[residuals.rows[unconfirmed]]
     return Reading(
@@ -195,7 +193,7 @@ def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tupl
     well it is seen where it was: landmarks that have moved must not throw the pose, however often
     they are seen.
     """
-    again, staying = _rejected_before(slam, sighting)
+    again, staying = _cost_of_staying(slam, sighting)
     again &= rejected
     is_second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
     new = int(np.sum(rejected & ~again))
@@ -208,7 +206,7 @@ def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tupl
     return causes * _outlier_cost(slam) + same_cause + stayed, causes > 0
 
 
-def _rejected_before(slam: Slam, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
+def _cost_of_staying(slam: Slam, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
     """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
 
     Where they were rejected first is known as well as the sensor tells. No landmark costs more
@@ -243,8 +241,7 @@ def _are_all_near(slam: Slam, residuals: Residuals) -> bool:
 
     This is quickly told, and by all of S they are no further off.
     """
-    k = slam.axes.point
-    own = mahalanobis(residuals.r[:, :k], residuals.covariances[:, :k, :k])
+    own = mahalanobis(*residuals.on(slam.axes))
     return bool((own <= slam.settings.rejection_distance).all())
 
 
@@ -255,11 +252,10 @@ def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:
 
 def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> BoolArray:
     """Return which points (m,) only pass the gate since the state is so uncertain."""
-    k = slam.axes.point
-    r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
+    r, noise = residuals.on(slam.axes)
     far = are_far(r, noise, slam.settings)
     if far.any():
-        far &= far_from_the_others(r, gains.predicted(residuals)[1], noise, slam.settings)
+        far &= far_from_the_others(r, gains.predicted(residuals), noise, slam.settings)
     return far
 
 
@@ -314,8 +310,7 @@ def _with_ids(
 
 def _cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:
     """Return what it costs to take some of m points for the landmarks whose ids they have."""
-    gate, k = slam.settings.rejection_distance, slam.axes.point
-    r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
-    passed, own = gated(r, gains.predicted(residuals)[1], noise, slam.settings)
+    r, noise = residuals.on(slam.axes)
+    passed, own = gated(r, gains.predicted(residuals), noise, slam.settings)
     paired_cost = joint_cost(r[passed], with_blocks(own, noise[passed]), noise[passed])
-    return paired_cost + (m - int(np.sum(passed))) * unpaired_cost(gate)
+    return paired_cost + (m - int(np.sum(passed))) * _outlier_cost(slam)

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from slam_observer_ros.errors import ParameterError
+from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observer import Correction, Observer
@@ -42,6 +43,11 @@ class Residuals:
     a: FloatArray
     covariances: FloatArray
     dt_s: FloatArray
+
+    def on(self, axes: Axes) -> tuple[FloatArray, FloatArray]:
+        """Return r (m, k), metres, and the covariances (m, k, k), m², on estimated axes."""
+        k = axes.point
+        return self.r[:, :k], self.covariances[:, :k, :k]
 
     def select(self, mask: BoolArray) -> Residuals:
         """Return the part of it that ``mask`` (m,) picks."""

@@ -84,11 +84,11 @@ class ConstantGains(GainDesign):
         settings = self._settings
         gain_l = 0.0 if self._is_fixed else settings.gain_l
         k = np.full(len(residuals.r), settings.gain_k)
-        step_on = paper_step if settings.step_mode == 'paper' else centroid_step
-        step = partial(step_on, axes=self._axes)
+        step = paper_step if settings.step_mode == 'paper' else centroid_step
         dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)
         # One time for the pose: were the r_i to act for different ones, L (34) might grow.
-        D = safe_step(step, k, residuals.e, residuals.r, float(np.mean(dt_s)))  # (30)
+        act = partial(step, axes=self._axes)
+        D = safe_step(act, k, residuals.e, residuals.r, float(np.mean(dt_s)))  # (30)
         remaining = se3.transform(D, residuals.e) - residuals.e + residuals.r
         shares = -np.expm1(-gain_l / settings.gain_k * dt_s)
         d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it

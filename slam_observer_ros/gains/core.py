@@ -105,6 +105,7 @@ class Core:
         T[self._places.ravel(), : self._p] = self._axes.turn_matrix(shifts).reshape(-1, self._p)
         eye = np.eye(len(T))
         self.P = _transformed(self.P, eye + T)
+        # (I + T)⁻¹ = I − T: T turns landmarks by the pose, and leaves the pose alone.
         self.leaves.change_core(eye - T, np.zeros_like(T))
 
     def admit(self, rows: IntArray) -> None:

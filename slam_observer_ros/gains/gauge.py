@@ -30,7 +30,7 @@ def gauge_information(J: FloatArray, S: FloatArray) -> FloatArray:
 
 
 def anchor(
-    P: FloatArray, G: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray
+    P: FloatArray, G: FloatArray, columns: IntArray, R: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Bring an estimate of unknown gauge to where known landmarks say that it is.
 
@@ -40,7 +40,7 @@ def anchor(
         (N, N) covariance of the error x.
     G : FloatArray
         (N, d) how x changes when the whole estimate is moved.
-    rows : IntArray
+    columns : IntArray
         (q,) entries of x that are the errors of the known landmarks' coordinates.
     R : FloatArray
         (q, q) covariance of the known landmarks.
@@ -55,8 +55,8 @@ def anchor(
         (N, N) its covariance now.
 
     """
-    J, PH = G[rows], P[:, rows]
-    S = PH[rows] + R + JITTER_M2 * np.eye(len(r))
+    J, PH = G[columns], P[:, columns]
+    S = PH[columns] + R + JITTER_M2 * np.eye(len(r))
     information = gauge_information(J, S)
     gamma = np.linalg.solve(information, J.T @ _solve(S, r))
     K = _solve(S, PH.T).T

@@ -51,11 +51,11 @@ EARLY_SHARE = 0.1
 what is linearised before the next time of looking back is linearised in the wrong place.
 """
 
-ITERATIONS = 2
-"""Steps of looking back at most."""
+ITERATIONS, TOLERANCE = 2, 2e-2
+"""Steps of looking back at most; change of pose and map, rad and m, below which one will do."""
 
-TOLERANCE = 2e-2
-"""Change of pose and map, rad and m, below which one step will do."""
+SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
+"""The same for smoothing everything."""
 
 
 class Hindsight:
@@ -84,7 +84,7 @@ class Hindsight:
     ) -> None:
         self.settings = settings
         self._axes, self._calibration, self._joint = axes, calibration, joint
-        self._noise = ObservationNoise(settings)
+        self._observation_noise = ObservationNoise(settings)
         self._warning = _Warning()
         self._seen = 0
         at_start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), joint.P.copy())
@@ -95,7 +95,7 @@ class Hindsight:
         self._start(self._known(observer), since)
 
     def _start(self, prior: Prior, since: str) -> None:
-        self.history = History(self._axes, self._noise, prior, since)
+        self.history = History(self._axes, self._observation_noise, prior, since)
         self._rest()
 
     def _rest(self) -> None:
@@ -152,7 +152,9 @@ class Hindsight:
             self.history.summarise(known)
 
     def smooth(self, observer: Observer) -> Solution:
-        """Return all estimates in hindsight, iterated from the present ones until nothing moves.
+        """Return all estimates in hindsight, iterated from the present ones.
+
+        Until the last pose, the map and the calibration rest.
 
         Raises
         ------
@@ -163,7 +165,8 @@ class Hindsight:
         history = self.history
         try:
             smoother = Smoother(self._axes, history.prior, history.frames(), self.settings)
-            return smoother.smooth(self._solution_from(0, observer), 50, 1e-6).end
+            start = self._solution_from(0, observer)
+            return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE).end
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
                 'can not smooth: the observations leave some pose or landmark open, or contradict '

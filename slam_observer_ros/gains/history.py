@@ -80,7 +80,7 @@ class History:
         self._calibration = prior.calibration
         self._start: FloatArray | None = None
         self._end = prior.pose
-        self._noise, self._sensitivity = self._at_rest()
+        self._motion_noise, self._sensitivity = self._at_rest()
         # Frames as arrays: those that are summarised, in pieces, and those that are not.
         self._none = no_frames(axes.p, len(prior.calibration), axes.point)
         self._summarised: list[Frames] = []
@@ -114,7 +114,7 @@ class History:
         if self._start is None:
             self._start = path[0].copy()
         self._end = path[-1].copy()  # not a view, which would keep all of the path
-        self._noise = self._noise + noise
+        self._motion_noise = self._motion_noise + noise
         self._sensitivity = self._sensitivity + sensitivity
         self._calibration = calibration
 
@@ -124,14 +124,16 @@ class History:
         self.poses.append(pose)
         start = self._end if self._start is None else self._start
         self._new.append(
-            _Frame(start, self._end, self._noise, self._sensitivity, self._calibration, seen)
+            _Frame(
+                start, self._end, self._motion_noise, self._sensitivity, self._calibration, seen
+            )
         )
         self._start = None
-        self._noise, self._sensitivity = self._at_rest()
+        self._motion_noise, self._sensitivity = self._at_rest()
 
     def summarise(self, known: Prior) -> None:
         """Take ``known`` for all that the frames up to now tell."""
-        self._summarised.append(self._with_new())
+        self._summarised.append(self._gathered())
         self._latest = self._none
         self.summary = known
         self.summarised = len(self.stamps_ns)
@@ -165,14 +167,14 @@ class History:
 
     def frames(self) -> Frames:
         """Return all frames."""
-        return joined([*self._summarised, self._with_new()])
+        return joined([*self._summarised, self._gathered()])
 
     def latest_frames(self) -> Frames:
         """Return the frames that are not summarised, numbered anew."""
-        latest = self._with_new()
+        latest = self._gathered()
         return replace(latest, frames=latest.frames - self.summarised)
 
-    def _with_new(self) -> Frames:
+    def _gathered(self) -> Frames:
         """Return the frames that are not summarised."""
         if self._new:
             first = self.summarised + len(self._latest.motions)
@@ -183,7 +185,7 @@ class History:
     def _change(self, change: Callable[[Frames], Frames]) -> None:
         """Change what was seen in the frames."""
         self._summarised = [change(frames) for frames in self._summarised]
-        self._latest = change(self._with_new())
+        self._latest = change(self._gathered())
 
     def _as_arrays(self, frames: list[_Frame], first: int) -> Frames:
         """Return frames as arrays; ``first`` is the number of the first one."""

@@ -125,7 +125,7 @@ class Leaves:
         self._sizes[CORE] += len(rows)
         self._group[rows] = CORE
         self._F[rows], self._N[rows], self._shifts[rows] = F, 0.0, 0.0
-        self._x[CORE] *= 1.0 - F.sum(axis=(0, 1))  # no move of their entries is put off by now
+        self._x[CORE, F.any(axis=(0, 1))] = 0.0  # no move of their entries is put off by now
 
     def release(self, rows: IntArray) -> None:
         """Let landmarks leave the core; they hang on those entries of z which they were."""

@@ -96,29 +96,32 @@ class RiccatiGains(GainDesign):
 
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each point was given."""
-        k, P = self._axes.point, self._joint.P
-        r, noise = residuals.r[:, :k], residuals.covariances[:, :k, :k]
-        weights = observation_weights(r, self.predicted(residuals)[1], noise, self._settings)
+        P, (r, noise) = self._joint.P, residuals.on(self._axes)
+        weights = observation_weights(r, self.predicted(residuals), noise, self._settings)
         passed = weights > 0.0
         used = residuals.select(passed)
         CP, CPC = self._project(used)
         share = weights[passed] / repetition_factors(
             used.dt_s, self._settings.observation_error_time
         )
-        S = with_blocks(CPC, used.covariances[:, :k, :k] / share[:, None, None])
+        S = with_blocks(CPC, noise[passed] / share[:, None, None])
         K = solve(S, CP).T
         half = K @ (0.5 * S @ K.T - CP)
         P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
-        return self._as_correction(-K @ used.r[:, :k].ravel()), weights
+        return self._as_correction(-K @ r[passed].ravel()), weights
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
-        k = self._axes.point
-        columns = self._joint.columns(residuals.rows).reshape(-1, k)
+        r, noise = residuals.on(self._axes)
+        columns = self._joint.columns(residuals.rows).reshape(r.shape)
         _, CPC = self._output_covariances(self._chord_output(residuals), columns)
-        return mahalanobis(residuals.r[:, :k], CPC + residuals.covariances[:, :k, :k])
+        return mahalanobis(r, CPC + noise)
 
-    def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+    def predicted(self, residuals: Residuals) -> FloatArray:
+        """Return the covariance (m k, m k) of m residuals but for the noise of the points, m²."""
+        return self.predicted_with_pose(residuals)[1]
+
+    def predicted_with_pose(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return what the state predicts of m residuals, as it is to judge them by.
 
         Returns

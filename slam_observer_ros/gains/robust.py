@@ -106,11 +106,12 @@ def huber_weights(
     Parameters
     ----------
     pull : FloatArray
-        (m, k) S⁻¹ r. What is left is R S⁻¹ r, at the distance √(pullᵀ R pull) from zero.
+        (m, k) S⁻¹ r, with R = Σ/w in S. What is left is R S⁻¹ r, by the sensor's own Σ at the
+        distance √(pullᵀ Σ pull)/w from zero.
     noise : FloatArray
-        (m, k, k) covariances of the observations, m².
+        (m, k, k) covariances Σ of the observations, m².
     weights : FloatArray
-        (m,) weights that were used, by which these covariances were divided to have R.
+        (m,) weights w that were used.
     threshold : float
         Distance from which on an observation weighs less; with 0 all weigh the same.
 

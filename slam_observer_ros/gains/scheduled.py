@@ -131,15 +131,17 @@ class ScheduledGains(GainDesign):
         x, P = anchor(P, G, known, R, r[:, :k].ravel())
 
         self._core.P = P[:q, :q]
-        J -= F[:, :, :p]
-        shifts = F @ x[z] + J @ x[gamma]
+        # γ = B z + ζ, so ã_i = F_i z + (J_i − F_i) γ + η_i hangs on z by F_i + (J_i − F_i) B.
+        J_gamma = J - F[:, :, :p]
+        errors = F @ x[z] + J_gamma @ x[gamma]
         B, left = regression(P, gamma, z)
-        F, N = F + J @ B, N + J @ left @ transpose(J)
-        shifts[rows] = x[known].reshape(m, k)
+        F, N = F + J_gamma @ B, N + J_gamma @ left @ transpose(J_gamma)
+        # Known landmarks were estimated themselves: they hang on z as P has it.
+        errors[rows] = x[known].reshape(m, k)
         B, left = regression(P, known, z)
         F[rows] = B.reshape(m, k, q)
         N[rows] = symmetric(left.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)])
-        shifts = -self._axes.full_points(shifts.ravel())
+        shifts = -self._axes.full_points(errors.ravel())
         F[:, :, :p] += self._axes.turn_matrix(shifts)
         self._leaves.update(everything, F, N)
         return self._as_correction(everything, -x[z], shifts, observer.a)
@@ -185,16 +187,16 @@ class ScheduledGains(GainDesign):
             weights[passed] = huber_weights(pull[passed, :, 0], R[passed], share, threshold)
             if (weights[passed] == 1.0).all():
                 break
-        shifts = self._axes.full_points((F @ x + N @ pull).ravel())
+        Delta, delta = x[:, 0], self._axes.full_points((F @ x + N @ pull).ravel())
         F = F + N @ gain_k @ H
-        F[:, :, : self._axes.p] += self._axes.turn_matrix(shifts)
+        F[:, :, : self._axes.p] += self._axes.turn_matrix(delta)
         N[passed] = symmetric(N[passed] @ gain_k[passed] @ noise)  # = N − N k N, but positive
         self._core.shrink(H[passed], gain_k[passed])
-        self._leaves.shift(x[:, 0])
+        self._leaves.shift(Delta)
         self._leaves.update(rows, F, N)
-        self._core.turn(x[:, 0])
+        self._core.turn(Delta)
         self._core.admit(rows[passed])
-        return self._as_correction(rows, x[:, 0], shifts, residuals.a), weights
+        return self._as_correction(rows, Delta, delta, residuals.a), weights
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""

@@ -3,8 +3,8 @@
 The paper writes A p̄ for points and A v⃗ for directions; here these are `se3.transform` and
 `se3.rotate`. All functions take n = 0, 1 or many landmarks and any leading axes.
 
-Of these the package only uses `exp`, at each correction by Riccati gains. The rest is what the
-paper states; tests hold :class:`slam_observer_ros.observer.Observer` against it.
+Of these the package only uses `exp`, at each correction by Riccati gains that map. The rest is
+what the paper states; tests hold :class:`slam_observer_ros.observer.Observer` against it.
 """
 
 from __future__ import annotations

@@ -87,15 +87,17 @@ class BaseFrame:
     Raises
     ------
     ParameterError
-        If an angle of ``sensor_pose`` is beyond 2π, as those in degrees are.
+        If the map's frame has no name, or an angle of ``sensor_pose`` is beyond 2π, as those in
+        degrees are.
 
     """
 
     def __init__(self, settings: InputSettings, transforms: TransformSource) -> None:
+        settings = settings.with_plain_frames()
         self._transforms = transforms
         self.name = settings.base_frame
-        self._map_frame = settings.map_frame.lstrip('/')
-        self._world_frames = {self._map_frame, settings.odom_frame.lstrip('/')} - {''}
+        self._map_frame = settings.map_frame
+        self._world_frames = {self._map_frame, settings.odom_frame} - {''}
         self._sensor_frame = settings.sensor_frame
         self._tag_frame_prefix = settings.tag_frame_prefix
         self._sensor_pose: FloatArray | None = None

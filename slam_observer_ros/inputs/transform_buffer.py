@@ -13,7 +13,7 @@ import logging
 import numpy as np
 
 from slam_observer_ros.errors import TransformError
-from slam_observer_ros.event_queue import AGREEING_STAMPS, NEAR_NS
+from slam_observer_ros.events import AGREEING_STAMPS, NEAR_NS
 from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s

@@ -24,6 +24,11 @@ from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 ROUNDING = 1e-14
 """Least variance that can be told from zero, as a share of the sum of all variances."""
 
+NEWS = 0.1
+"""Share of the observations that is new when the same landmarks are compared with a map again:
+with many of them that takes long, and a single further observation seldom decides it.
+"""
+
 CONFIRMING_VOTES = 10
 """Observations that confirm a place that was told."""
 
@@ -88,6 +93,21 @@ def is_lost(slam: Slam) -> bool:
     return bool(not slam.is_mapping and slam.rejected_in_a_row >= often and moved >= needed)
 
 
+class PlaceSearch:
+    """When a map is worth comparing with what was seen: it takes long, and seldom tells more."""
+
+    def __init__(self) -> None:
+        self._observations = self._compared_at = self._shared = 0
+
+    def tell(self, shared: int) -> bool:
+        """Count an observation; return whether to compare, now that ``shared`` landmarks are."""
+        self._observations += 1
+        if shared == self._shared and self._observations < (1.0 + NEWS) * self._compared_at:
+            return False
+        self._shared, self._compared_at = shared, self._observations
+        return True
+
+
 class PoseTrial:
     """A place in a map that someone has told, on trial until landmarks of the map confirm it.
 
@@ -106,7 +126,7 @@ class PoseTrial:
         self._ids = known.ids
         self._for = self._against = 0
 
-    def is_contradicted(self, outcome: Outcome, often: int) -> bool:
+    def vote(self, outcome: Outcome, often: int) -> bool:
         """Count the vote of an observation; return whether ``often`` ones say it is wrong."""
         if self._for >= CONFIRMING_VOTES and self._for > self._against:
             return False
@@ -175,8 +195,12 @@ def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
     r = observer.points[rows] - targets
     observer.correct(slam.gains.anchor(observer, rows, r, covariances))
     slam.gains.settle(observer)
-    # A surveyed landmark needs no observation to be believed.
-    slam.landmarks.counts[rows] += np.maximum(known.counts, slam.settings.confirmations)
+    slam.landmarks.counts[rows] += _counts(known, slam)
+
+
+def _counts(known: LandmarkMap, slam: Slam) -> IntArray:
+    """Return how often landmarks of a map count as seen: a surveyed one is believed at once."""
+    return np.asarray(np.maximum(known.counts, slam.settings.confirmations))
 
 
 def _renumber(slam: Slam, known: LandmarkMap) -> None:
@@ -194,8 +218,7 @@ def _complete(slam: Slam, known: LandmarkMap) -> None:
     y_ref, covariances = _in_reference_frame(slam, new)
     observer.add_reference_landmarks(y_ref)
     observer.rebase(observer.points)
-    # A surveyed landmark needs no observation to be believed.
-    slam.landmarks.add_known(new.ids, np.maximum(new.counts, settings.confirmations))
+    slam.landmarks.add_known(new.ids, _counts(new, slam))
     slam.is_mapping = settings.localization_mode == 'off'
     if settings.localization_mode == 'fixed':
         _fix(slam, known)

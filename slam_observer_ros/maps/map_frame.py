@@ -14,6 +14,7 @@ from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.localisation import (
     enter_map,
     is_lost,
+    PlaceSearch,
     PoseTrial,
     shape_covariances,
     start_in_map,
@@ -31,11 +32,6 @@ GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 
 MOVING_SPEED = 0.1
 """Speed from which on a landmark is left out of a map, m/s; slower ones may be at rest."""
-
-NEWS = 0.1
-"""Share of the observations that is new when the same landmarks are compared with a map again:
-with many of them that takes long, and a single further observation seldom decides it.
-"""
 
 
 class MapFrame:
@@ -69,7 +65,7 @@ class MapFrame:
         self._start_pose: FloatArray | None = None
         # By somebody, so that the settings don't say any more where it is.
         self._is_placed = False
-        self._begin_search()
+        self._search = PlaceSearch()
         is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
         if is_given and not settings.set_initial_pose:
             logger.warning(
@@ -142,7 +138,7 @@ class MapFrame:
         self._counts += self.slam.counts
         slam = Slam(self.settings, np.eye(4) if pose is None else self._allowed(pose))
         self.states = Hypotheses(slam)
-        self._begin_search()
+        self._search = PlaceSearch()
         self.is_localised = self.loaded is None or pose is not None
         self._trial = None
         if self.loaded is not None and pose is not None:
@@ -164,7 +160,7 @@ class MapFrame:
         self.loaded = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
         self.is_localised = False
         self._trial = None
-        self._begin_search()
+        self._search = PlaceSearch()
         if pose is not None:
             self.set_pose(pose, covariance)
         elif self.settings.set_initial_pose and not (has_begun or self._is_placed):
@@ -196,12 +192,13 @@ class MapFrame:
         if self.loaded is None:
             return
         often = self.settings.max_rejections
-        if self._trial is not None and self._trial.is_contradicted(outcome, often):
+        if self._trial is not None and self._trial.vote(outcome, often):
             self._search_anew('Most landmarks contradict the pose that was told')
         elif self.is_localised and is_lost(self.slam):
             self._search_anew('All landmarks are far from where they should be')
         if not self.is_localised:
-            if self._is_news(self.loaded):
+            shared = int(np.sum(self.slam.landmarks.rows_of(self.loaded.ids) >= 0))
+            if self._search.tell(shared):
                 self._enter()
             self._counts['not_localised'] += not self.is_localised
 
@@ -209,18 +206,6 @@ class MapFrame:
         logger.warning('%s; localising anew.', why)
         self._counts['lost'] += 1
         self._start(None)
-
-    def _begin_search(self) -> None:
-        self._shared = self._searched = self._compared = 0
-
-    def _is_news(self, known: LandmarkMap) -> bool:
-        """Return whether another of the map's landmarks was seen, or all for much longer."""
-        shared = int(np.sum(self.slam.landmarks.rows_of(known.ids) >= 0))
-        self._searched += 1
-        if shared == self._shared and self._searched < (1.0 + NEWS) * self._compared:
-            return False
-        self._shared, self._compared = shared, self._searched
-        return True
 
     def _enter(self) -> None:
         """Move the states into the frame of the loaded map, if the landmarks seen suffice."""

@@ -216,7 +216,7 @@ def _record_type(
         if field.offset + np.dtype(numpy_type).itemsize > point_step:
             raise MessageError(f'field {field.name} lies beyond point_step {point_step}')
         formats[field.name] = (numpy_type, field.offset)
-    _require_whole_groups(formats.keys() | set())
+    _require_whole_groups(set(formats))
     return np.dtype(
         {
             'names': list(formats),

@@ -97,7 +97,7 @@ class Calibration:
         return to_ns(float(self._all[DELAY]))
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
-        """Return (k, 6) velocities (1 + s) ∘ V + b."""
+        """Return velocities (…, 6) as (1 + s) ∘ V + b."""
         return body_velocities * self._all[:6] + self._all[6:DELAY]
 
     def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:

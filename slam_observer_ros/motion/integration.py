@@ -20,8 +20,8 @@ def transition(
 ) -> FloatArray:
     """Return exp(V_1 dt_1) … exp(V_k dt_k) (4, 4), how the body moves from stamp to stamp."""
     held = _held(velocities, calibration, start_ns, end_ns)
-    transition: FloatArray = _path(np.eye(4), held, calibration)[-1]
-    return transition
+    end: FloatArray = _path(np.eye(4), held, calibration)[-1]
+    return end
 
 
 def transition_covariance(

@@ -1,4 +1,4 @@
-"""A motion between two observations, as a gain design is given it."""
+"""A motion of the robot, as a gain design is given it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from slam_observer_ros.types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion since the last observation, in k pieces of held velocity.
+    """Motion from one instant of the state to the next, in k pieces of held velocity.
 
     Attributes
     ----------

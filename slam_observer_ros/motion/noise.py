@@ -80,7 +80,10 @@ class MotionNoise(Immutable):
 
 
 def _white_s(held: HeldVelocities) -> FloatArray:
-    """Return what the variances (k, 6) of motions are, over their density: dt, or more of it."""
+    """Return what the variances of motions are, over their density: dt, or more of it.
+
+    (k, 6), or (k, 1) where it is one for all axes.
+    """
     dt_s = held.dt_s[:, None]
     until_s = held.before_s + dt_s
     if not (until_s > held.usual_s).any():  # as nearly always

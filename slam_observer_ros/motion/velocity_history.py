@@ -62,13 +62,13 @@ class HeldVelocities:
         """Return k = len(gap_s) pieces of time in which no velocity is known."""
         k = len(gap_s)
         return cls(
-            np.zeros((k, 6)),
-            np.zeros((k, 6, 6)),
-            np.zeros((k, 2), dtype=np.bool_),
-            np.zeros(k),
-            gap_s,
-            np.zeros((k, 2)),
-            np.full(2, np.inf),
+            body_velocities=np.zeros((k, 6)),
+            covariances=np.zeros((k, 6, 6)),
+            is_stated=np.zeros((k, 2), dtype=np.bool_),
+            dt_s=np.zeros(k),
+            gap_s=gap_s,
+            before_s=np.zeros((k, 2)),
+            usual_s=np.full(2, np.inf),
         )
 
     def with_gaps_apart(self) -> HeldVelocities:
@@ -77,13 +77,13 @@ class HeldVelocities:
         rows = np.repeat(np.arange(len(has_gap)), 1 + has_gap)
         is_gap = np.append(False, rows[1:] == rows[:-1]) | (self.dt_s[rows] == 0.0)
         return HeldVelocities(
-            self.body_velocities[rows],
-            self.covariances[rows],
-            self.is_stated[rows],
-            np.where(is_gap, 0.0, self.dt_s[rows]),
-            np.where(is_gap, self.gap_s[rows], 0.0),
-            self.before_s[rows],
-            self.usual_s,
+            body_velocities=self.body_velocities[rows],
+            covariances=self.covariances[rows],
+            is_stated=self.is_stated[rows],
+            dt_s=np.where(is_gap, 0.0, self.dt_s[rows]),
+            gap_s=np.where(is_gap, self.gap_s[rows], 0.0),
+            before_s=self.before_s[rows],
+            usual_s=self.usual_s,
         )
 
     def averaged(self, window_s: float) -> FloatArray:
@@ -162,13 +162,13 @@ class VelocityHistory:
         rows, begins, stops, ends = self._pieces(start_ns, end_ns)
         joined = self._written()
         held = HeldVelocities(
-            self._counting(joined.body_velocities[rows]),
-            joined.covariances[rows],
-            joined.is_stated[rows],
-            to_s(stops - begins),
-            to_s(ends - stops),
-            to_s(begins[:, None] - joined.since_ns[rows]),
-            self._usual_s(),
+            body_velocities=self._counting(joined.body_velocities[rows]),
+            covariances=joined.covariances[rows],
+            is_stated=joined.is_stated[rows],
+            dt_s=to_s(stops - begins),
+            gap_s=to_s(ends - stops),
+            before_s=to_s(begins[:, None] - joined.since_ns[rows]),
+            usual_s=self._usual_s(),
         )
         return held.with_gaps_apart() if held.gap_s.any() else held
 

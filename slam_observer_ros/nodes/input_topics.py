@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.inputs.settings import AUTO, ON_TF
+from slam_observer_ros.inputs.settings import AUTO, ON_TF, POSE_DIFFERENCES
 from slam_observer_ros.messages.detections import (
     decode_apriltags,
     decode_pose_array,
@@ -59,7 +59,7 @@ def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> l
 
 def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
     qos = _qos(settings.twist_qos, settings.queue_depth)
-    if settings.velocity_source == 'pose_differences':
+    if settings.velocity_source == POSE_DIFFERENCES:
         if settings.velocity_type not in (AUTO, 'Odometry'):
             raise ParameterError(
                 f"velocity_type '{settings.velocity_type}' has no poses: with velocity_source "

@@ -26,16 +26,15 @@ class Sighting:
     Attributes
     ----------
     event : ObservationEvent
-        The observation without points that have no id, or are of no landmark that is mapped.
+        The observation; where nothing is added to the map, without what is not in it.
     rows : IntArray
         (m,) row of the landmark that each of them is, −1 where it is new.
     covariances : FloatArray
         (m, 3, 3) their covariances, body frame, m².
     residuals : Residuals
         Of those that are not new.
-    left_out : dict
-        How many points of the observation are not in ``event``, by the reason: ``'unknown_id'``,
-        ``'unmapped_landmark'``.
+    left_out : int
+        How many points of the observation are not in ``event``.
 
     """
 
@@ -43,7 +42,7 @@ class Sighting:
     rows: IntArray
     covariances: FloatArray
     residuals: Residuals
-    left_out: dict[str, int]
+    left_out: int
 
     @property
     def known(self) -> BoolArray:
@@ -105,9 +104,7 @@ class Outlook:
         self._observer, self._landmarks, self._noise = observer, landmarks, noise
         self._settings = settings
 
-    def sighting(
-        self, event: ObservationEvent, rows: IntArray, left_out: dict[str, int]
-    ) -> Sighting:
+    def sighting(self, event: ObservationEvent, rows: IntArray, left_out: int) -> Sighting:
         """Return what the points of ``event`` tell, of landmarks ``rows`` (m,)."""
         known, covariances = rows >= 0, self.covariances(event, rows)
         residuals = self.residuals(event.select(known), rows[known], covariances[known])
@@ -120,12 +117,12 @@ class Outlook:
         observer = self._observer
         e, r = observer.errors(rows, event.points)
         return Residuals(
-            rows,
-            e,
-            r,
-            observer.a[rows],
-            observer.turned(covariances),
-            self._landmarks.unseen_s(rows, event.stamp_ns),
+            rows=rows,
+            e=e,
+            r=r,
+            a=observer.a[rows],
+            covariances=observer.turned(covariances),
+            dt_s=self._landmarks.unseen_s(rows, event.stamp_ns),
         )
 
     def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from slam_observer_ros.estimates import Smoothed
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.geometry import se3
@@ -187,19 +187,20 @@ class Slam:
 
         It moves landmarks whose gains had put that off.
         """
-        m, event = len(event.ids), event.select(event.ids != UNKNOWN_ID)
-        left_out = {'unknown_id': m - len(event.ids)}
-        rows = self.landmarks.rows_of(event.ids)
-        known = rows >= 0
+        m, rows = len(event.ids), self.landmarks.rows_of(event.ids)
         if not self.is_mapping:
-            left_out['unmapped_landmark'] = int(np.sum(~known))
-            event, rows, known = event.select(known), rows[known], known[known]
-        self.gains.recall(self.observer, rows[known])
-        return self._outlook.sighting(event, rows, left_out)
+            event, rows = self._mapped(event)
+        self.gains.recall(self.observer, rows[rows >= 0])
+        return self._outlook.sighting(event, rows, m - len(event.ids))
+
+    def _mapped(self, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
+        """Return the part of an observation that is of known landmarks, and their rows."""
+        rows = self.landmarks.rows_of(event.ids)
+        return event.select(rows >= 0), rows[rows >= 0]
 
     def observe(self, sighting: Sighting) -> Outcome:
         """Use what :meth:`look` has returned for an observation; return what was made of it."""
-        self.counts.update(sighting.left_out)
+        self.counts['unmapped_landmark'] += sighting.left_out
         event, rows, known = sighting.event, sighting.rows, sighting.known
         forgotten = self._in_the_way(sighting)
         if len(forgotten):
@@ -210,8 +211,7 @@ class Slam:
         if not known.all():
             self._forget(forgotten, 'forgotten_landmark')
             self._initialise(event.select(~known), sighting.covariances[~known])
-            rows = self.landmarks.rows_of(event.ids)
-            event, rows = event.select(rows >= 0), rows[rows >= 0]
+            event, rows = self._mapped(event)
         moved_ids = self._look_back(event, rows)
         self._note_velocities(event, rows)
         return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
@@ -221,8 +221,7 @@ class Slam:
 
         Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
         """
-        rows = self.landmarks.rows_of(event.ids)
-        event, rows = event.select(rows >= 0), rows[rows >= 0]  # one may have made room
+        event, rows = self._mapped(event)  # one may have made room
         noise = self.observation_noise.covariances(event)
         self.landmarks.reject(rows, *self._outlook.places(event.points, noise))
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping

@@ -66,14 +66,14 @@ class Surroundings:
         everything = np.arange(len(landmarks))
         seen = landmarks.last_seen_ns == event.stamp_ns
         in_view = seen | self._field_of_view.contains(self._observer.body_points(everything))
-        is_strange = not some_have_ids and self._is_strange(event, in_view, seen)
+        is_strange = not some_have_ids and self._add_surprise(event, in_view, seen)
         rows = np.flatnonzero(is_numbered & in_view)
         landmarks.note_in_view(rows, seen[rows])
         self._field_of_view.include(event.points)
         return is_strange
 
-    def _is_strange(self, event: ObservationEvent, in_view: BoolArray, seen: BoolArray) -> bool:
-        """Return whether those in view and not seen (n,) are too many, for too long."""
+    def _add_surprise(self, event: ObservationEvent, in_view: BoolArray, seen: BoolArray) -> bool:
+        """Count those in view and not seen (n,); return whether they are too many, too long."""
         landmarks = self._landmarks
         numbers = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
         old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)

@@ -108,7 +108,7 @@ class Solution:
     calibration : FloatArray
         (c,) calibration of the velocity.
     points : FloatArray
-        (n, 3) landmarks, metres; of those that move, where they would be had they not.
+        (n, 3) landmarks, metres.
 
     """
 
@@ -166,7 +166,8 @@ class Smoother:
     def smooth(self, start: Solution, iterations: int, tolerance: float) -> Step:
         """Iterate from ``start``; return the last step.
 
-        That is one which moves neither the last pose nor the border by ``tolerance`` (m, rad).
+        That is the first which moves neither the last pose nor the border by ``tolerance`` (m,
+        rad), or the last of ``iterations``.
         """
         for _ in range(iterations):
             factors = Factors(self._linearise(start))

@@ -53,7 +53,7 @@ class Prior:
         y = se3.transform(se3.inverse(self.pose), self.points)
         C, R = axes.output_matrix(y).reshape(-1, d), self.pose[:k, :k]
         covariance = self.covariance.copy()
-        for rows in (covariance, covariance.T):
+        for rows in (covariance, covariance.T):  # a view: its rows are the columns
             rows[first:] = _turned(rows[first:], R.T) - C @ rows[:d]
         return replace(self, covariance=covariance, is_relative=True)
 
