@@ -24,7 +24,7 @@ from slam_observer_ros.association.joint_compatibility import (
     MAX_PARTIAL,
     Pairs,
 )
-from slam_observer_ros.association.readings import readings
+from slam_observer_ros.association.readings import are_one, readings
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -238,6 +238,43 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     assert np.sqrt(estimator.pose_covariance[2, 2]) < 0.2 * in_doubt_rad
     assert_array_equal(estimator.landmark_ids, known)
     assert_allclose(estimator.world_points, posts, atol=0.1)
+
+
+def test_of_two_places_the_one_is_given_up_where_more_should_have_been_seen():
+    """A lone post, and one as far with another behind it; odometry says that it is that one."""
+    settings = replace(PLANAR, angular_velocity_noise=(0.0, 0.0, 0.1), confirmations=1)
+    posts = np.array([[5.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.6, 4.8, 0.0]])
+    estimator, turn_rad = Estimator(settings), -np.arctan2(4.0, 3.0)
+    for step in range(20):
+        stand(estimator, 0.1 * step)
+        observe(estimator, 0.1 * step, posts)
+    for step in range(20, 120):
+        stand(estimator, 0.1 * step)  # at rest, it says; the robot turns to the right
+    turned = se3.exp(np.array([0.0, 0.0, turn_rad, 0.0, 0.0, 0.0]))
+    seen = se3.transform(se3.inverse(turned), posts)[:1]
+    stand(estimator, 12.0)
+    observe(estimator, 12.0, seen)
+    assert_allclose(estimator.pose, np.eye(4), atol=0.1)
+    for step in range(121, 150):
+        stand(estimator, 0.1 * step)
+        observe(estimator, 0.1 * step, seen)
+    assert_allclose(estimator.pose, turned, atol=0.1)
+
+
+def test_states_that_took_two_look_alikes_for_each_other_are_one_where_their_maps_agree():
+    estimator = Estimator(replace(SPATIAL, confirmations=1))
+    stand(estimator, 0.0)
+    points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    observe(estimator, 0.0, points, [4, 5])
+    slam = estimator._slam
+    event = ObservationEvent(0, np.array([4, 5]), points)
+    swapped = replace(event, ids=event.ids[::-1])
+    other, elsewhere = deepcopy(slam), deepcopy(slam)
+    assert are_one(slam, event, other, swapped)
+    other.observer.relocate_landmarks(np.array([1]), points[1:] + 1.0)
+    assert not are_one(slam, event, other, swapped), 'each has a point where the other has none'
+    elsewhere.observer.A = elsewhere.observer.A @ se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
+    assert not are_one(slam, event, elsewhere, swapped), 'the robot is 1 m off'
 
 
 def test_one_hypothesis_at_most_if_no_more_are_wanted():
@@ -562,7 +599,25 @@ def test_before_it_is_known_where_a_sensor_looks_no_place_is_strange_to_it():
         straight_ahead = ObservationEvent(
             look, np.array([UNKNOWN_ID]), np.array([[1.0, 0.0, 0.0]])
         )
-        assert not surroundings.note(straight_ahead, some_have_ids=False)
+        assert surroundings.note(straight_ahead, some_have_ids=False) == (0.0, False)
+
+
+@pytest.mark.parametrize('misses', [1, 5, 40])
+def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_soon_no_more(misses):
+    """After k looks that miss it 2 ln(1 + k p): for the first one much, by and by little."""
+    observer, landmarks, share = Observer(np.eye(4)), looked_at([], [], 10, 5), 0.5
+    observer.add_reference_landmarks(np.array([[2.0, 0.0, 0.0]]))
+    surroundings = Surroundings(observer, landmarks, 2)
+    ahead = 4.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]])
+    others = ObservationEvent(10, np.full(2, UNKNOWN_ID), ahead)
+    landmarks.note_in_view = lambda rows, seen: None  # so that the share stays
+    costs = [surroundings.note(others, some_have_ids=False)[0]]
+    for landmarks.missed[0] in range(misses):
+        costs.append(surroundings.note(others, some_have_ids=False)[0])
+    assert costs[0] == 0.0, 'before anything was seen it is not known where the sensor looks'
+    assert_allclose(sum(costs), 2.0 * np.log1p(misses * share))
+    landmarks.last_seen_ns[0] = others.stamp_ns
+    assert surroundings.note(others, some_have_ids=False)[0] == 0.0
 
 
 def test_a_landmark_that_was_given_its_id_needs_no_support_any_more():

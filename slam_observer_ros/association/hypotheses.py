@@ -13,6 +13,7 @@ from collections import Counter
 from copy import deepcopy
 from dataclasses import dataclass, replace
 import math
+from operator import attrgetter
 
 import numpy as np
 
@@ -41,11 +42,12 @@ from slam_observer_ros.types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class _Followed:
-    """A state after an observation, what it took that for, and what it made of it."""
+    """A state after an observation, what it took that for, what it made of it, and its cost."""
 
     slam: Slam
     reading: Reading
     outcome: Outcome
+    cost: float
 
 
 class Hypotheses:
@@ -156,28 +158,29 @@ class Hypotheses:
         for number, reading in possible:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
-            state = _Followed(slam, reading, self._follow(slam, reading, event))
+            state = self._follow(slam, reading, event)
             if not any(_are_one(state, other) for other in followed):
                 followed.append(state)
             if len(followed) == self._limit:
                 break
-        least = followed[0].reading.cost
-        self._costs = [state.reading.cost - least for state in followed]
+        followed.sort(key=attrgetter('cost'))
+        self._costs = [state.cost - followed[0].cost for state in followed]
         self._states = [state.slam for state in followed]
         return followed[0].outcome
 
-    def _follow(self, slam: Slam, reading: Reading, event: ObservationEvent) -> Outcome:
-        """Let a state use an observation as one reading has it; return what it makes of it."""
+    def _follow(self, slam: Slam, reading: Reading, event: ObservationEvent) -> _Followed:
+        """Let a state use an observation as one reading has it; return what comes of it."""
         slam.landmarks.renumber(reading.named_rows, reading.names)
         if reading.has_slipped:
             slip(slam, slam.look(reading.event))
         outcome = slam.observe(slam.look(reading.event))
         if reading.disbelieved is not None:
             slam.disbelieve(reading.disbelieved)
+        cost = reading.cost
         if (event.ids == UNKNOWN_ID).any():
-            slam.note_surroundings(reading.event, self._some_have_ids)
+            cost += slam.note_surroundings(reading.event, self._some_have_ids)
         slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
-        return outcome
+        return _Followed(slam, reading, outcome, cost)
 
     def _possible(self, event: ObservationEvent) -> list[tuple[int, Reading]]:
         """Return what each state may take an observation for, by the number of the state.
@@ -207,5 +210,7 @@ def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
 
 def _are_one(state: _Followed, other: _Followed) -> bool:
     """Return whether two states have the robot and the landmarks seen at the same places."""
-    same_ids = np.array_equal(state.reading.event.ids, other.reading.event.ids)
-    return same_ids and are_one(state.slam, other.slam, state.reading.event)
+    event, other_event = state.reading.event, other.reading.event
+    if not np.array_equal(event.points, other_event.points):  # one leaves some out
+        return False
+    return are_one(state.slam, event, other.slam, other_event)

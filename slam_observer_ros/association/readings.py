@@ -259,12 +259,25 @@ def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> BoolArra
     return far
 
 
-def are_one(slam: Slam, other: Slam, event: ObservationEvent) -> bool:
-    """Return whether two states have the robot at one place, as far as the points seen tell."""
+def are_one(
+    slam: Slam, event: ObservationEvent, other: Slam, other_event: ObservationEvent
+) -> bool:
+    """Return whether two states, by the same m points seen, are at one place with one map there.
+
+    That is so if they have the points, and each landmark that either takes one of them for, at
+    the same places: which was which this once does not matter then.
+    """
     here, there = slam.observer.pose, other.observer.pose
-    shifts = se3.transform(here, event.points) - se3.transform(there, event.points)
     noise = here[:3, :3] @ slam.observation_noise.covariances(event) @ here[:3, :3].T
-    return len(shifts) > 0 and bool(np.max(mahalanobis(shifts, noise)) <= RESOLUTION)
+    shifts = [se3.transform(here, event.points) - se3.transform(there, event.points)]
+    if not np.array_equal(event.ids, other_event.ids):
+        for ids in (event.ids, other_event.ids):
+            rows, other_rows = slam.landmarks.rows_of(ids), other.landmarks.rows_of(ids)
+            if (rows < 0).any() or (other_rows < 0).any():
+                return False
+            shifts.append(slam.world_points[rows] - other.world_points[other_rows])
+    distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
+    return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)
 
 
 def _named(

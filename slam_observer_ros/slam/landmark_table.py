@@ -23,6 +23,7 @@ _COLUMNS = (
     'seen_before_ns',
     'tentative',
     'in_view',
+    'missed',
 )
 
 
@@ -47,6 +48,8 @@ class LandmarkTable:
         (n,) which have no id of their own, and have yet to be seen often enough to stay.
     in_view : IntArray
         (n,) in how many observations without ids each was in view.
+    missed : IntArray
+        (n,) in how many of these since the latest one that saw it.
 
     """
 
@@ -58,6 +61,7 @@ class LandmarkTable:
         self.seen_before_ns: IntArray = np.empty(0, dtype=np.int64)
         self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
         self.in_view: IntArray = np.empty(0, dtype=np.int64)
+        self.missed: IntArray = np.empty(0, dtype=np.int64)
         self.rejected_at: FloatArray = np.empty((0, 3))
         self._settled_in_view = 0
         self._settled_seen = 0
@@ -160,6 +164,7 @@ class LandmarkTable:
         self._settled_in_view += int(np.sum(settled))
         self._settled_seen += int(np.sum(settled & seen))
         self.in_view[rows] += 1
+        self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
 
     @property
     def seen_share(self) -> float:
@@ -193,6 +198,7 @@ class LandmarkTable:
         self.rejections[rows] = 0
         self.tentative[rows] = is_automatic(self.ids[rows])
         self.in_view[rows] = 0
+        self.missed[rows] = 0
 
     def remove(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""

@@ -267,16 +267,20 @@ class Slam:
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
 
-    def note_surroundings(self, event: ObservationEvent, some_have_ids: bool) -> None:
+    def note_surroundings(self, event: ObservationEvent, some_have_ids: bool) -> float:
         """Count what was in view of an observation of landmarks without an id.
+
+        Return −2 ln of the probability that what was not seen of it was not.
 
         Those that were seen too seldom while they were in view are forgotten; out of view none
         is: it may be the only tie to what was mapped before. Parameters are those of
         :meth:`.Surroundings.note`.
         """
-        self.counts['strange_place'] += self._surroundings.note(event, some_have_ids)
+        cost, is_strange = self._surroundings.note(event, some_have_ids)
+        self.counts['strange_place'] += is_strange
         unsupported = self.landmarks.unsupported(self.settings.min_support)
         self._forget(unsupported, 'unsupported_landmark')
+        return cost
 
     def _forget(self, rows: IntArray, why: str) -> None:
         if len(rows):

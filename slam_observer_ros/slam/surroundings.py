@@ -10,7 +10,7 @@ from slam_observer_ros.events import is_automatic, ObservationEvent
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.slam.field_of_view import FieldOfView
 from slam_observer_ros.slam.landmark_table import LandmarkTable
-from slam_observer_ros.types import BoolArray
+from slam_observer_ros.types import BoolArray, IntArray
 
 IMPROBABLE = 20.0
 """−ln of the probability below which it is no chance that none of several landmarks is seen."""
@@ -44,7 +44,7 @@ class Surroundings:
         self._surprise = 0.0
         self._newest_number = 0
 
-    def note(self, event: ObservationEvent, some_have_ids: bool) -> bool:
+    def note(self, event: ObservationEvent, some_have_ids: bool) -> tuple[float, bool]:
         """Count which landmarks were in view of an observation, already used, and which were seen.
 
         Parameters
@@ -56,7 +56,10 @@ class Surroundings:
 
         Returns
         -------
-        bool
+        cost : float
+            −2 ln of the probability that settled landmarks in view were not seen, those that were
+            not.
+        is_strange : bool
             Whether the place has become strange, if there are no ids at all: points were seen for
             so long, and of the landmarks that should have been among them not one, that it is no
             chance any more.
@@ -68,9 +71,27 @@ class Surroundings:
         in_view = seen | self._field_of_view.contains(self._observer.body_points(everything))
         is_strange = not some_have_ids and self._add_surprise(event, in_view, seen)
         rows = np.flatnonzero(is_numbered & in_view)
+        cost = self._cost(rows[~seen[rows] & ~landmarks.tentative[rows]])
         landmarks.note_in_view(rows, seen[rows])
         self._field_of_view.include(event.points)
-        return is_strange
+        return cost, is_strange
+
+    def _cost(self, unseen: IntArray) -> float:
+        """Return what it costs that these settled landmarks (u,) in view were not seen once more.
+
+        How often one in view is seen differs from one to the other and from place to place. Where
+        that share is exponentially distributed about its mean p, one is not seen k times in a row
+        with the probability 1/(1 + k p): one that is hidden soon costs little more.
+        """
+        if not self._field_of_view.is_known:
+            return 0.0
+        p, missed = self._seen_share, self._landmarks.missed[unseen]
+        return 2.0 * float(np.sum(np.log1p(p / (1.0 + missed * p))))
+
+    @property
+    def _seen_share(self) -> float:
+        """How often a landmark in view is seen, as far as it is known."""
+        return min(max(self._landmarks.seen_share, MIN_SHARE), MOST_SHARE)
 
     def _add_surprise(self, event: ObservationEvent, in_view: BoolArray, seen: BoolArray) -> bool:
         """Count those in view and not seen (n,); return whether they are too many, too long."""
@@ -80,8 +101,7 @@ class Surroundings:
         if (old & seen).any():
             self._surprise = 0.0
         elif len(event.points) and self._field_of_view.is_known:
-            share = min(max(landmarks.seen_share, MIN_SHARE), MOST_SHARE)
-            surprise = -math.log1p(-share) * int(np.sum(old))
+            surprise = -math.log1p(-self._seen_share) * int(np.sum(old))
             self._surprise += min(surprise, MAX_SURPRISE)
         is_strange = self._surprise > IMPROBABLE
         if is_strange or self._surprise == 0.0:
