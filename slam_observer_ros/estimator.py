@@ -468,7 +468,7 @@ class Estimator:
         observer = self._slam.observer
         return Update(
             stamp_ns,
-            self.pose_at(stamp_ns),
+            observer.pose,
             outcome.ids,
             se3.rotate(observer.reference_pose, outcome.residuals),
             outcome.rejected,

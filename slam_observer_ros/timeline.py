@@ -125,13 +125,14 @@ class Timeline:
     def meet(self, event: ObservationEvent) -> ObservationEvent:
         """Move the states on to an observation, or it to them if it is late; return it.
 
-        For one without points they stay: such as an idle sensor sends would make others late.
+        One without points, as an idle sensor sends, moves nothing: it would make others late.
         """
         state_ns = self._begin(event.stamp_ns)
+        if not len(event.ids):
+            return replace(event, stamp_ns=state_ns)
         if event.stamp_ns < state_ns:
-            return self._carried_forward(event, state_ns)
-        if len(event.ids):
-            self._advance(event.stamp_ns)
+            event = self._carried_forward(event, state_ns)
+        self._advance(event.stamp_ns)
         return event
 
     def motion(self, start_ns: int, end_ns: int) -> FloatArray:
@@ -144,12 +145,11 @@ class Timeline:
     def _carried_forward(self, event: ObservationEvent, state_ns: int) -> ObservationEvent:
         """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
 
-        Its points are as uncertain as any seen from there, and as the motion's noise makes them,
-        as far as the states can't take that back. This is one and the same error for all m, but
-        is given to each as its own: m would average it down.
+        Its points are as uncertain as any seen from there, and as that motion makes them. Its
+        error is one and the same for all m, but is given to each as its own: m would average it
+        down.
         """
         slam, back = self._frame.slam, self.motion(state_ns, event.stamp_ns)
-        left = 1.0 - self._frame.states.take_back(self.velocities, event.stamp_ns, state_ns)
         points, sensor = event.points, event.sensor
         if event.velocities is not None:
             shifts = event.velocities * to_s(state_ns - event.stamp_ns)
@@ -161,5 +161,5 @@ class Timeline:
             self.velocities, slam.gains.calibration, slam.motion_noise, event.stamp_ns, state_ns
         )
         C = back[:3, :3] @ SPATIAL.output_matrix(points)
-        shared = left * len(points) * C @ Q @ transpose(C)
+        shared = len(points) * C @ Q @ transpose(C)
         return replace(moved, covariances=slam.covariances_of(moved) + shared)

@@ -185,7 +185,6 @@ def test_however_many_velocities_come_late_no_motion_counts_twice():
 @pytest.mark.parametrize('are_given', [False, True])
 def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_given):
     settings = Settings(
-        gains='scheduled',  # which do not take the motion's noise back
         observation_model='cartesian',
         point_noise=0.1,
         angular_velocity_noise=(0.0, 0.0, 0.2),
@@ -252,43 +251,37 @@ def test_landmarks_that_are_always_seen_late_are_not_drawn_towards_the_robot():
     np.testing.assert_allclose(late, in_time, rtol=5e-3)
 
 
-def wander(late_s, *, empties=False, velocities=300):
-    """Return an estimator fed with landmarks that come ``late_s`` after velocities of 100 Hz."""
-    estimator, noise = Estimator(Settings(reorder_window=0.0)), np.random.default_rng(0)
-    pose, waiting = np.eye(4), []
-    nothing = np.empty(0, dtype=np.int64)
-    for step in range(velocities):
-        stamp_ns = START_NS + step * 10**7
-        turning = np.array([0.1, 0.2, 0.3, 0.5, 0.1 * np.sin(0.1 * step), 0.0])
-        estimator.add(VelocityEvent(stamp_ns, turning + 0.05 * noise.normal(size=6)))
-        if empties:
-            estimator.add(ObservationEvent(stamp_ns, nothing, np.empty((0, 3))))
-        if step % 50 == 10:
-            seen = se3.transform(se3.inverse(pose), LANDMARKS)
-            seen = seen + 0.02 * noise.normal(size=seen.shape)
-            waiting.append((stamp_ns, ObservationEvent(stamp_ns, np.arange(5), seen)))
-        while waiting and waiting[0][0] <= stamp_ns - round(late_s * 1e9):
-            estimator.add(waiting.pop(0)[1])
-        pose = pose @ se3.exp(0.01 * turning)
-    return estimator
-
-
 def test_empty_observations_make_no_others_late():
-    alone, beside_empty_ones = wander(0.3), wander(0.3, empties=True)
+    settings, noise = Settings(reorder_window=0.0), np.random.default_rng(0)
+    alone, beside_empty_ones = Estimator(settings), Estimator(settings)
+    waiting: list[ObservationEvent] = []
+    for step in range(300):
+        stamp_ns = START_NS + 10**7 * step
+        for estimator in (alone, beside_empty_ones):
+            estimator.add(VelocityEvent(stamp_ns, BODY_VELOCITY))
+        beside_empty_ones.add(ObservationEvent(stamp_ns, np.empty(0, int), np.empty((0, 3))))
+        if step % 50 == 10:
+            seen = se3.transform(se3.inverse(true_pose(0.01 * step)), LANDMARKS)
+            seen += 0.02 * noise.normal(size=seen.shape)
+            waiting.append(ObservationEvent(stamp_ns, np.arange(5), seen))
+        if step % 50 == 40:
+            for estimator in (alone, beside_empty_ones):
+                estimator.add(waiting[-1])
+    assert beside_empty_ones.counts['observation'] == 306
     assert beside_empty_ones.counts['late_observation'] == 0
     np.testing.assert_array_equal(beside_empty_ones.pose, alone.pose)
     np.testing.assert_array_equal(beside_empty_ones.pose_covariance, alone.pose_covariance)
 
 
-def test_what_nothing_else_was_used_after_tells_as_much_if_it_comes_late():
-    """The state had gone on since there were many velocities; nothing else was in between."""
-    in_time, late = wander(0.0), wander(1.5, velocities=300 + 150)
-    assert late.counts['late_observation'] == late.counts['observation'] == 6
-    stamp_ns = START_NS + 300 * 10**7
-    np.testing.assert_allclose(late.pose_at(stamp_ns), in_time.pose_at(stamp_ns), atol=1e-4)
-    np.testing.assert_allclose(late.world_points, in_time.world_points, atol=1e-4)
-    covariances = late.landmark_covariances, in_time.landmark_covariances
-    np.testing.assert_allclose(*covariances, rtol=1e-3, atol=1e-6)
+def test_an_update_is_of_the_state_at_its_stamp_and_stamps_never_go_back():
+    told = []
+    estimator = Estimator(
+        Settings(reorder_window=0.0), on_update=lambda update: told.append(update.stamp_ns)
+    )
+    for event in (velocity(0.0), observation(0.1), observation(0.5, []), observation(0.2)):
+        estimator.add(event)
+    assert [stamp_ns - START_NS for stamp_ns in told] == [10**8, 10**8, 2 * 10**8]
+    assert estimator.stamp_ns == START_NS + 5 * 10**8
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])

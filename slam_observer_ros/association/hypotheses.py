@@ -112,18 +112,6 @@ class Hypotheses:
         for slam in self._states:
             slam.advance(velocities, start_ns, end_ns)
 
-    def take_back(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> float:
-        """Take back the noise of the latest motion until an observation made before it is used.
-
-        Return which share of it, the same for all states.
-        """
-        noises = [slam.latest_noise(velocities, start_ns, end_ns) for slam in self._states]
-        pairs = list(zip(self._states, noises, strict=True))
-        share = min(slam.gains.share_of_noise(noise) for slam, noise in pairs)
-        for slam, noise in pairs:
-            slam.gains.take_back(share * noise)
-        return share
-
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change, in all states."""
         for slam in self._states:

@@ -165,23 +165,6 @@ class GainDesign:
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Account for the noise of a motion that has brought ``observer`` to where it is."""
 
-    def share_of_noise(self, noise: FloatArray) -> float:
-        """Return which share of the noise (6, 6) of the latest motions can be taken back.
-
-        That of which no observation since has told; 0 where a design knows no way.
-        """
-        return 0.0
-
-    def take_back(self, noise: FloatArray) -> None:
-        """Take noise (6, 6) out of what is known of the pose until :meth:`give_back`.
-
-        What is used in between was seen before the motion of that noise: as the error E stays
-        where it is while the robot moves, the noise is all that there is between then and now.
-        """
-
-    def give_back(self) -> None:
-        """Let the pose be as uncertain again as before :meth:`take_back`, if that was called."""
-
     def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Account for landmarks (m, 3) whose first observation has ``covariances`` (m, 3, 3)."""
 

@@ -14,9 +14,6 @@ from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray, IntArray
 
-ROUNDING, LEAST_VARIANCE = 1e-12, 1e-18
-"""Share of each variance, and rad² or m², added to it where P may be singular."""
-
 
 class JointCovariance:
     """P, the covariance of x = (ε, c, ã_1 … ã_n); with landmarks that move, (ã_i, ũ_i) for ã_i.
@@ -97,16 +94,6 @@ class JointCovariance:
         """Take over the covariance (p, p) of ε, independent of all else."""
         self.P[: self._p] = self.P[:, : self._p] = 0.0
         self.P[: self._p, : self._p] = covariance
-
-    def share_of_noise(self, noise: FloatArray) -> float:
-        """Return the largest share s ≤ 1 of ``noise`` (p, p) that can be taken from the pose.
-
-        So that P stays positive: s noise ≤ P_εε − P_εm P_mm⁻¹ P_mε, with m all but the pose.
-        """
-        p, P = self._p, self.P + np.diag(ROUNDING * np.diagonal(self.P) + LEAST_VARIANCE)
-        own = P[:p, :p] - P[:p, p:] @ np.linalg.solve(P[p:, p:], P[p:, :p])
-        largest = np.max(np.linalg.eigvals(np.linalg.solve(own, noise)).real)
-        return float(1.0 / max(largest, 1.0))
 
     def make_room(self, m: int) -> IntArray:
         """Append m landmarks, filled with zeros; return their rows."""

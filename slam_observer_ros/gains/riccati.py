@@ -57,7 +57,6 @@ class RiccatiGains(GainDesign):
         self._p = self._axes.p
         self.calibration = calibration
         self._joint = joint
-        self._taken_back: FloatArray | None = None
 
     def change_settings(self, settings: Settings) -> None:
         """Take over the robustness."""
@@ -89,23 +88,6 @@ class RiccatiGains(GainDesign):
         P = self._joint.P[:first, :first].copy()
         predict(P, self._axes, self.calibration, motion)
         return self._axes.full_pose_covariance(P[: self._p, : self._p])
-
-    def share_of_noise(self, noise: FloatArray) -> float:
-        """Return which share of ``noise`` (6, 6) P holds yet; O(n³)."""
-        pose = self._axes.pose
-        return self._joint.share_of_noise(noise[pose, pose])
-
-    def take_back(self, noise: FloatArray) -> None:
-        """Take noise (6, 6) out of the pose block until :meth:`give_back`."""
-        pose = self._axes.pose
-        self._taken_back = noise[pose, pose]
-        self._joint.pose[:] -= self._taken_back
-
-    def give_back(self) -> None:
-        """Add it again."""
-        if self._taken_back is not None:
-            self._joint.pose[:] += self._taken_back
-            self._taken_back = None
 
     def set_pose_error_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (6, 6) of ε, independent of all else."""

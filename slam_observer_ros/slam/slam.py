@@ -12,7 +12,7 @@ from slam_observer_ros.gains import make_gains
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.motion.integration import integrate, transition, transition_covariance
+from slam_observer_ros.motion.integration import integrate
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
 from slam_observer_ros.motion.velocity_history import VelocityHistory
@@ -167,15 +167,6 @@ class Slam:
         self.gains.predict(self.observer, moved)
         self._end_velocity = None if moved.at_ends is None else moved.at_ends[1]
 
-    def latest_noise(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> FloatArray:
-        """Return what a motion that has led here may be off by: (6, 6), of ε."""
-        calibration = self.gains.calibration
-        Q = transition_covariance(velocities, calibration, self.motion_noise, start_ns, end_ns)
-        back = se3.inverse(transition(velocities, calibration, start_ns, end_ns))
-        Ad = se3.adjoint(self.observer.A @ back)
-        noise: FloatArray = Ad @ Q @ Ad.T
-        return noise
-
     def _motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
         return integrate(
             velocities,
@@ -222,7 +213,6 @@ class Slam:
             self._initialise(event.select(~known), sighting.covariances[~known])
             event, rows = self._mapped(event)
         moved_ids = self._look_back(event, rows)
-        self.gains.give_back()
         self._note_velocities(event, rows)
         return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
 

@@ -79,9 +79,9 @@ class Surroundings:
     def _cost(self, unseen: IntArray) -> float:
         """Return what it costs that these settled landmarks (u,) in view were not seen once more.
 
-        How often one in view is seen differs from one to the other and from place to place. Where
-        that share is exponentially distributed about its mean p, one is not seen k times in a row
-        with the probability 1/(1 + k p): one that is hidden soon costs little more.
+        The rate at which one in view is seen differs from one to the other and from place to
+        place. Where it is exponentially distributed about its mean p, one is not seen k times in
+        a row with the probability 1/(1 + k p): one that is hidden soon costs little more.
         """
         if not self._field_of_view.is_known:
             return 0.0
