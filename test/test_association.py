@@ -6,6 +6,7 @@ from copy import deepcopy
 from dataclasses import replace
 import itertools
 from pathlib import Path
+from unittest.mock import Mock
 
 import gain_worlds
 from hypothesis import given
@@ -664,6 +665,16 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
     (before, after), (_, unasked) = run(True), run(False)
     assert_array_equal(after, unasked)
     assert before[2, 2] < after[2, 2]
+
+
+def test_settings_and_jumps_of_the_clock_are_of_all_states_that_are_followed():
+    states = Hypotheses(Slam(Settings(), np.eye(4)))
+    states._states = [Mock(), Mock()]
+    states.change_settings(PLANAR)
+    states.restart_time()
+    for slam in states._states:
+        slam.change_settings.assert_called_once_with(PLANAR)
+        slam.restart_time.assert_called_once_with()
 
 
 def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():

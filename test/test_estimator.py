@@ -20,13 +20,14 @@ from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import (
     AGREEING_STAMPS,
+    AngularVelocityEvent,
     FIRST_AUTOMATIC_ID,
     LAST_AUTOMATIC_ID,
     ObservationEvent,
     UNKNOWN_ID,
     VelocityEvent,
 )
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_frame import MapFrame
 from slam_observer_ros.observation_noise import ObservationNoise
@@ -137,6 +138,24 @@ def test_events_shuffled_within_the_window_give_the_same_bits(random):
     assert_same_state(run(shuffled, reorder_window=0.2), run(events, reorder_window=0.2))
 
 
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_residual_is_how_far_a_landmark_is_seen_from_where_the_map_has_it(gains):
+    settings = Settings(gains=gains, confirmations=1, reorder_window=0.0)
+    estimator = Estimator(settings, initial_pose=true_pose(3.0))
+    compared = 0
+    for event in drive():
+        pose, expected = estimator.pose_at(event.stamp_ns), np.full((5, 3), np.nan)
+        expected[estimator.landmark_ids] = estimator.world_points
+        estimator.add(event)
+        if isinstance(event, ObservationEvent):
+            off = se3.transform(pose, event.points) - expected[event.ids]
+            known = np.isfinite(off[:, 0])
+            assert_array_equal(estimator.last_update.ids, event.ids[known])
+            np.testing.assert_allclose(estimator.last_update.residuals, off[known], atol=1e-9)
+            compared += np.sum(known)
+    assert compared > 50
+
+
 def test_asking_for_the_pose_never_changes_the_estimate():
     asked = Estimator(Settings(confirmations=1))
     for event in drive():
@@ -166,6 +185,17 @@ def test_an_observation_later_than_the_window_is_carried_forward():
     np.testing.assert_allclose(estimator.world_points, LANDMARKS, atol=1e-9)
 
 
+def test_an_observation_may_be_as_late_as_is_asked_for_and_takes_the_estimate_back_nowhere():
+    events = [velocity(0.1 * step) for step in range(100)]
+    events += [observation(9.5, []), observation(0.5)]
+    estimator = Estimator(Settings(confirmations=1, reorder_window=0.0, late_limit=10.0))
+    for event in events:
+        assert estimator.add(event)
+    assert estimator.stamp_ns == START_NS + round(9.9e9)
+    np.testing.assert_allclose(estimator.pose, true_pose(9.9), atol=1e-9)
+    np.testing.assert_allclose(estimator.world_points, LANDMARKS, atol=1e-9)
+
+
 def test_a_velocity_later_than_the_window_counts_from_then_on():
     fast, faster = np.array([0.0, 0, 0, 1, 0, 0]), np.array([0.0, 0, 0, 2, 0, 0])
     events = [velocity(0.0, 0 * fast), observation(1.0), velocity(0.9, faster)]
@@ -173,6 +203,13 @@ def test_a_velocity_later_than_the_window_counts_from_then_on():
     np.testing.assert_allclose(estimator.pose[:3, 3], [1.0, 0.0, 0.0], atol=1e-9)
     assert estimator.counts['late_velocity'] == 1
     assert estimator.dropped == {'too_late': 1}, 'a newer velocity was known before it'
+
+
+def test_a_velocity_that_is_late_is_used_though_a_newer_one_of_a_gyroscope_was_before():
+    gyroscope = AngularVelocityEvent(START_NS + 10**9, BODY_VELOCITY[:3])
+    estimator = run([velocity(0.0), gyroscope, velocity(0.9)], reorder_window=0.0)
+    assert estimator.counts['late_velocity'] == 1
+    assert not estimator.dropped
 
 
 def test_however_many_velocities_come_late_no_motion_counts_twice():
@@ -183,7 +220,9 @@ def test_however_many_velocities_come_late_no_motion_counts_twice():
 
 
 @pytest.mark.parametrize('are_given', [False, True])
-def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_given):
+@pytest.mark.parametrize('m', [1, 3])
+def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(m, are_given):
+    """However many points share its error: they don't average it down."""
     settings = Settings(
         observation_model='cartesian',
         point_noise=0.1,
@@ -195,27 +234,30 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(are_
     for step in range(21):
         timeline.append(velocity(0.1 * step, turning))
     timeline.catch_up()
-    given_m2 = 0.01 * np.eye(3)[None] if are_given else None
-    event = ObservationEvent(START_NS + 10**9, np.array([1]), np.array([[5.0, 0, 0]]), given_m2)
-    carried = timeline.meet(event)
-    expected = np.diag([0.01 + 0.3**2, 0.01 + (5.0 * 0.2) ** 2, 0.01])
+    given_m2 = np.tile(0.01 * np.eye(3), (m, 1, 1)) if are_given else None
+    points = np.tile([5.0, 0.0, 0.0], (m, 1))
+    carried = timeline.meet(ObservationEvent(START_NS + 10**9, np.arange(m), points, given_m2))
+    expected = 0.01 * np.eye(3) + m * np.diag([0.3, 5.0 * 0.2, 0.0]) ** 2
     np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
 
 
-def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen():
+@pytest.mark.parametrize('turn_rad', [0.0, 1.0])
+def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_rad):
     still = (0.0,) * 3
     settings = Settings(
         observation_model='stereo', angular_velocity_noise=still, linear_velocity_noise=still
     )
     timeline = Timeline(MapFrame(settings), settings)
+    turning = np.array([0.0, 0.0, turn_rad / 0.9, 0.0, 0.0, 0.0])
     for step in range(11):
-        timeline.append(velocity(0.1 * step, np.zeros(6)))
+        timeline.append(velocity(0.1 * step, turning))
     timeline.catch_up()
     seen, speed = np.array([[5.0, 0.0, 0.0]]), np.array([[4.0, 0.0, 0.0]])
     event = ObservationEvent(START_NS + 10**8, np.array([1]), seen, velocities=speed)
     carried = timeline.meet(event)
-    np.testing.assert_allclose(carried.points, seen + 0.9 * speed, atol=1e-9)
-    expected = ObservationNoise(settings).at(seen)
+    R = so3.exp(np.array([0.0, 0.0, turn_rad]))
+    np.testing.assert_allclose(carried.points, (seen + 0.9 * speed) @ R, atol=1e-9)
+    expected = R.T @ ObservationNoise(settings).at(seen) @ R
     np.testing.assert_allclose(carried.covariances, expected, rtol=1e-6)
 
 
@@ -900,6 +942,40 @@ def test_after_a_jump_back_in_time_pose_and_map_are_held_if_asked(gains):
     np.testing.assert_allclose(estimator.pose, pose, atol=1e-12)
     np.testing.assert_allclose(estimator.world_points[:-1], points, atol=1e-12)
     np.testing.assert_allclose(estimator.world_points[-1], pose[:3] @ [1.0, 1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize('gains', GAINS)
+def test_a_pose_that_is_held_is_that_of_the_newest_velocity_not_of_the_last_observation(gains):
+    estimator = Estimator(Settings(on_time_jump='hold', reorder_window=0.0, gains=gains))
+    for event in [observation(0.0), *[velocity(0.05 * step) for step in range(21)]]:
+        estimator.add(event)
+    estimator.restart_time()
+    np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
+
+
+@pytest.mark.parametrize('is_in_loaded_map', [False, True])
+def test_a_pose_that_is_set_is_that_of_the_newest_velocity(is_in_loaded_map):
+    estimator, pose = Estimator(Settings(reorder_window=0.0)), true_pose(7.0)
+    for event in [observation(0.0), *[velocity(0.05 * step) for step in range(21)]]:
+        estimator.add(event)
+    if is_in_loaded_map:
+        known = LandmarkMap(np.arange(5), LANDMARKS, None, np.zeros(5, dtype=np.int64))
+        estimator.load_map(known, pose)
+    else:
+        estimator.set_pose(pose)
+    np.testing.assert_allclose(estimator.pose, pose, atol=1e-9)
+
+
+def test_nothing_is_smoothed_across_a_pose_that_was_set():
+    estimator, far = Estimator(Settings(reorder_window=0.0)), se3.exp(np.full(6, 0.5))
+    for event in drive(2.0):
+        estimator.add(event)
+    estimator.set_pose(far @ estimator.pose)
+    assert estimator.smooth().since == 'the pose was set'
+    set_ns = estimator.stamp_ns
+    for event in drive(4.0)[len(drive(2.0)) :]:
+        estimator.add(event)
+    assert (estimator.smooth().stamps_ns > set_ns).all()
 
 
 def test_after_a_jump_back_in_time_landmarks_out_of_view_make_room_for_new_ones():

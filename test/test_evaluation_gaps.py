@@ -41,6 +41,18 @@ def test_poses_between_the_stamps_of_the_motion_are_kept():
     assert_allclose(filled.positions[1:-1], TRUE.positions[21:61], atol=0.05)
 
 
+def test_poses_of_before_and_after_the_motion_are_kept():
+    motion = Trajectory(DRIFTING.stamps_ns[20:160], DRIFTING.poses[20:160])
+    rows = np.array([10, 40, 60, 180])
+    assert_array_equal(fill_gaps(at(rows), motion).stamps_ns, STAMPS_NS[[10, *range(40, 61), 180]])
+
+
+def test_a_motion_with_pauses_is_used_as_well():
+    sparse = Trajectory(DRIFTING.stamps_ns[::20], DRIFTING.poses[::20])  # every two seconds
+    filled = fill_gaps(at(np.array([30, 90])), sparse)
+    assert_array_equal(filled.stamps_ns, STAMPS_NS[[30, 40, 60, 80, 90]])
+
+
 def test_where_no_motion_is_known_the_estimate_stays_as_it_is():
     empty = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)))
     short = Trajectory(DRIFTING.stamps_ns[:15], DRIFTING.poses[:15])

@@ -61,6 +61,28 @@ def test_heading_error_is_the_turn_about_the_vertical() -> None:
     assert errors.rotation_rmse_rad == pytest.approx(0.1)
 
 
+@given(generators(), poses())
+def test_without_alignment_an_estimate_is_compared_where_it_says_it_is(
+    rng: np.random.Generator, G: FloatArray
+) -> None:
+    estimate, truth = random_pair(rng)
+    estimate = estimate.moved(G)
+    lengths_m = np.linalg.norm(estimate.positions - truth.positions, axis=1)
+    found_m = metrics.trajectory_errors(estimate, truth).unaligned_rmse_m
+    assert found_m == pytest.approx(np.sqrt(np.mean(lengths_m**2)))
+
+
+def test_rms_errors_are_told_of_errors_that_change() -> None:
+    _, truth = random_pair(np.random.default_rng(0))
+    yaw = np.where(np.arange(len(truth)) % 2, 0.2, 0.0)
+    turn = se3.exp(yaw[:, None] * np.array([0.0, 0, 1, 0, 0, 0]))
+    turned = truth.poses.copy()
+    turned[:, :3, :3] = turn[:, :3, :3] @ turned[:, :3, :3]
+    errors = metrics.trajectory_errors(Trajectory(STAMPS_NS, turned), truth)
+    assert errors.heading_rmse_rad == pytest.approx(0.2 / np.sqrt(2.0))
+    assert errors.rotation_rmse_rad == pytest.approx(0.2 / np.sqrt(2.0))
+
+
 def test_only_times_that_the_truth_covers_are_compared() -> None:
     estimate, truth = random_pair(np.random.default_rng(0))
     part = Trajectory(truth.stamps_ns[10:20], truth.poses[10:20])
@@ -160,6 +182,16 @@ def test_exactly_known_directions_do_not_count() -> None:
     assert consistency.average_nees(error[None], np.zeros((1, 6, 6))) is None
 
 
+@given(generators())
+def test_what_is_known_exactly_need_not_lie_along_an_axis(rng: np.random.Generator) -> None:
+    root, components = rng.normal(size=(6, 3)), rng.normal(size=3)
+    nees, degrees_of_freedom = consistency.normalised_squared_errors(
+        root @ components, root @ root.T
+    )
+    assert degrees_of_freedom == 3
+    assert nees == pytest.approx(components @ components)
+
+
 def test_an_indefinite_covariance_is_refused() -> None:
     with pytest.raises(EvaluationError, match='negative'):
         consistency.average_nees(np.ones((1, 2)), np.array([[[1.0, 2.0], [2.0, 1.0]]]))
@@ -239,6 +271,30 @@ def test_anchored_nees_ignores_the_worlds_and_starts_at_zero(
     assert exact == pytest.approx(0.0, abs=1e-15)
 
 
+def test_where_the_truth_has_a_gap_errors_are_compared_with_their_own_covariances() -> None:
+    estimate, truth = random_pair(np.random.default_rng(0))
+    covariances = np.arange(len(STAMPS_NS))[:, None, None] * np.eye(6)
+    seen = np.r_[:5, 25 : len(STAMPS_NS)]
+    gapped = Trajectory(STAMPS_NS[seen], truth.poses[seen])
+    part = Trajectory(STAMPS_NS[seen], estimate.poses[seen])
+    assert consistency.anchored_average_nees(estimate, covariances, gapped) == pytest.approx(
+        consistency.anchored_average_nees(part, covariances[seen], gapped)
+    )
+
+
+def test_the_anees_is_not_told_where_the_first_heading_is_uncertain_and_the_way_is_long() -> None:
+    """The heading itself may be little of what is uncertain later; 100 m further on it is not."""
+    poses = np.tile(np.eye(4), (len(STAMPS_NS), 1, 1))
+    covariances = np.tile(np.eye(6), (len(STAMPS_NS), 1, 1))
+    covariances[0] = np.diag([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]) ** 2
+    near = Trajectory(STAMPS_NS, poses.copy())
+    assert consistency.anchored_average_nees(near, covariances, near) == 0.0
+    poses[1:, 0, 3] = 100.0
+    far = Trajectory(STAMPS_NS + 10**9, poses)
+    with pytest.raises(EvaluationError, match=r'begins 0\.0 s after the estimate'):
+        consistency.anchored_average_nees(far, covariances, far)
+
+
 def test_the_anees_is_honest_or_not_told_where_the_truth_begins_late() -> None:
     """What counts is not how late, but how uncertain the pose is by then."""
     rng = np.random.default_rng(0)
@@ -269,3 +325,9 @@ def test_so_few_poses_that_any_truth_fits_have_no_error(count: int) -> None:
     few = Trajectory(estimate.stamps_ns[:count], estimate.poses[:count])
     with pytest.raises(EvaluationError, match=f'{count} of its {count} poses .* it takes 3'):
         metrics.trajectory_errors(few, truth)
+
+
+def test_three_poses_that_the_truth_covers_are_enough() -> None:
+    estimate, truth = random_pair(np.random.default_rng(0))
+    three = Trajectory(estimate.stamps_ns[:3], estimate.poses[:3])
+    assert metrics.trajectory_errors(three, truth).ate_rmse_m > 0.0

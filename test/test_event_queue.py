@@ -31,8 +31,9 @@ def received(event, receive_ns):
     return dataclasses.replace(event, receive_ns=receive_ns)
 
 
-def observation(stamp_ns, ids=(1,)):
-    return ObservationEvent(START_NS + stamp_ns, np.array(ids), np.zeros((len(ids), 3)))
+def observation(stamp_ns, ids=(1,), range_m=0.0):
+    points = np.full((len(ids), 3), range_m)
+    return ObservationEvent(START_NS + stamp_ns, np.array(ids), points)
 
 
 def make_queue(window_ns=100, max_jump_ns=10 * SECOND, late_limit_ns=2 * SECOND):
@@ -103,8 +104,9 @@ def test_an_event_that_comes_twice_is_refused(event, is_given_out):
     assert error.value.reason == 'duplicate'
 
 
-def test_two_sensors_may_see_different_landmarks_at_one_instant():
-    queue = filled(observation(3, [1, 2]), observation(3, [4]))
+@pytest.mark.parametrize('of_another', [observation(3, [4]), observation(3, [1, 2], range_m=5.0)])
+def test_two_sensors_may_see_landmarks_at_one_instant(of_another):
+    queue = filled(observation(3, [1, 2]), of_another)
     assert len(list(queue.pop_all())) == 2
 
 
@@ -120,6 +122,29 @@ def test_keys_of_old_events_are_forgotten():
         queue.push(velocity(SECOND // 100 * k))
         queue.pop_ready()
     assert len(queue._known) <= MIN_KNOWN
+
+
+def test_however_many_events_came_since_a_late_one_that_comes_twice_is_refused():
+    events = dense(SECOND, step_ns=SECOND // (2 * MIN_KNOWN))
+    with pytest.raises(InvalidEventError) as error:
+        filled(*events).push(events[MIN_KNOWN])
+    assert error.value.reason == 'duplicate'
+
+
+def test_how_late_an_event_may_be_is_counted_from_the_newest_one_not_from_another_late_one():
+    queue = filled(velocity(2 * SECOND), velocity(SECOND))
+    assert queue.newest_ns == START_NS + 2 * SECOND
+    with pytest.raises(InvalidEventError) as error:
+        queue.push(velocity(-SECOND // 2))
+    assert error.value.reason == 'too_late'
+
+
+@pytest.mark.parametrize('begun_s', [0, 1])
+def test_a_pause_may_be_no_longer_than_asked_for_however_short_that_is(begun_s):
+    queue = filled(velocity(0), *dense(begun_s * SECOND)[1:], max_jump_ns=SECOND // 2)
+    with pytest.raises(InvalidEventError) as error:
+        queue.push(velocity(begun_s * SECOND + SECOND * 6 // 10))
+    assert error.value.reason == 'stamp_jump'
 
 
 @pytest.mark.parametrize(
@@ -181,6 +206,17 @@ def test_a_pause_is_believed_when_enough_events_agree_and_none_of_them_is_lost()
     assert queue.pop_all() == events
 
 
+def test_after_a_pause_the_newest_stamp_is_the_largest_in_whatever_order_they_came():
+    after = [velocity(6 * SECOND - n) for n in range(AGREEING_STAMPS)]
+    assert filled(*dense(SECOND), *after).newest_ns == after[0].stamp_ns
+
+
+def test_one_stamp_far_behind_tells_of_no_jump_of_the_clock_right_after_a_pause():
+    queue = filled(*dense(SECOND), *[velocity(6 * SECOND + n) for n in range(AGREEING_STAMPS)])
+    with pytest.raises(InvalidEventError):
+        queue.push(velocity(3 * SECOND))
+
+
 LONG_NS = 900 * SECOND
 
 
@@ -194,6 +230,11 @@ def before_and_after_a_silence(received_before_ns=0):
 def test_a_silence_of_any_length_is_no_jump_of_the_clock():
     before, after = before_and_after_a_silence()
     assert filled(*before, *after).pop_all() == [*before, *after]
+
+
+def test_a_message_that_is_quicker_after_a_silence_than_all_before_makes_it_no_jump():
+    before, (first, *_) = before_and_after_a_silence(received_before_ns=SECOND)
+    assert not filled(*before).push(received(first, LONG_NS))
 
 
 def test_what_was_received_only_after_a_silence_does_not_make_it_a_jump():
@@ -234,7 +275,7 @@ def test_stamps_that_go_on_further_than_time_does_are_a_jump_of_the_clock():
 
 
 def test_where_events_come_seldom_none_waits_for_others():
-    events = dense(60 * SECOND, step_ns=5 * SECOND)
+    events = [velocity(5 * SECOND * n + SECOND * (n % 2)) for n in range(12)]
     queue = filled(*events[: 1 + AGREEING_STAMPS], window_ns=0)
     assert queue.pop_ready() == events[: 1 + AGREEING_STAMPS]
     for event in events[1 + AGREEING_STAMPS :]:
@@ -270,6 +311,15 @@ def test_stamps_that_do_not_agree_confirm_no_jump():
     for far_s in (100, -20, 200, -40, 1000, 300, -70, 500):
         with pytest.raises(InvalidEventError):
             queue.push(velocity(far_s * SECOND))
+
+
+def test_stamps_behind_all_others_and_ahead_of_them_confirm_no_jump():
+    queue = filled(*dense(SECOND))
+    for n in range(2 * AGREEING_STAMPS):
+        assert not queue.push(velocity(5 * SECOND + n))
+        with pytest.raises(InvalidEventError):
+            queue.push(velocity(n - 3 * SECOND))
+    assert queue.newest_ns < START_NS + SECOND
 
 
 @pytest.mark.parametrize('jump_ns', [10**15, -(10**15), -3 * SECOND, -START_NS])

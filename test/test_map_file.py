@@ -94,6 +94,27 @@ def test_a_surveyor_needs_no_more_than_ids_positions_and_sigma(tmp_path):
     assert_array_equal(surveyed.counts, [0, 0])
 
 
+def test_a_surveyed_landmark_may_be_exact_and_have_the_largest_id(tmp_path):
+    path = tmp_path / 'surveyed.yaml'
+    path.write_text(SURVEYED.replace('id: 3', f'id: {MAX_ID}').replace('0.02', '0'))
+    surveyed = read_map(path)
+    assert surveyed.ids[1] == MAX_ID
+    assert not surveyed.covariances[1].any()
+
+
+@pytest.mark.parametrize(
+    'rows',
+    [
+        '[[1, 0.5, 0], [0.5000001, 1, 0], [0, 0, 1]]',
+        '[[1, 1.0000001, 0], [1.0000001, 1, 0], [0, 0, 1]]',
+    ],
+)
+def test_a_covariance_with_the_digits_that_somebody_writes_down_is_read(tmp_path, rows):
+    path = tmp_path / 'surveyed.yaml'
+    path.write_text(SURVEYED.replace('sigma: 0.01', f'covariance: {rows}'))
+    np.testing.assert_allclose(read_map(path).covariances[0], yaml.safe_load(rows))
+
+
 def test_an_older_map_is_replaced_at_once_and_nothing_else_is_left(tmp_path):
     path = tmp_path / 'map.yaml'
     write_map(path, a_map(3), Settings())
@@ -192,6 +213,7 @@ BAD_FILES = [
     (changed('-2', '.inf'), "landmark 7: 'position' has inf"),
     (changed('-2', '1' + 400 * '0'), "landmark 7: 'position' has 1000"),
     (changed('-2', 'x'), "landmark 7: 'position' has 'x'"),
+    (changed('-2', 'true'), "landmark 7: 'position' has True"),
     (changed('sigma: 0.01', 'sigma: -1'), "landmark 7: 'sigma' is negative"),
     (changed('sigma: 0.01', 'sigma: .nan'), "landmark 7: 'sigma' has nan"),
     (changed('id: 7', 'id: 010'), "entry 0 of landmarks: 'id' is '010'"),

@@ -33,7 +33,7 @@ from slam_observer_ros.nodes.conversions import (
     pose_message,
     twist_message,
 )
-from slam_observer_ros.nodes.initial_pose import InitialPose
+from slam_observer_ros.nodes.initial_pose import filled_in, InitialPose
 from slam_observer_ros.nodes.maps import free_name
 from slam_observer_ros.settings import Settings
 
@@ -283,11 +283,11 @@ def test_the_initial_pose_places_the_robot_in_the_map(ros, robot, tmp_path):
 class GivenPose:
     """What is given on ``initialpose``, to an observer that sees five landmarks."""
 
-    def __init__(self):
-        self.estimator = Estimator(Settings(reorder_window=0.0))
+    def __init__(self, reorder_window=0.0):
+        self.estimator = Estimator(Settings(reorder_window=reorder_window))
         self.stamp_ns = 0
-        self.node = Mock()
-        InitialPose(self.node, 'map', self.estimator, Mock())
+        self.node, self.on_move = Mock(), Mock()
+        InitialPose(self.node, 'map', self.estimator, self.on_move)
         self.receive = self.node.create_subscription.call_args.args[2]
         self.see()
 
@@ -312,10 +312,30 @@ def test_an_initial_pose_beyond_what_the_parameter_allows_is_refused(x):
     assert_allclose(given.estimator.pose, np.eye(4), atol=1e-9)
 
 
-def test_an_initial_pose_may_have_a_frame_with_a_slash():
+@pytest.mark.parametrize('frame_id', ['/map', ''])
+def test_an_initial_pose_may_have_a_frame_with_a_slash_or_none(frame_id):
     given = GivenPose()
-    given.give(se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0])), frame_id='/map')
+    given.give(se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0])), frame_id=frame_id)
     assert_allclose(given.estimator.pose[0, 3], 3.0)
+    given.on_move.assert_called_once_with()
+
+
+def test_an_initial_pose_is_that_of_the_newest_message_even_if_that_waits_for_others():
+    given = GivenPose(reorder_window=1.0)
+    assert given.estimator.stamp_ns is None
+    given.give(se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0])), frame_id='elsewhere')
+    given.on_move.assert_not_called()
+    given.give(se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0])))
+    assert given.estimator.stamp_ns == given.stamp_ns
+
+
+def test_of_an_initial_pose_what_is_told_counts_and_what_is_not_is_assumed():
+    """What only rounding has made negative is not refused."""
+    told = np.diag([0.0, 0.0, 0.07, 0.25, 0.25, 0.0])
+    told[3, 4] = told[4, 3] = 0.25 + 1e-14
+    expected = told + np.diag([0.26, 0.26, 0.0, 0.0, 0.0, 0.5]) ** 2
+    assert_allclose(filled_in(told), expected)
+    assert_allclose(filled_in(None), np.diag([0.26, 0.26, 0.26, 0.5, 0.5, 0.5]) ** 2)
 
 
 def test_an_initial_pose_whose_covariance_is_none_is_refused():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -13,7 +14,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes import pose_broadcaster
-from slam_observer_ros.nodes.pose_broadcaster import DISCOVERY_S, PoseBroadcaster
+from slam_observer_ros.nodes.pose_broadcaster import DISCOVERY_S, MAX_WAITING_NS, PoseBroadcaster
 from slam_observer_ros.nodes.transform_publisher import TFMessage
 
 pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not installed')
@@ -97,8 +98,11 @@ def test_a_correction_holds_until_the_next_one_at_25_hz(robot):
 
 
 def test_without_odometry_the_base_is_published_until_there_is_some(robot):
+    begin_ns = robot.now_ns
     robot.run(DISCOVERY_S + 1.0)
-    assert children(robot.take()) == {'base_link'}
+    sent = robot.take()
+    assert children(sent) == {'base_link'}
+    assert stamp_ns(sent[0]) > begin_ns + round(DISCOVERY_S * 1e9), 'it is the newest pose'
     robot.run(1.0, lag_s=0.0)
     assert children(robot.take()) == {'odom'}
     assert "publishing 'map' to 'odom' on /tf: /tf has 'odom' to 'base_link'" in robot.logged
@@ -148,6 +152,14 @@ def test_odometry_that_is_stamped_far_ahead_is_reported(robot):
     assert robot.broadcaster.trouble in robot.logged
 
 
+def test_odometry_that_begins_after_the_pose_is_no_trouble(robot):
+    robot.run(0.1)
+    robot.buffer.insert('odom', 'base_link', robot.now_ns + STEP_NS // 2, ODOMETRY)
+    robot.broadcaster.retry()
+    assert not robot.take()
+    assert not robot.broadcaster.trouble
+
+
 def test_odometry_that_ends_is_reported_until_it_is_back(robot):
     robot.run(1.0, lag_s=0.0)
     assert not robot.broadcaster.trouble
@@ -169,6 +181,47 @@ def test_odometry_that_does_not_come_back_after_a_jump_of_the_clock_is_reported(
     assert not robot.broadcaster.trouble
     robot.run(1.0)
     assert 's behind' in robot.broadcaster.trouble
+
+
+def test_while_poses_are_held_the_last_correction_holds_on(robot):
+    robot.broadcaster.repeat(robot.now_ns)
+    assert not robot.take(), 'there is none yet'
+    robot.run(1.0, lag_s=0.0)
+    last = robot.take()[-1]
+    robot.wait(5.0)
+    for _ in range(2):
+        robot.broadcaster.repeat(robot.now_ns)
+    (repeated,) = robot.take()  # no stamp goes out twice
+    assert repeated.transform == last.transform
+    tolerance_ns = round(robot.settings.transform_tolerance * 1e9)
+    assert stamp_ns(repeated) == robot.now_ns + tolerance_ns
+
+
+def test_after_a_reset_nothing_of_before_goes_out(robot):
+    robot.run(1.0, lag_s=0.0)
+    robot.run(0.4)  # poses that wait for their odometry
+    robot.take()
+    robot.broadcaster.forget()
+    robot.buffer.insert('odom', 'base_link', robot.now_ns, ODOMETRY)
+    robot.broadcaster.retry()
+    robot.broadcaster.repeat(robot.now_ns)
+    assert not robot.take()
+
+
+def test_poses_wait_no_longer_for_odometry_than_tf_keeps_it(robot):
+    robot.run(1.0, lag_s=0.0)
+    robot.run(30.0)
+    assert len(robot.broadcaster._waiting) <= MAX_WAITING_NS // STEP_NS + 1
+
+
+def test_where_the_map_is_published_below_the_base_that_may_have_another_parent(robot):
+    settings = replace(robot.settings, invert_tf=True)
+    robot.broadcaster = PoseBroadcaster(robot.node, settings, robot.buffer, WINDOW_S)
+    robot.buffer.insert('body', 'base_link', robot.now_ns, ODOMETRY)
+    robot.run(DISCOVERY_S + 1.0)
+    sent = robot.take()[-1]
+    assert (sent.header.frame_id, sent.child_frame_id) == ('base_link', 'map')
+    np.testing.assert_allclose(pose_of(sent.transform), se3.inverse(POSE), atol=1e-9)
 
 
 def test_frames_have_no_leading_slash():

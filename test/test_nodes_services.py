@@ -24,8 +24,9 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
-from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.nodes import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.diagnostics import Diagnostics as NodeDiagnostics
 from slam_observer_ros.nodes.qos import LATCHED_QOS
@@ -274,7 +275,7 @@ def is_moving(values):
 class Told:
     """The status that diagnostics publish of an estimator's counts."""
 
-    def __init__(self):
+    def __init__(self, *inputs, **estimate):
         self.node = Mock()
         self.node.get_name.return_value = 'observer_node'
         self.node.get_namespace.return_value = '/robot'
@@ -285,12 +286,14 @@ class Told:
             calibration=[], lyapunov=0.0, stamp_ns=None, velocity_is_stale=False,
             is_localised=True,
         )  # fmt: skip
-        intake = SimpleNamespace(
+        vars(self.estimator).update(estimate)
+        self.intake = SimpleNamespace(
             dropped=Counter(), is_paused=False, clock_troubles=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
-        outputs = SimpleNamespace(trouble='')
-        self.diagnostics = NodeDiagnostics(self.node, self.estimator, intake, [], outputs)
+        self.outputs = SimpleNamespace(trouble='')
+        parts = self.estimator, self.intake, inputs, self.outputs
+        self.diagnostics = NodeDiagnostics(self.node, *parts)
 
     def publish(self, **new):
         # A new one, as the real one gives.
@@ -316,10 +319,76 @@ def test_more_rejected_points_than_outliers_are_told_once_there_are_enough(
 def test_points_rejected_long_ago_are_told_of_no_more():
     told = Told()
     for _ in range(5):
-        assert told.publish(observation=1, observed_point=20, rejected_landmark=8)
-    for _ in range(30):
+        assert told.publish(observation=1, observed_point=20, rejected_landmark=20)
+    for _ in range(20):
+        status = told.publish(observation=1, observed_point=20)
+    assert status.message == '20 % of the points seen lately were rejected'
+    for _ in range(10):
         status = told.publish(observation=1, observed_point=20)
     assert status.message == 'running'
+
+
+@pytest.mark.parametrize('reason', ['repeated_id', 'reserved_id'])
+def test_of_points_left_out_for_their_ids_a_single_one_is_told(reason):
+    status = Told().publish(observation=1, observed_point=100, **{reason: 1})
+    assert status.message.startswith('of 100 points seen 1 ')
+    assert status.level == DiagnosticStatus.WARN
+
+
+NO_PLACE = 'the place in the loaded map is not known yet: no pose is published'
+NO_IDS = 'points have no ids: give the pose on initialpose'
+
+
+@pytest.mark.parametrize(
+    ('estimate', 'message'),
+    [
+        ({'velocity_is_stale': True}, 'running'),  # there was no event yet
+        ({'velocity_is_stale': True, 'stamp_ns': 1}, 'no velocity in force: the pose is held'),
+        ({'is_localised': False}, NO_PLACE),
+        ({'is_localised': False, 'landmark_ids': [7, FIRST_AUTOMATIC_ID]}, NO_PLACE),
+        ({'is_localised': False, 'landmark_ids': [FIRST_AUTOMATIC_ID]}, f'{NO_PLACE}; {NO_IDS}'),
+    ],
+)
+def test_what_is_amiss_with_the_estimate_is_told_and_nothing_else(estimate, message):
+    landmark_ids = np.array(estimate.get('landmark_ids', []), dtype=np.int64)
+    told = Told(**{**estimate, 'landmark_ids': landmark_ids})
+    assert told.publish().message == message
+
+
+def test_what_is_dropped_in_a_pause_is_no_error():
+    told = Told()
+    told.intake.is_paused = True
+    told.intake.dropped['paused'] += 3
+    status = told.publish()
+    assert (status.level, status.message) == (DiagnosticStatus.WARN, 'paused')
+
+
+def test_what_cannot_be_published_is_told():
+    told = Told()
+    told.outputs.trouble = 'no odometry'
+    assert told.publish().message == 'no odometry'
+
+
+def test_an_input_is_told_by_what_came_since_the_last_time(monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr(node_diagnostics.time, 'monotonic', lambda: now_s[0])
+    source = SimpleNamespace(
+        topic='/twist', received=0, age_s=None, malformed=0, trouble='',
+        backlog=SimpleNamespace(wait_s=0.0),
+    )  # fmt: skip
+    told, messages, rates = Told(source), [], []
+    for received, malformed, age_s in [(0, 0, None), (40, 2, 0.1), (60, 2, 0.1), (60, 2, 3.0)]:
+        source.received, source.malformed, source.age_s = received, malformed, age_s
+        now_s[0] += 2.0
+        status = told.publish(velocity=1)
+        messages.append(status.message)
+        rates.append(values_of(status)['/twist rate [Hz]'])
+    dropped = '2 messages dropped (malformed)'
+    assert messages == ['running', dropped, 'running', "no message on '/twist'"]
+    assert rates == ['0.0', '20.0', '10.0', '0.0']
+    now_s[0] += 2.0
+    source.trouble = 'another type'
+    assert told.publish(velocity=1).message == 'another type'
 
 
 def test_messages_that_are_all_dropped_are_an_error_and_some_a_warning():

@@ -301,6 +301,21 @@ def test_smoothing_a_run_without_noise_returns_the_truth(two_d_mode):
     )
 
 
+def test_in_hindsight_too_a_point_counts_as_its_message_says():
+    """Every second observation is a foot off, and says so."""
+    still = (1e-4,) * 3
+    settings = Settings(angular_velocity_noise=still, linear_velocity_noise=still)
+    estimator, points = Estimator(settings), 4.0 * np.vstack([np.eye(3), -np.eye(3)])
+    for step in range(20):
+        estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+        off_m, sigma_m = (0.3, 0.5) if step % 2 else (0.0, 0.01)
+        covariances = np.tile(sigma_m**2 * np.eye(3), (6, 1, 1))
+        seen = points + off_m * points / 4.0
+        estimator.add(ObservationEvent(step * 10**8, np.arange(6), seen, covariances))
+    estimator.flush()
+    np.testing.assert_allclose(estimator.smooth().world_points, points, atol=2e-3)
+
+
 def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkeypatch):
     """A stereo camera that has turned further than it knew errs along where it looks now."""
     noted, see = [], History.see

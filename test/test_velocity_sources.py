@@ -245,10 +245,22 @@ def test_another_clock_is_found_and_corrected_once():
     assert clock.correction_ns == 0
 
 
-def test_single_stragglers_are_not_another_clock():
+def test_when_this_machines_clock_has_jumped_the_offset_is_found_anew():
+    clock = ClockOffset(SECOND)
+    for index in range(SAMPLES):
+        clock.add(1000 * SECOND + index, 10 * SECOND + index)
+    clock.clear()
+    for index in range(SAMPLES):
+        assert (clock.offset_ns, clock.correction_ns) == (None, 0)
+        clock.add(1000 * SECOND + index, 1000 * SECOND + index)
+    assert clock.offset_ns == 0
+
+
+@pytest.mark.parametrize('straggler_s', [5, -5])
+def test_single_stragglers_are_not_another_clock(straggler_s):
     clock = ClockOffset(SECOND)
     for index in range(3 * SAMPLES):
-        delay = 5 * SECOND if index % 3 == 0 else 0
+        delay = straggler_s * SECOND if index % 3 == 0 else 0
         clock.add(index * SECOND, index * SECOND + delay)
     assert not clock.is_off
     assert clock.correction_ns == 0
