@@ -336,9 +336,8 @@ class Estimator:
         """
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        covariance = self._slam.pose_covariance_after(timeline.velocities, start_ns, end_ns)
-        doubt = self._frame.states.doubt
-        return covariance if covariance is None or doubt is None else covariance + doubt
+        states = self._frame.states
+        return states.pose_covariance_after(timeline.velocities, start_ns, end_ns)
 
     @property
     def body_velocity(self) -> FloatArray:
@@ -367,14 +366,13 @@ class Estimator:
     @property
     def world_points(self) -> FloatArray:
         """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
-        timeline, points = self._timeline, self._slam.world_points[self._slam.confirmed]
-        lead_s = to_s((timeline.stamp_ns or 0) - (timeline.state_ns or 0))
-        return points + lead_s * self.landmark_velocities
+        points = self._slam.world_points[self._slam.confirmed]
+        return points + self._timeline.lead_s * self.landmark_velocities
 
     @property
     def landmark_covariances(self) -> FloatArray | None:
-        """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
-        of_all = self._slam.landmark_covariances
+        """(n, 3, 3) covariances of the same, world, m²; None where the gains know none."""
+        of_all = self._slam.landmark_covariances_after(self._timeline.lead_s)
         return None if of_all is None else of_all[self._slam.confirmed]
 
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:

@@ -61,11 +61,12 @@ class Timeline:
         self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
         self._pending = 0
+        self._in_force_ns = 0  # no velocity of before can change what is in force
         self._newest_ns: dict[type, int] = {}
 
     def is_late(self, event: Event) -> bool:
         """Return whether a newer event was used already."""
-        return event.stamp_ns < (self.stamp_ns or 0)
+        return event.stamp_ns < self._in_force_ns
 
     def _begin(self, stamp_ns: int) -> int:
         """Note the stamp of an event that is about to be used; return ``state_ns``."""
@@ -91,9 +92,10 @@ class Timeline:
             raise InvalidEventError('too_late', 'a newer velocity was already used')
         self._newest_ns[kind] = event.stamp_ns
         if self.is_late(event):
-            event = replace(event, stamp_ns=self.stamp_ns or 0)
+            event = replace(event, stamp_ns=self._in_force_ns)
         if not self.velocities.append(event):
             return False
+        self._in_force_ns = event.stamp_ns
         self._begin(event.stamp_ns)
         self._pending += 1
         if self._pending >= MAX_PENDING_VELOCITIES:
@@ -104,6 +106,11 @@ class Timeline:
     def body_velocity(self) -> FloatArray | None:
         """(6,) velocity (Ω, v) in force at ``stamp_ns``; None if none is or it has timed out."""
         return None if self.stamp_ns is None else self.velocities.latest(self.stamp_ns)
+
+    @property
+    def lead_s(self) -> float:
+        """Seconds from ``state_ns`` to ``stamp_ns``."""
+        return to_s((self.stamp_ns or 0) - (self.state_ns or 0))
 
     def catch_up(self) -> None:
         """Move the states on to the last event that was used."""
@@ -121,6 +128,7 @@ class Timeline:
         self._frame.states.advance(self.velocities, start_ns, stamp_ns)
         self.velocities.forget_before(stamp_ns - self._kept_ns)
         self.state_ns = stamp_ns
+        self._in_force_ns = max(self._in_force_ns, stamp_ns)
 
     def meet(self, event: ObservationEvent) -> ObservationEvent:
         """Move the states on to an observation, or it to them if it is late; return it.
@@ -150,11 +158,11 @@ class Timeline:
         down.
         """
         slam, back = self._frame.slam, self.motion(state_ns, event.stamp_ns)
-        points, sensor = event.points, event.sensor
-        if event.velocities is not None:
-            shifts = event.velocities * to_s(state_ns - event.stamp_ns)
-            # The sensor with it, so that it was measured from as far.
-            points, sensor = points + shifts, shifts if sensor is None else sensor + shifts
+        velocities = slam.velocities_of(event, slam.observer.A @ back)
+        shifts = velocities * to_s(state_ns - event.stamp_ns)
+        points = event.points + shifts
+        # The sensor with it, so that it was measured from as far.
+        sensor = shifts if event.sensor is None else event.sensor + shifts
         shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
         moved = move_observation(shifted, back)
         Q = transition_covariance(

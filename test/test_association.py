@@ -38,6 +38,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.parameter_file import read_parameter_file
 from slam_observer_ros.parameters import from_parameters, table
@@ -667,6 +668,20 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
     assert before[2, 2] < after[2, 2]
 
 
+def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved_on():
+    """The further the robot goes, the further apart are states that differ in their heading."""
+    states = Hypotheses(Slam(PLANAR, np.eye(4)))
+    states._states, states._costs = [states.best, deepcopy(states.best)], [0.0, 1.0]
+    for slam, yaw_rad in zip(states._states, [0.0, 0.4], strict=True):
+        slam.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
+    velocities, end_ns = VelocityHistory(10**10), 6 * 10**9
+    velocities.append(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
+    told = states.pose_covariance_after(velocities, 0, end_ns)
+    states.advance(velocities, 0, end_ns)
+    assert_allclose(told, states.pose_covariance_after(velocities, end_ns, end_ns), atol=1e-9)
+    assert np.sqrt(told[4, 4]) > 1.0
+
+
 def test_settings_and_jumps_of_the_clock_are_of_all_states_that_are_followed():
     states = Hypotheses(Slam(Settings(), np.eye(4)))
     states._states = [Mock(), Mock()]
@@ -692,7 +707,8 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     turns = so3.log(poses[:, :3, :3] @ poses[0, :3, :3].T)
     d = np.column_stack([turns, poses[:, :3, 3] - poses[0, :3, 3]])
     each = covariances + d[:, :, None] * d[:, None, :]
-    expected = np.einsum('i,ijk->jk', weights, each) - covariances[0]
-    assert_allclose(states.doubt, expected, atol=1e-9)
+    expected = np.einsum('i,ijk->jk', weights, each)
+    velocities = VelocityHistory(10**9)
+    assert_allclose(states.pose_covariance_after(velocities, 0, 0), expected, atol=1e-9)
     states.decide()
-    assert states.doubt is None
+    assert_allclose(states.pose_covariance_after(velocities, 0, 0), covariances[0], atol=1e-9)

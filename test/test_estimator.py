@@ -212,6 +212,14 @@ def test_a_velocity_that_is_late_is_used_though_a_newer_one_of_a_gyroscope_was_b
     assert not estimator.dropped
 
 
+def test_an_observation_without_points_makes_no_velocity_late():
+    stop = velocity(0.5, np.zeros(6))
+    events = [velocity(0.0), observation(1.0, []), stop, observation(1.5, [])]
+    estimator = run(events, reorder_window=0.0, velocity_timeout=5.0)
+    assert not estimator.counts['late_velocity']
+    np.testing.assert_allclose(estimator.pose, true_pose(0.5), atol=1e-9)
+
+
 def test_however_many_velocities_come_late_no_motion_counts_twice():
     events = [velocity(0.0), observation(0.4, [])]
     events += [velocity(0.001 * step) for step in range(1, 3 * MAX_PENDING_VELOCITIES)]
@@ -241,19 +249,28 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(m, a
     np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.parametrize('is_estimated', [False, True])
 @pytest.mark.parametrize('turn_rad', [0.0, 1.0])
-def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_rad):
+def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_rad, is_estimated):
     still = (0.0,) * 3
     settings = Settings(
-        observation_model='stereo', angular_velocity_noise=still, linear_velocity_noise=still
+        observation_model='stereo',
+        angular_velocity_noise=still,
+        linear_velocity_noise=still,
+        landmark_velocity_error=0.5 * is_estimated,
     )
-    timeline = Timeline(MapFrame(settings), settings)
+    frame = MapFrame(settings)
+    timeline = Timeline(frame, settings)
     turning = np.array([0.0, 0.0, turn_rad / 0.9, 0.0, 0.0, 0.0])
     for step in range(11):
         timeline.append(velocity(0.1 * step, turning))
     timeline.catch_up()
     seen, speed = np.array([[5.0, 0.0, 0.0]]), np.array([[4.0, 0.0, 0.0]])
     event = ObservationEvent(START_NS + 10**8, np.array([1]), seen, velocities=speed)
+    if is_estimated:
+        frame.observe(replace(event, stamp_ns=timeline.state_ns))
+        frame.slam.observer.u[0] = so3.exp(0.1 * turning[:3]) @ speed[0]
+        event = replace(event, velocities=None)
     carried = timeline.meet(event)
     R = so3.exp(np.array([0.0, 0.0, turn_rad]))
     np.testing.assert_allclose(carried.points, (seen + 0.9 * speed) @ R, atol=1e-9)
@@ -900,6 +917,31 @@ def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():
         estimator.add(ObservationEvent(stamp_ns, np.arange(5), points))
     estimator.flush()
     np.testing.assert_allclose(estimator.landmark_velocities, speed, atol=0.03)
+
+
+def moving_landmark(speeds=None):
+    """An estimator of a landmark's velocity that saw one for a second and then drives on."""
+    settings = Settings(landmark_velocity_error=0.5, reorder_window=0.0, velocity_timeout=10.0)
+    estimator = Estimator(settings)
+    for step in range(40):
+        stamp_ns = START_NS + step * 10**8
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        if step <= 10:
+            point = np.array([[5.0 + 0.02 * step, 0.0, 0.0]])
+            estimator.add(ObservationEvent(stamp_ns, np.array([1]), point, velocities=speeds))
+    return estimator
+
+
+def test_a_landmark_that_moves_is_the_less_certain_the_longer_it_was_not_seen():
+    estimator = moving_landmark()
+    told = estimator.landmark_covariances
+    assert estimator.stamp_ns - estimator._timeline.state_ns > 10**9
+    estimator.flush()
+    np.testing.assert_allclose(told, estimator.landmark_covariances, rtol=0.05, atol=1e-5)
+
+
+def test_where_velocities_of_landmarks_are_estimated_those_of_messages_are_not_used():
+    assert_same_state(moving_landmark(np.array([[3.0, 2.0, 1.0]])), moving_landmark())
 
 
 def test_a_landmark_that_is_placed_anew_moves_as_its_sensor_says_from_then_on():

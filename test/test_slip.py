@@ -74,7 +74,7 @@ def test_after_a_slip_the_pose_is_as_uncertain_as_the_slip_was_large_up_to_a_lim
             estimator.add(ObservationEvent(step * 10**8, ids, point))
         slam, seen = estimator._slam, point + [[shift_m, 0.0, 0.0]]
         slip(slam, slam.look(ObservationEvent(4 * 10**8, ids, seen)))
-        return np.trace(slam.pose_covariance[3:, 3:])
+        return np.trace(slam.gains.pose_error_covariance[3:, 3:])
 
     assert 2.0 * variance_m2(0.3) < variance_m2(0.6) < 0.5 * variance_m2(2.0)
     assert variance_m2(3.0) == pytest.approx(variance_m2(2.0), rel=0.01)
@@ -250,6 +250,24 @@ def test_a_landmark_that_moved_and_is_seen_alone_does_not_throw_the_pose(setting
     _, plain_m = run(world, settings)
     assert estimator.counts['rejected_landmark'] >= 1
     assert max(errors_m.values()) < max(plain_m.values()) + 0.3
+
+
+@modes
+@seeds
+def test_a_landmark_that_moved_away_from_beside_the_robot_does_not_throw_the_pose(settings, seed):
+    """Its noise is that of where it is seen now, not of where it was: right at the sensor."""
+    rng, estimator, points = np.random.default_rng(seed), Estimator(settings), 4.0 * np.eye(3)
+    points[2] = [0.1, 0.0, 0.0]
+    for step in range(40):
+        stamp_ns, ids = START_NS + step * 10**8, np.arange(3) if step < 20 else np.array([2])
+        if step == 20:
+            points[2] = [3.0, 2.0, 0.0]
+        noise = rng.normal(size=(len(ids), 3)) * ([0.1, 0.1, 0.0] if step >= 20 else 0.0)
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        estimator.add(ObservationEvent(stamp_ns, ids, points[ids] + noise))
+    assert estimator.counts['slip'] == 0
+    assert estimator.counts['moved_landmark'] == 1
+    assert np.linalg.norm(estimator.pose[:3, 3]) < 0.1
 
 
 @modes

@@ -66,7 +66,6 @@ class Hypotheses:
         self._limit = slam.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
-        self._doubt: FloatArray | None = None
 
     def __len__(self) -> int:
         """Return how many states are followed."""
@@ -79,36 +78,31 @@ class Hypotheses:
 
     def decide(self) -> Slam:
         """Give up all states but the most likely one, and return that."""
-        self._states, self._costs, self._doubt = self._states[:1], [0.0], None
+        self._states, self._costs = self._states[:1], [0.0]
         return self.best
 
-    @property
-    def doubt(self) -> FloatArray | None:
-        """(6, 6) what the pose's covariance lacks if the most likely state may be wrong.
+    def pose_covariance_after(
+        self, velocities: VelocityHistory, start_ns: int, end_ns: int
+    ) -> FloatArray | None:
+        """Return the covariance (6, 6) of the most likely pose at ``end_ns``, which may be wrong.
 
-        Σ w_i (P_i + d_i d_iᵀ) − P_1 at the states' instant, with w_i the likelihoods of the
-        states and d_i how far their poses are from that of the first, in its coordinates. None
-        if there is one state.
+        Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the states, moved on from ``start_ns``,
+        and d_i how far their poses are then from that of the first. Coordinates are those of
+        :meth:`.Slam.pose_after`. None where the gains know none.
         """
-        if self._doubt is None and len(self._states) > 1:
-            self._doubt = self._spread()
-        return self._doubt
-
-    def _spread(self) -> FloatArray | None:
-        likelihoods = np.exp(-0.5 * np.array(self._costs))
-        weights, spread = likelihoods / likelihoods.sum(), np.zeros((6, 6))
-        own = self.best.pose_covariance
+        pose, own = self.best.pose_after(velocities, start_ns, end_ns)
+        likelihoods, total = np.exp(-0.5 * np.array(self._costs)), own
+        weights = likelihoods / likelihoods.sum()
         for slam, weight in zip(self._states[1:], weights[1:].tolist(), strict=True):
-            covariance = slam.pose_covariance
-            if own is None or covariance is None:
+            other, covariance = slam.pose_after(velocities, start_ns, end_ns)
+            if total is None or own is None or covariance is None:
                 return None
-            d = _difference(self.best.observer.pose, slam.observer.pose)
-            spread += weight * (covariance - own + np.outer(d, d))
-        return spread
+            d = _difference(pose, other)
+            total = total + weight * (covariance - own + np.outer(d, d))
+        return total
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move all states, which are those of ``start_ns``, on to ``end_ns``."""
-        self._doubt = None
         for slam in self._states:
             slam.advance(velocities, start_ns, end_ns)
 
@@ -132,7 +126,6 @@ class Hypotheses:
 
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at the states' instant; return what the best one makes of it."""
-        self._doubt = None
         is_unknown = event.ids == UNKNOWN_ID
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
         if len(self._states) == 1 and not is_unknown.any():

@@ -209,10 +209,12 @@ def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tupl
 def _cost_of_staying(slam: Slam, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
     """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
 
-    Where they were rejected first is known as well as the sensor tells. No landmark costs more
-    than another outlier.
+    Where they were rejected last is known as well as the sensor tells: compared with the first
+    place, one that goes on moving would pay for one and the same shift each time. No landmark
+    costs more than another outlier.
     """
-    k, noise = slam.axes.point, 2.0 * sighting.residuals.covariances
+    k, seen = slam.axes.point, sighting.event.select(sighting.known)
+    noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(seen))
     again, shifts = slam.rejected_before(sighting)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
     return again, np.minimum(costs, _outlier_cost(slam))

@@ -45,8 +45,8 @@ def slip(slam: Slam, sighting: Sighting) -> float:
         path=np.array([start, observer.A, observer.A]),
         measured_velocities=stray.body_velocities,
         dt_s=stray.dt_s,
-        gap_s=np.zeros(2),
         covariances=noise,
+        duration_s=0.0,
         at_ends=None,
     )
     slam.gains.predict(observer, moved)

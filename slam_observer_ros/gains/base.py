@@ -254,6 +254,10 @@ class GainDesign:
         """(n, 3, 3) covariances of the errors ã_i, reference frame, m²; None if unknown."""
         return None
 
+    def landmark_error_covariances_after(self, duration_s: float) -> FloatArray | None:
+        """Return what the same will be when landmarks that move have moved on."""
+        return self.landmark_error_covariances
+
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and m landmarks; None if unknown."""
         return None

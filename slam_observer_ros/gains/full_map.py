@@ -52,7 +52,11 @@ class FullMapGains(RiccatiGains):
     @property
     def landmark_error_covariances(self) -> FloatArray:
         """(n, 3, 3) covariances of the landmark errors ã_i."""
-        return self._joint.landmarks
+        return self._joint.landmarks_after(0.0)
+
+    def landmark_error_covariances_after(self, duration_s: float) -> FloatArray:
+        """Return what the same will be when landmarks that move have moved on."""
+        return self._joint.landmarks_after(duration_s)
 
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
@@ -76,9 +80,8 @@ class FullMapGains(RiccatiGains):
         """
         joint, everything = self._joint, np.arange(self._joint.count)
         a, u = joint.columns(everything), joint.velocity_columns(everything)
-        duration_s = np.sum(motion.dt_s + motion.gap_s)
-        joint.P[a] += duration_s * joint.P[u]
-        joint.P[:, a] += duration_s * joint.P[:, u]
+        joint.P[a] += motion.duration_s * joint.P[u]
+        joint.P[:, a] += motion.duration_s * joint.P[:, u]
         joint.turn(u, observer.u)
         predict(joint.P, self._axes, self.calibration, motion)
         joint.turn(u, -observer.u)

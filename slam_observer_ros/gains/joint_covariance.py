@@ -9,7 +9,7 @@ import numpy as np
 from slam_observer_ros.gains.prediction import initial_covariance
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.matrices import block_diagonal
+from slam_observer_ros.matrices import block_diagonal, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.types import FloatArray, IntArray
@@ -53,14 +53,23 @@ class JointCovariance:
         """(p, p) covariance of ε."""
         return self.P[: self._p, : self._p]
 
-    @property
-    def landmarks(self) -> FloatArray:
-        """(n, 3, 3) covariances of the landmark errors ã_i."""
-        k = self._axes.point
-        columns = self.columns(np.arange(self.count)).reshape(-1, k)
+    def landmarks_after(self, duration_s: float) -> FloatArray:
+        """Return the covariances (n, 3, 3) of ã_i + ũ_i t after t seconds, m²."""
+        k, everything = self._axes.point, np.arange(self.count)
+        a, u = self.columns(everything), self.velocity_columns(everything)
         covariances = np.zeros((self.count, 3, 3))
-        covariances[:, :k, :k] = self.P[columns[:, :, None], columns[:, None, :]]
+        covariances[:, :k, :k] = self._blocks(a, a)
+        if len(u):
+            crossed = duration_s * self._blocks(a, u)
+            covariances[:, :k, :k] += crossed + transpose(crossed)
+            covariances[:, :k, :k] += duration_s**2 * self._blocks(u, u)
         return covariances
+
+    def _blocks(self, left: IntArray, right: IntArray) -> FloatArray:
+        """Return the blocks (n, k, k) of P at the columns (n k,) of each landmark."""
+        k = self._axes.point
+        blocks: FloatArray = self.P[left.reshape(-1, k, 1), right.reshape(-1, 1, k)]
+        return blocks
 
     @property
     def map_columns(self) -> IntArray | slice:

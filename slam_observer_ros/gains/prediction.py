@@ -48,7 +48,7 @@ def predict(
         P[:p] += F @ P[c]
         P[:p, :p] += P[:p, c] @ F.T
         P[p:, :p] = P[:p, p:].T
-        P[c, c] += calibration.drift_covariance * np.sum(motion.dt_s + motion.gap_s)
+        P[c, c] += calibration.drift_covariance * motion.duration_s
     # No observation takes a skew part away again, so rounding must not add to it.
     P[:p, :p] = symmetric(P[:p, :p] + noise)
     return noise, F

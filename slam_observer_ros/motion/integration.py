@@ -62,8 +62,8 @@ def integrate(
         path=_path(A, held, calibration),
         measured_velocities=held.body_velocities,
         dt_s=held.dt_s,
-        gap_s=held.gap_s,
         covariances=noise.covariances(held),
+        duration_s=float((held.dt_s + held.gap_s).sum()),
         at_ends=np.array([at_start, _around(velocities, calibration, end_ns)]),
     )
 

@@ -19,10 +19,10 @@ class Motion:
         (k, 6) velocities (Ω, v) as measured, rad/s and m/s.
     dt_s : FloatArray
         (k,) seconds that each velocity was held.
-    gap_s : FloatArray
-        (k,) seconds of each piece without a known velocity; ``dt_s`` is zero then.
     covariances : FloatArray
         (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
+    duration_s : float
+        Seconds in all, with those without a known velocity.
     at_ends : FloatArray or None
         (2, 6) measured velocities around the start and the end, rad/s and m/s; None where what
         moved does not depend on the delay of the velocities.
@@ -32,6 +32,6 @@ class Motion:
     path: FloatArray
     measured_velocities: FloatArray
     dt_s: FloatArray
-    gap_s: FloatArray
     covariances: FloatArray
+    duration_s: float
     at_ends: FloatArray | None

@@ -19,6 +19,7 @@ _COLUMNS = (
     'counts',
     'rejections',
     'rejected_at',
+    'rejected_last',
     'last_seen_ns',
     'seen_before_ns',
     'tentative',
@@ -40,6 +41,8 @@ class LandmarkTable:
         (n,) how many observations in a row were rejected at one place, up to now.
     rejected_at : FloatArray
         (n, 3) where each was at the first of these, metres, reference frame.
+    rejected_last : FloatArray
+        (n, 3) where each was at the last of them.
     last_seen_ns : IntArray
         (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
     seen_before_ns : IntArray
@@ -63,6 +66,7 @@ class LandmarkTable:
         self.in_view: IntArray = np.empty(0, dtype=np.int64)
         self.missed: IntArray = np.empty(0, dtype=np.int64)
         self.rejected_at: FloatArray = np.empty((0, 3))
+        self.rejected_last: FloatArray = np.empty((0, 3))
         self._settled_in_view = 0
         self._settled_seen = 0
         self._order: IntArray = np.empty(0, dtype=np.int64)
@@ -138,6 +142,7 @@ class LandmarkTable:
         same_place = self.are_rejected_again(rows, points, tolerances_m)
         self.rejections[rows] = np.where(same_place, self.rejections[rows] + 1, 1)
         self.rejected_at[rows[~same_place]] = points[~same_place]
+        self.rejected_last[rows] = points
 
     def are_rejected_again(
         self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray

@@ -132,14 +132,14 @@ class Outlook:
         dt_s = self._landmarks.unseen_s(rows, event.stamp_ns)
         return Seen(event.stamp_ns, rows, event.points, sights, stated, dt_s)
 
-    def places(self, points: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def places(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
         """Return where points seem to be (m, 3), and within what they are at one place, metres.
 
-        They are given in the body frame, with ``covariances`` along any axes, and returned in the
-        reference frame.
+        In the reference frame, by their noise there: that of where a landmark should be may be
+        much less.
         """
-        spread_m = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
-        return se3.transform(self._observer.A, points), SAME_PLACE * spread_m
+        spread_m = np.sqrt(np.trace(self._noise.covariances(event), axis1=1, axis2=2))
+        return se3.transform(self._observer.A, event.points), SAME_PLACE * spread_m
 
     def covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return what observed points may be off by: (m, 3, 3), body frame, m².

@@ -107,24 +107,30 @@ class Slam:
     @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
-        return covariances.of_landmarks(self.observer, self.gains)
+        return self.landmark_covariances_after(0.0)
 
-    @property
-    def pose_covariance(self) -> FloatArray | None:
-        """(6, 6) covariance of the pose's rotation vector and position, along the world's axes.
+    def landmark_covariances_after(self, duration_s: float) -> FloatArray | None:
+        """Return the same as they will be when landmarks that move have moved on."""
+        return covariances.of_landmarks(self.observer, self.gains, duration_s)
 
-        In rad² and m². None where the gains know none.
-        """
-        now = self.gains.pose_error_covariance
-        return covariances.of_pose(self.observer, now, self.observer.A)
-
-    def pose_covariance_after(
+    def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
-    ) -> FloatArray | None:
-        """Return the same (6, 6) as it will be at ``end_ns``."""
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return what the pose will be at ``end_ns``, and how uncertain it will be.
+
+        Returns
+        -------
+        pose : FloatArray
+            (4, 4) body to world.
+        covariance : FloatArray or None
+            (6, 6) of its rotation vector and position, along the world's axes, rad² and m². None
+            where the gains know none.
+
+        """
         moved = self._motion(velocities, start_ns, end_ns)
         after = self.gains.pose_error_covariance_after(moved)
-        return covariances.of_pose(self.observer, after, moved.path[-1])
+        A = moved.path[-1]
+        return self.observer.reference_pose @ A, covariances.of_pose(self.observer, after, A)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot and keep the map; what they have to do with each other is forgotten.
@@ -134,7 +140,7 @@ class Slam:
         pose : FloatArray
             (4, 4) body to world.
         covariance : FloatArray or None
-            (6, 6) as :attr:`pose_covariance` has it; None for an exact pose.
+            (6, 6) as :meth:`pose_after` has it; None for an exact pose.
 
         """
         observer = self.observer
@@ -163,7 +169,7 @@ class Slam:
         """Move the state, which is that of ``start_ns``, on to ``end_ns``."""
         moved = self._motion(velocities, start_ns, end_ns)
         self.observer.propagate(moved.path)
-        self.observer.move_landmarks(float((moved.dt_s + moved.gap_s).sum()))
+        self.observer.move_landmarks(moved.duration_s)
         self.gains.predict(self.observer, moved)
         self._end_velocity = None if moved.at_ends is None else moved.at_ends[1]
 
@@ -179,8 +185,31 @@ class Slam:
         )
 
     def covariances_of(self, event: ObservationEvent) -> FloatArray:
-        """Return what its points would be taken to be off by: (m, 3, 3), body frame, m²."""
-        return self._outlook.covariances(event, self.landmarks.rows_of(event.ids))
+        """Return what its points would be taken to be off by: (m, 3, 3), body frame, m².
+
+        It moves landmarks whose gains had put that off.
+        """
+        rows = self.landmarks.rows_of(event.ids)
+        self.gains.recall(self.observer, rows[rows >= 0])
+        return self._outlook.covariances(event, rows)
+
+    @property
+    def _estimates_velocities(self) -> bool:
+        """Whether the gains find out how landmarks move, whatever a sensor says of that."""
+        name = 'landmark_velocity_error'
+        return name not in self.gains.ignores and getattr(self.settings, name) > 0.0
+
+    def velocities_of(self, event: ObservationEvent, A: FloatArray) -> FloatArray:
+        """Return how its landmarks (m, 3) move, m/s, along the axes of the body at Â = ``A``.
+
+        As estimated, or else as the observation says, which is made there; zero if neither is.
+        """
+        velocities = np.zeros_like(event.points)
+        if not self._estimates_velocities:
+            return velocities if event.velocities is None else event.velocities
+        rows = self.landmarks.rows_of(event.ids)
+        velocities[rows >= 0] = self.observer.u[rows[rows >= 0]]
+        return se3.rotate(se3.inverse(A), velocities)
 
     def look(self, event: ObservationEvent) -> Sighting:
         """Return what an observation made at the state's instant tells, before it is used.
@@ -222,8 +251,7 @@ class Slam:
         Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
         """
         event, rows = self._mapped(event)  # one may have made room
-        noise = self.observation_noise.covariances(event)
-        self.landmarks.reject(rows, *self._outlook.places(event.points, noise))
+        self.landmarks.reject(rows, *self._outlook.places(event))
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         if in_doubt.any():
             self.remove(rows[in_doubt])
@@ -231,13 +259,13 @@ class Slam:
     def rejected_before(self, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
         """Return which known landmarks (m,) in it were rejected before where they are seen now.
 
-        And how far all of them (m, 3) are from where they were rejected first, metres, reference
+        And how far all of them (m, 3) are from where they were rejected last, metres, reference
         frame.
         """
-        rows, seen = sighting.residuals.rows, sighting.event.points[sighting.known]
-        points, tolerances_m = self._outlook.places(seen, sighting.residuals.covariances)
+        rows = sighting.residuals.rows
+        points, tolerances_m = self._outlook.places(sighting.event.select(sighting.known))
         again = self.landmarks.are_rejected_again(rows, points, tolerances_m)
-        return again, points - self.landmarks.rejected_at[rows]
+        return again, points - self.landmarks.rejected_last[rows]
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; see :meth:`.GainDesign.smooth`."""
@@ -290,8 +318,7 @@ class Slam:
         self.was_contradicted = is_contradiction(rejected)
         self.landmarks.accept(rows[~rejected], event.stamp_ns)
         if rejected.any():
-            noise = residuals.covariances[rejected]
-            places = self._outlook.places(event.points[rejected], noise)
+            places = self._outlook.places(event.select(rejected))
             self.landmarks.reject(rows[rejected], *places)
             self.counts['rejected_landmark'] += int(np.sum(rejected))
         return rejected
@@ -299,9 +326,9 @@ class Slam:
     def _note_velocities(self, event: ObservationEvent, rows: IntArray) -> None:
         """Let landmarks move as the sensor says; by one that says nothing they are static."""
         velocities = event.velocities
-        if velocities is None and self.settings.landmark_velocity_error == 0.0:
-            velocities = np.zeros((len(rows), 3)) if self.observer.have_moved else None
-        if velocities is None or self.is_fixed:
+        if velocities is None and self.observer.have_moved:
+            velocities = np.zeros((len(rows), 3))
+        if velocities is None or self._estimates_velocities or self.is_fixed:
             return
         used = self.landmarks.rejections[rows] == 0
         self.observer.set_landmark_velocities(rows[used], velocities[used])
