@@ -37,6 +37,17 @@ def solve(S: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(solution, dtype=np.float64)
 
 
+def condition(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
+    """Make P, in place, what an observation C x of covariance S leaves of it; return K = P Cᵀ S⁻¹.
+
+    In Joseph's form, (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, it stays positive.
+    """
+    K: FloatArray = solve(S, CP).T
+    half = K @ (0.5 * S @ K.T - CP)
+    P += half + half.T
+    return K
+
+
 def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return √(r_iᵀ Σ_i⁻¹ r_i) (m,) of residuals (m, k) with covariances (m, k, k)."""
     whitened = np.linalg.solve(covariances, r[:, :, None])

@@ -196,8 +196,8 @@ class Observer:
     def correct(self, correction: Correction) -> None:
         """Move the state from the left by (D, d_i); see the module's text."""
         D, rows = correction.D, correction.rows
-        self.A = D @ self.A
-        self.a[rows] = self.a[rows] @ D[:3, :3].T + correction.d
+        self.A = D @ self.A  # (28), Δ for a finite time
+        self.a[rows] = self.a[rows] @ D[:3, :3].T + correction.d  # (28), δ_i
         if correction.u is not None:
             self.u[rows] = self.u[rows] @ D[:3, :3].T + correction.u
             self.have_moved = True

@@ -26,9 +26,8 @@ class Filter:
         path = paths.path(self.observer.A, V * dt_s[:, None])
         self.observer.propagate(path)
         self.observer.move_landmarks(float(np.sum(dt_s)))
-        no_gaps = np.zeros(len(dt_s))
         at_ends = np.zeros((2, 6))
-        motion = Motion(path, body_velocities, dt_s, no_gaps, covariances, at_ends)
+        motion = Motion(path, body_velocities, dt_s, covariances, float(dt_s.sum()), at_ends)
         self.gains.predict(self.observer, motion)
 
     def add(self, points, covariances):

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.association.assignments import MARGIN
-from slam_observer_ros.association.hypotheses import Hypotheses
+from slam_observer_ros.association.hypotheses import are_one, Hypotheses
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     huber_loss,
@@ -25,7 +25,7 @@ from slam_observer_ros.association.joint_compatibility import (
     MAX_PARTIAL,
     Pairs,
 )
-from slam_observer_ros.association.readings import are_one, readings
+from slam_observer_ros.association.readings import readings
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory

@@ -260,7 +260,7 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
 
     nominal = path(np.zeros(calibration.count))
     motion = Motion(
-        nominal, V, np.full(pieces, dt_s), np.zeros(pieces), np.zeros((pieces, 6, 6)), V[[0, -1]]
+        nominal, V, np.full(pieces, dt_s), np.zeros((pieces, 6, 6)), pieces * dt_s, V[[0, -1]]
     )
     Ad = se3.adjoint(nominal)[:, axes.pose]
     F = calibration.sensitivity(Ad, motion)
@@ -282,8 +282,8 @@ def test_drift_lets_the_uncertainty_grow_with_time():
         np.tile(np.eye(4), (5, 1, 1)),
         np.zeros((4, 6)),
         np.array([1.0, 1.0, 0.5, 1.0]),
-        np.array([0.0, 0.0, 0.5, 0.0]),  # half a second without a velocity
         np.zeros((4, 6, 6)),
+        4.0,  # half a second of it without a velocity
         np.zeros((2, 6)),
     )
     predict(P, SPATIAL, calibration, still)
@@ -318,7 +318,7 @@ def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
     calibration.shift(np.full(calibration.count, 0.1))
     path = np.array([np.eye(4), se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))])
     zero = np.zeros(1)
-    carried = Motion(path, np.zeros((1, 6)), zero, zero, np.zeros((1, 6, 6)), None)
+    carried = Motion(path, np.zeros((1, 6)), zero, np.zeros((1, 6, 6)), 0.0, None)
     assert not calibration.sensitivity(se3.adjoint(path), carried).any()
 
 

@@ -242,8 +242,10 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
         start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
         history = History(axes, ObservationNoise(settings), start, 'the start')
         for a, b in pairwise((0, *cuts, k)):
-            no_gaps, at_ends = np.zeros(b - a), np.zeros((2, 6))
-            part = Motion(path[a : b + 1], V[a:b], dt_s[a:b], no_gaps, covariances[a:b], at_ends)
+            at_ends, duration_s = np.zeros((2, 6)), float(dt_s[a:b].sum())
+            part = Motion(
+                path[a : b + 1], V[a:b], dt_s[a:b], covariances[a:b], duration_s, at_ends
+            )
             P = initial_covariance(axes, calibration)
             history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
         nothing = Seen(

@@ -17,14 +17,8 @@ from operator import attrgetter
 
 import numpy as np
 
-from slam_observer_ros.association.joint_compatibility import MARGIN
-from slam_observer_ros.association.readings import (
-    are_one,
-    is_ambiguous,
-    may_name,
-    Reading,
-    readings,
-)
+from slam_observer_ros.association.joint_compatibility import MARGIN, RESOLUTION
+from slam_observer_ros.association.readings import is_ambiguous, may_name, Reading, readings
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
@@ -32,7 +26,8 @@ from slam_observer_ros.events import (
     ObservationEvent,
     UNKNOWN_ID,
 )
-from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.matrices import mahalanobis
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.sighting import Outcome
@@ -140,7 +135,9 @@ class Hypotheses:
             uses[number] -= 1
             slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
             state = self._follow(slam, reading, event)
-            if not any(_are_one(state, other) for other in followed):
+            if not any(
+                are_one(slam, reading.event, other.slam, other.reading.event) for other in followed
+            ):
                 followed.append(state)
             if len(followed) == self._limit:
                 break
@@ -189,9 +186,24 @@ def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
     return np.concatenate([turn, other[:3, 3] - pose[:3, 3]])
 
 
-def _are_one(state: _Followed, other: _Followed) -> bool:
-    """Return whether two states have the robot and the landmarks seen at the same places."""
-    event, other_event = state.reading.event, other.reading.event
+def are_one(
+    slam: Slam, event: ObservationEvent, other: Slam, other_event: ObservationEvent
+) -> bool:
+    """Return whether two states, by the points they saw, are at one place with one map there.
+
+    That is so if they have the points, and each landmark that either takes one of them for, at
+    the same places: which was which this once does not matter then.
+    """
     if not np.array_equal(event.points, other_event.points):  # one leaves some out
         return False
-    return are_one(state.slam, event, other.slam, other_event)
+    here, there = slam.observer.pose, other.observer.pose
+    noise = here[:3, :3] @ slam.observation_noise.covariances(event) @ here[:3, :3].T
+    shifts = [se3.transform(here, event.points) - se3.transform(there, event.points)]
+    if not np.array_equal(event.ids, other_event.ids):
+        for ids in (event.ids, other_event.ids):
+            rows, other_rows = slam.landmarks.rows_of(ids), other.landmarks.rows_of(ids)
+            if (rows < 0).any() or (other_rows < 0).any():
+                return False
+            shifts.append(slam.world_points[rows] - other.world_points[other_rows])
+    distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
+    return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)

@@ -22,7 +22,6 @@ from slam_observer_ros.association.assignments import Assignment, find_assignmen
 from slam_observer_ros.association.joint_compatibility import (
     huber_loss,
     joint_cost,
-    RESOLUTION,
     unpaired_cost,
 )
 from slam_observer_ros.association.slip import slip
@@ -30,7 +29,6 @@ from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import are_far, far_from_the_others, gated
-from slam_observer_ros.geometry import se3
 from slam_observer_ros.matrices import mahalanobis, with_blocks
 from slam_observer_ros.slam.sighting import is_contradiction, Sighting
 from slam_observer_ros.slam.slam import Slam
@@ -259,27 +257,6 @@ def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> BoolArra
     if far.any():
         far &= far_from_the_others(r, gains.predicted(residuals), noise, slam.settings)
     return far
-
-
-def are_one(
-    slam: Slam, event: ObservationEvent, other: Slam, other_event: ObservationEvent
-) -> bool:
-    """Return whether two states, by the same m points seen, are at one place with one map there.
-
-    That is so if they have the points, and each landmark that either takes one of them for, at
-    the same places: which was which this once does not matter then.
-    """
-    here, there = slam.observer.pose, other.observer.pose
-    noise = here[:3, :3] @ slam.observation_noise.covariances(event) @ here[:3, :3].T
-    shifts = [se3.transform(here, event.points) - se3.transform(there, event.points)]
-    if not np.array_equal(event.ids, other_event.ids):
-        for ids in (event.ids, other_event.ids):
-            rows, other_rows = slam.landmarks.rows_of(ids), other.landmarks.rows_of(ids)
-            if (rows < 0).any() or (other_rows < 0).any():
-                return False
-            shifts.append(slam.world_points[rows] - other.world_points[other_rows])
-    distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
-    return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)
 
 
 def _named(

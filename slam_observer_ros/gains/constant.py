@@ -6,8 +6,9 @@ g = Σ k_i J_iᵀ r_i and the Gauss–Newton matrix H = Σ k_i J_iᵀ J_i, that 
 
     ξ = −U diag((1 − e^{−λ dt})/λ) Uᵀ g,      H = U diag(λ) Uᵀ,
 
-and the landmarks close the share 1 − e^{−(l/k) dt} of what remains. To first order in dt this is
-Δ dt and δ_i dt; for dt → ∞ it is one Gauss–Newton step.
+and the landmarks close the share 1 − e^{−(l/k) dt} of what remains. For dt → ∞ it is one
+Gauss–Newton step. For dt → 0 it is −g dt about the centroid of the e_i, down the same L as the
+paper's Δ dt in another metric; with `step_mode: paper` it is Δ dt.
 """
 
 from __future__ import annotations

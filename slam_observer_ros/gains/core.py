@@ -16,7 +16,7 @@ import numpy as np
 from slam_observer_ros.gains.leaves import Leaves
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.matrices import symmetric, transpose
+from slam_observer_ros.matrices import condition, symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.types import FloatArray, IntArray
@@ -93,10 +93,7 @@ class Core:
         root = transpose(np.linalg.cholesky(gain_k).astype(np.float64)) @ H
         W = np.asarray(np.linalg.qr(root.reshape(-1, len(self.P)), mode='r'))  # WᵀW = Σ Hᵀ k H
         WP = W @ self.P
-        S = WP @ W.T + np.eye(len(W))
-        K = np.linalg.solve(S, WP).T
-        half = K @ (0.5 * S @ K.T - WP)
-        self.P += half + half.T
+        condition(self.P, WP, WP @ W.T + np.eye(len(W)))
 
     def turn(self, x: FloatArray) -> None:
         """Let a motion of everything remain one where the step x (q,) has put landmarks."""

@@ -137,13 +137,15 @@ class Hindsight:
         self.history.see(seen, observer.A)
         self._seen += 1
         self._observations += 1
-        if not (in_doubt or self._window_is_full or self._is_due):
-            return
-        is_done = self._linearise_anew(observer)
-        # A landmark in doubt may be placed anew by this very frame, which must be kept for that.
         if in_doubt:
+            self._linearise_anew(observer)
+            # It may be placed anew by this very frame, which must be kept for that.
             self._is_owed = True
-            return
+        elif self._window_is_full or self._is_due:
+            self._sum_up(observer, self._linearise_anew(observer))
+
+    def _sum_up(self, observer: Observer, is_done: bool) -> None:
+        """Let what is known now stand for all frames, if they could be linearised anew."""
         self._rest()
         known, angle_rad = self._known(observer).least_nonlinear(self._axes)
         if self._window_is_full:

@@ -10,7 +10,8 @@ What no observation can tell, the choice of the world's frame, is exactly in its
 the covariance stays honest. While â_i = 0, which :meth:`.FullMapGains.settle` sees to after each
 correction and each motion (the reference ξ° is arbitrary), noise of the motion touches Ã alone:
 
-    prediction   P ← P + Ad_Â Q Ad_Âᵀ in the pose block alone: O(1), however large the map
+    prediction   P ← P + Ad_Â Q Ad_Âᵀ in the pose block alone: O(1), however large the map;
+                 with a calibration O(n), as what is known of it goes on into the pose
     update       K = P Cᵀ (C P Cᵀ + R)⁻¹,   X̂ ← exp(−K r) · X̂
 
 at O(m n) for m landmarks seen plus O(m n²) to update the covariance of n known ones.
@@ -28,7 +29,7 @@ from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.robust import observation_weights
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.matrices import mahalanobis, solve, with_blocks
+from slam_observer_ros.matrices import condition, mahalanobis, with_blocks
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observation_noise import repetition_factors
@@ -96,19 +97,16 @@ class RiccatiGains(GainDesign):
 
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each point was given."""
-        P, (r, noise) = self._joint.P, residuals.on(self._axes)
-        weights = observation_weights(r, self.predicted(residuals), noise, self._settings)
+        r, noise = residuals.on(self._axes)
+        repeated = repetition_factors(residuals.dt_s, self._settings.observation_error_time)
+        predicted = self.predicted(residuals)
+        weights = observation_weights(r, predicted, noise, repeated, self._settings)
         passed = weights > 0.0
-        used = residuals.select(passed)
-        CP, CPC = self._project(used)
-        share = weights[passed] / repetition_factors(
-            used.dt_s, self._settings.observation_error_time
-        )
-        S = with_blocks(CPC, noise[passed] / share[:, None, None])
-        K = solve(S, CP).T
-        half = K @ (0.5 * S @ K.T - CP)
-        P += half + half.T  # Joseph form: (I − K C) P (I − K C)ᵀ + K R Kᵀ, multiplied out
-        return self._as_correction(-K @ r[passed].ravel()), weights
+        shares = weights[passed] / repeated[passed]
+        CP, CPC = self._project(residuals.select(passed))
+        S = with_blocks(CPC, noise[passed] / shares[:, None, None])
+        K = condition(self._joint.P, CP, S)
+        return self._as_correction(-K @ r[passed].ravel()), weights  # for (30) and (31)
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""

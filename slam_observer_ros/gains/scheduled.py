@@ -22,7 +22,7 @@ Kalman filter does with the covariance of everything.
 They are not quite, because of what happens between observations: where the core becomes another
 one (:mod:`slam_observer_ros.gains.core`), landmarks that hung on the old one have in common what
 the new one does not tell of it. That is added to each N_i as if it were its own. So P is not that
-of an exact filter, and not published as a covariance.
+of an exact filter, and not published.
 
 An observation costs O(m) for the m landmarks seen. The n known ones follow when they are seen
 again (:mod:`slam_observer_ros.gains.leaves`), which makes it O(m log n) in the mean.
@@ -38,7 +38,13 @@ from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.robust import huber_weights, REWEIGHTINGS
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.matrices import block_diagonal, mahalanobis, symmetric, transpose
+from slam_observer_ros.matrices import (
+    block_diagonal,
+    diagonal_blocks,
+    mahalanobis,
+    symmetric,
+    transpose,
+)
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observation_noise import repetition_factors
@@ -140,7 +146,7 @@ class ScheduledGains(GainDesign):
         errors[rows] = x[known].reshape(m, k)
         B, left = regression(P, known, z)
         F[rows] = B.reshape(m, k, q)
-        N[rows] = symmetric(left.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)])
+        N[rows] = symmetric(diagonal_blocks(left, k))
         shifts = -self._axes.full_points(errors.ravel())
         F[:, :, :p] += self._axes.turn_matrix(shifts)
         self._leaves.update(everything, F, N)
@@ -178,15 +184,16 @@ class ScheduledGains(GainDesign):
         weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
         error_time_s = self._settings.observation_error_time
         repeated = repetition_factors(residuals.dt_s[passed], error_time_s)
-        for _ in range(1 + REWEIGHTINGS):
-            share = weights[passed] / repeated
-            noise = R[passed] / share[:, None, None]
+        for remaining in reversed(range(1 + REWEIGHTINGS)):
+            shares = weights[passed] / repeated
+            noise = R[passed] / shares[:, None, None]
             gain_k[passed] = np.linalg.inv(N[passed] + noise)
             x = self._core.step(H, gain_k, r)
             pull = gain_k @ (r + H @ x)
-            weights[passed] = huber_weights(pull[passed, :, 0], R[passed], share, threshold)
-            if (weights[passed] == 1.0).all():
+            found = huber_weights(pull[passed, :, 0], R[passed], shares, threshold)
+            if not remaining or (found == weights[passed]).all():
                 break
+            weights[passed] = found
         Delta, delta = x[:, 0], self._axes.full_points((F @ x + N @ pull).ravel())
         F = F + N @ gain_k @ H
         F[:, :, : self._axes.p] += self._axes.turn_matrix(delta)

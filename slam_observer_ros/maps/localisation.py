@@ -16,7 +16,12 @@ from slam_observer_ros.gains.gauge import gauge_information, JITTER_M2
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.alignment import find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
-from slam_observer_ros.matrices import block_diagonal, transpose, with_variances_above
+from slam_observer_ros.matrices import (
+    block_diagonal,
+    diagonal_blocks,
+    transpose,
+    with_variances_above,
+)
 from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
@@ -157,8 +162,7 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     G_each = G.reshape(n, k, -1)
     common = G_each @ np.linalg.pinv(information, hermitian=True) @ transpose(G_each)
     own = np.zeros((n, 3, 3))
-    i = np.arange(n)
-    own[:, :k, :k] = P.reshape(n, k, n, k)[i, :, i] - common
+    own[:, :k, :k] = diagonal_blocks(P, k) - common
     world: FloatArray = R @ own @ R.T
     return world
 
