@@ -115,11 +115,11 @@ class EkfSlam:
         H = self._output_matrix(rows)
         HPH = H @ self._P @ H.T
         noise = covariances[:, :k, :k]
-        weights = observation_weights(z, HPH, noise, factors, self._settings)
+        weights = observation_weights(z, HPH, noise, self._settings)
         used = weights > 0.0
         every = np.repeat(used, k)
-        shares = weights[used] / factors[used]
-        S = HPH[np.ix_(every, every)] + block_diagonal(noise[used] / shares[:, None, None])
+        share = weights[used] / factors[used]
+        S = HPH[np.ix_(every, every)] + block_diagonal(noise[used] / share[:, None, None])
         H = H[every]
         K = np.linalg.solve(S, H @ self._P).T
         error = K @ z[used].ravel()

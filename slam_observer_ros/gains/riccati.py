@@ -98,13 +98,14 @@ class RiccatiGains(GainDesign):
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return exp(−K r) and the weight that each point was given."""
         r, noise = residuals.on(self._axes)
-        repeated = repetition_factors(residuals.dt_s, self._settings.observation_error_time)
-        predicted = self.predicted(residuals)
-        weights = observation_weights(r, predicted, noise, repeated, self._settings)
+        weights = observation_weights(r, self.predicted(residuals), noise, self._settings)
         passed = weights > 0.0
-        shares = weights[passed] / repeated[passed]
-        CP, CPC = self._project(residuals.select(passed))
-        S = with_blocks(CPC, noise[passed] / shares[:, None, None])
+        used = residuals.select(passed)
+        CP, CPC = self._project(used)
+        share = weights[passed] / repetition_factors(
+            used.dt_s, self._settings.observation_error_time
+        )
+        S = with_blocks(CPC, noise[passed] / share[:, None, None])
         K = condition(self._joint.P, CP, S)
         return self._as_correction(-K @ r[passed].ravel()), weights  # for (30) and (31)
 

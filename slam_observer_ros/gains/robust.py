@@ -22,11 +22,7 @@ One that is off by less can't throw the pose far.
 
 
 def observation_weights(
-    r: FloatArray,
-    predicted: FloatArray,
-    noise: FloatArray,
-    repeated: FloatArray,
-    settings: Settings,
+    r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
 ) -> FloatArray:
     """Return the weight (m,) of each observation, zero where the gate rejects it.
 
@@ -42,9 +38,6 @@ def observation_weights(
         (m k, m k) covariance C P Cᵀ of the predicted residuals, m².
     noise : FloatArray
         (m, k, k) covariances of the observations, m².
-    repeated : FloatArray
-        (m,) how many times each of these counts, in R but not for the gate; see
-        :func:`.repetition_factors`.
     settings : Settings
         ``rejection_distance`` and ``huber_threshold``.
 
@@ -56,17 +49,14 @@ def observation_weights(
         passed, own = gated(r, predicted, noise, settings)
         if not passed.all():
             weights[~passed] = 0.0
-            weights[passed] = observation_weights(
-                r[passed], own, noise[passed], repeated[passed], settings
-            )
+            weights[passed] = observation_weights(r[passed], own, noise[passed], settings)
             return weights
-    for _ in range(REWEIGHTINGS):
-        shares = weights / repeated
-        if (shares < 1.0).any():  # else it is the pull of before
-            pull = _pull(r, predicted, noise / shares[:, None, None])
-        weights = huber_weights(pull, noise, shares, settings.huber_threshold)
-        if (weights == 1.0).all():
+    weights = huber_weights(pull, noise, weights, settings.huber_threshold)
+    for _ in range(REWEIGHTINGS - 1):
+        if weights.min(initial=1.0) == 1.0:
             break
+        pull = _pull(r, predicted, noise / weights[:, None, None])
+        weights = huber_weights(pull, noise, weights, settings.huber_threshold)
     return weights
 
 
@@ -109,26 +99,26 @@ def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatA
 
 
 def huber_weights(
-    pull: FloatArray, noise: FloatArray, shares: FloatArray, threshold: float
+    pull: FloatArray, noise: FloatArray, weights: FloatArray, threshold: float
 ) -> FloatArray:
     """Return Huber's weights (m,) of what is left of residuals after a correction.
 
     Parameters
     ----------
     pull : FloatArray
-        (m, k) S⁻¹ r, with R = Σ/s in S. What is left is R S⁻¹ r, by the sensor's own Σ at the
-        distance √(pullᵀ Σ pull)/s from zero.
+        (m, k) S⁻¹ r, with R = Σ/w in S. What is left is R S⁻¹ r, by the sensor's own Σ at the
+        distance √(pullᵀ Σ pull)/w from zero.
     noise : FloatArray
         (m, k, k) covariances Σ of the observations, m².
-    shares : FloatArray
-        (m,) shares s of their information that were used.
+    weights : FloatArray
+        (m,) weights w that were used.
     threshold : float
         Distance from which on an observation weighs less; with 0 all weigh the same.
 
     """
     if threshold == 0.0:
         return np.ones(len(pull))
-    left = np.sqrt(np.einsum('ij,ijk,ik->i', pull, noise, pull)) / shares
+    left = np.sqrt(np.einsum('ij,ijk,ik->i', pull, noise, pull)) / weights
     return np.asarray(threshold / np.maximum(left, threshold))
 
 
