@@ -47,8 +47,9 @@ def detection(
     class_id: str | None = None,
     covariance: np.ndarray | None = None,
     centre: Sequence[float] = (7.0, 8.0, 9.0),
+    position: Sequence[float] = (1.0, 2.0, 3.0),
 ) -> object:
-    """vision_msgs/Detection3D of a box, and of a result at (1, 2, 3) if it has a class."""
+    """vision_msgs/Detection3D of a box, and of a result at ``position`` if it has a class."""
     results = []
     if class_id is not None:
         hypothesis = ros.make('vision_msgs/msg/ObjectHypothesis', class_id, 0.9)
@@ -57,7 +58,7 @@ def detection(
             whole[:3, :3] = covariance
         pose = ros.make(
             'geometry_msgs/msg/PoseWithCovariance',
-            ros.pose((1.0, 2.0, 3.0), NO_TURN),
+            ros.pose(position, NO_TURN),
             whole.ravel(),
         )
         results = [ros.make('vision_msgs/msg/ObjectHypothesisWithPose', hypothesis, pose)]

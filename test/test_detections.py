@@ -56,6 +56,17 @@ def test_an_id_and_a_position_are_never_of_different_results():
     assert_array_equal(detections(message).ids, [-1])
 
 
+def test_where_a_result_has_no_position_the_centre_of_the_box_is_taken():
+    unset = (0.0, 0.0, 0.0)
+    event = detections(
+        detector.detection('', 'tag_1', np.eye(3), position=unset),
+        detector.detection('', 'tag_2', np.eye(3), position=(0.0, 0.0, 1.0)),
+    )
+    assert_array_equal(event.ids, [1, 2])
+    assert_array_equal(event.points, [[7.0, 8.0, 9.0], [0.0, 0.0, 1.0]])
+    assert event.covariances is None, 'that of the result is not of the box'
+
+
 def test_what_was_not_measured_is_left_out():
     unmeasured = (np.nan, 0.0, 0.0)
     event = detections(detector.detection('17', centre=unmeasured), detector.detection('18'))

@@ -67,7 +67,7 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
 
     The id of a landmark is the number that ends its detection's ``id``, or else its first
     result's ``class_id``: both are strings. Its position, with covariance if it is known of all,
-    is that result's, or else the centre of the box.
+    is that result's, or else, if that is missing or zero, the centre of the box.
     """
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
@@ -169,10 +169,11 @@ def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
     names = [reader.string(), *(name for name, _, _ in results[:1])]
     matches = (_TRAILING_NUMBER.fullmatch(name) for name in names)
     landmark_id = next((_landmark_id(match[1]) for match in matches if match), UNKNOWN_ID)
-    if not results:
-        return landmark_id, centre, np.zeros((3, 3))
-    _, point, covariance = results[0]
-    return landmark_id, point, covariance
+    if results and results[0][1].any():
+        _, point, covariance = results[0]
+        return landmark_id, point, covariance
+    # Detectors that fill in the box only leave the position of the result at zero.
+    return landmark_id, centre, np.zeros((3, 3))
 
 
 def _read_result(reader: CdrReader) -> tuple[str, FloatArray, FloatArray]:
