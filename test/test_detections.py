@@ -102,13 +102,35 @@ TOO_LARGE = [str(MAX_ID + 1), '20240501123', '9' * 19, '1' * 5000]
 
 
 @pytest.mark.parametrize('number', TOO_LARGE)
-def test_an_id_that_could_not_be_published_is_refused(number):
-    reason = f'landmark id {number[:30]} is beyond {MAX_ID}'
-    for item in (detector.detection(number), detector.detection('', f'reflector_{number}')):
-        with pytest.raises(MessageError, match=reason):
-            detections(item)
-    with pytest.raises(MessageError, match=reason):
-        observed_tags([transform('camera', f'tag_{number}', 1.0)], 'tag_')
+def test_a_number_that_could_not_be_published_is_no_id_and_loses_no_other(number):
+    event = detections(
+        detector.detection(number),
+        detector.detection('', f'reflector_{number}'),
+        detector.detection(number, 'reflector_4'),
+        detector.detection('5'),
+    )
+    assert_array_equal(event.ids, [-1, -1, 4, 5])
+    frames = (f'tag_{number}', 'tag_6')
+    (seen,) = observed_tags([transform('camera', frame, 1.0) for frame in frames], 'tag_')
+    assert_array_equal(seen.event.ids, [6])
+
+
+@pytest.mark.parametrize(
+    'name',
+    [
+        '7d444840-9dc0-11d1-b245-5ffdce74fad2',
+        'track_7D4448409DC011D1B2455FFDCE74FA42',
+        '8f3c-41f9',
+    ],
+)
+def test_a_number_that_ends_a_uuid_or_a_hash_is_no_id(name):
+    event = detections(detector.detection(name), detector.detection(name, 'reflector_4'))
+    assert_array_equal(event.ids, [-1, 4])
+
+
+@pytest.mark.parametrize('name', ['00000012', 'facade12', 'b-0000012', 'a1-b12', 'tag36h11:12'])
+def test_a_number_in_a_name_that_looks_like_a_hash_is_an_id(name):
+    assert_array_equal(detections(detector.detection(name)).ids, [12])
 
 
 def test_a_frame_with_a_serial_number_is_no_fiducial():

@@ -29,6 +29,10 @@ MAX_NAMES = 12
 """Names of frames that a message lists."""
 
 _TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
+_HASH = re.compile(r'(?<![^\W_])(?=.*\d[a-f])[\da-f-]{8,}\Z', re.IGNORECASE)
+"""A UUID, too. Names with a number, as ``facade12`` or ``b-000123``, have no letter after it."""
+_HASH_LENGTH = 64
+"""No more of a name is searched: the time that takes grows with the square of the length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +70,8 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
     """Decode a vision_msgs/Detection3DArray.
 
     The id of a landmark is the number that ends its detection's ``id``, or else its first
-    result's ``class_id``: both are strings. Its position, with covariance if it is known of all,
+    result's ``class_id``: both are strings. No id are UUIDs, hashes, and numbers beyond
+    ``MAX_ID``, as trackers give them. Its position, with covariance if it is known of all,
     is that result's, or else, if that is missing or zero, the centre of the box.
     """
     reader = CdrReader(raw)
@@ -97,7 +102,8 @@ def observed_tags(
 ) -> list[Measurement[ObservationEvent]]:
     """Return what of /tf are sightings of fiducials: transforms from a camera to a tag.
 
-    Those that are no transforms, which have NaN in them for example, are left out.
+    Those that are no transforms, which have NaN in them for example, are left out, and so are
+    numbers beyond ``MAX_ID``.
 
     Parameters
     ----------
@@ -111,11 +117,6 @@ def observed_tags(
     list of Measurement[ObservationEvent]
         One for each camera and stamp.
 
-    Raises
-    ------
-    MessageError
-        If an id is beyond ``MAX_ID``.
-
     """
     # Other things have names with a colon, too, and longer numbers than a family has tags.
     pattern = re.compile(rf'{re.escape(tag_frame_prefix)}(\d+)|\w+:(\d{{1,9}})')
@@ -124,6 +125,7 @@ def observed_tags(
         for message in transforms
         if (match := pattern.fullmatch(message.child_frame_id)) and not message.trouble
     ]
+    seen = [sighting for sighting in seen if sighting[1] != UNKNOWN_ID]
     seen.sort(key=_camera_and_stamp)
     return [
         _observation(frame_id, stamp_ns, list(group))
@@ -142,11 +144,19 @@ def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
 
 
 def _landmark_id(digits: str) -> int:
+    """Return the number as an id, or the unknown id if it is beyond the largest one."""
     significant = digits.lstrip('0') or '0'
-    # Python converts no number of thousands of digits.
-    if len(significant) > len(str(MAX_ID)) or int(significant) > MAX_ID:
-        raise MessageError(f'landmark id {significant[:30]} is beyond {MAX_ID}')
-    return int(significant)
+    if len(significant) > len(str(MAX_ID)):  # Python converts no number of thousands of digits.
+        return UNKNOWN_ID
+    return int(significant) if int(significant) <= MAX_ID else UNKNOWN_ID
+
+
+def _id_in_name(name: str) -> int:
+    """Return the number that ends the name of a detection; the unknown id if none does."""
+    match = _TRAILING_NUMBER.fullmatch(name)
+    if match is None or _HASH.search(name[-_HASH_LENGTH:]):
+        return UNKNOWN_ID
+    return _landmark_id(match[1])
 
 
 def _camera_and_stamp(sighting: tuple[PoseMessage, int]) -> tuple[str, int]:
@@ -167,8 +177,8 @@ def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
     results = [_read_result(reader) for _ in range(reader.uint32())]
     centre = reader.float64(_POSE + _SIZE)[:3]
     names = [reader.string(), *(name for name, _, _ in results[:1])]
-    matches = (_TRAILING_NUMBER.fullmatch(name) for name in names)
-    landmark_id = next((_landmark_id(match[1]) for match in matches if match), UNKNOWN_ID)
+    ids = (_id_in_name(name) for name in names)
+    landmark_id = next((number for number in ids if number != UNKNOWN_ID), UNKNOWN_ID)
     if results and results[0][1].any():
         _, point, covariance = results[0]
         return landmark_id, point, covariance
