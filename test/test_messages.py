@@ -361,6 +361,24 @@ class TestPointCloud2:
         for name in ('points', 'covariances', 'velocities'):
             np.testing.assert_array_equal(getattr(event, name), getattr(expected, name))
 
+    @pytest.mark.parametrize(
+        ('id_type', 'junk'), [('<f4', np.nan), ('<f8', -9999), ('<i4', -9999), ('<i4', -1)]
+    )
+    def test_unmeasured_points_may_have_any_id(self, id_type, junk):
+        dtype = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('id', id_type)])
+        cloud = records(dtype, (2, 3))
+        cloud['x'][:, 1], cloud['id'][:, 1] = np.nan, junk
+        raw = ros.serialise(ros.point_cloud2(cloud, row_padding=5))
+        event = point_clouds.decode_point_cloud2(raw).event
+        assert event.ids.tolist() == [7, 9, 10, 12]
+        np.testing.assert_array_equal(event.points, points_of(cloud)[[0, 2, 3, 5]])
+
+    @pytest.mark.parametrize('junk', [np.nan, -9999])
+    def test_unmeasured_points_of_a_point_cloud_may_have_any_id(self, junk):
+        points = np.array([[1.0, 2.0, 3.0], [np.inf] * 3])
+        raw = ros.serialise(ros.point_cloud(points, {'id': np.array([7, junk])}))
+        assert point_clouds.decode_point_cloud(raw).event.ids.tolist() == [7]
+
     def test_unmeasured_points_of_a_point_cloud_are_left_out(self):
         points = np.array([[1.0, 2.0, 3.0], [np.nan] * 3, [4.0, 5.0, 6.0]])
         raw = ros.serialise(ros.point_cloud(points, {'id': np.array([7, 8, 9])}))

@@ -62,6 +62,7 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[O
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     points = reader.float32(3 * reader.uint32()).reshape(-1, 3)
+    measured = is_measured(points)
     ids = np.full(len(points), UNKNOWN_ID, dtype=np.int64)
     for _ in range(reader.uint32()):
         name = reader.string()
@@ -69,9 +70,9 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[O
         if name == ID_NAME:
             if len(values) != len(points):
                 raise MessageError(f'{len(values)} ids for {len(points)} points')
-            ids = _ids_from_floats(values)
+            ids[measured] = _ids_from_floats(values[measured])
     reader.finish()
-    return Measurement(frame_id, without_unmeasured(ObservationEvent(stamp_ns, ids, points)))
+    return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points).select(measured))
 
 
 def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
@@ -79,8 +80,8 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[
 
     ``id`` gives the landmark ids; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per
     point in the axes of the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s.
-    Points that weren't measured, which are NaN or infinite, are left out, whether or not the
-    cloud claims to be dense.
+    Points that weren't measured, which are NaN or infinite, are left out, whatever id they have,
+    and whether or not the cloud claims to be dense.
 
     Parameters
     ----------
@@ -114,13 +115,18 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[
     dtype = _record_type(fields, byte_order, point_step)
     strides = (row_step if height > 1 else len(data), point_step)
     records: Records = np.ndarray((height, width), dtype, data, strides=strides)
-    return Measurement(frame_id, without_unmeasured(_observation(stamp_ns, records)))
+    return Measurement(frame_id, _observation(stamp_ns, records))
+
+
+def is_measured(points: FloatArray) -> BoolArray:
+    """Return which points (n, 3) are neither NaN nor infinite: only those were measured."""
+    measured: BoolArray = np.all(np.isfinite(points), axis=1)
+    return measured
 
 
 def without_unmeasured(event: ObservationEvent) -> ObservationEvent:
-    """Return an observation without the points that are NaN or infinite: they weren't measured."""
-    is_measured: BoolArray = np.all(np.isfinite(event.points), axis=1)
-    return event.select(is_measured)
+    """Return an observation without the points that weren't measured."""
+    return event.select(is_measured(event.points))
 
 
 def scan_trouble(event: ObservationEvent) -> str:
@@ -251,6 +257,9 @@ def _check_size(size: int, height: int, width: int, point_step: int, row_step: i
 
 def _observation(stamp_ns: int, records: Records) -> ObservationEvent:
     points = _columns(records, POINT_NAMES)
+    measured = is_measured(points)
+    if not measured.all():  # The other fields of such points may hold anything.
+        records, points = records[measured.reshape(records.shape)], points[measured]
     covariances = velocities = None
     if COVARIANCE_NAMES[0] in _names(records):
         upper_triangles = _columns(records, COVARIANCE_NAMES)
