@@ -12,6 +12,7 @@ import pytest
 import ros_messages as ros
 
 from slam_observer_ros.errors import MessageError
+from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.messages import point_clouds
 from slam_observer_ros.messages import poses_and_velocities as messages
 from slam_observer_ros.messages.detections import decode_apriltags
@@ -399,6 +400,20 @@ class TestPointCloud2:
         raw = ros.serialise(ros.point_cloud2(records(np.dtype(fields))))
         with pytest.raises(MessageError, match=reason):
             point_clouds.decode_point_cloud2(raw)
+
+    @pytest.mark.parametrize(
+        ('id_type', 'largest'), [('<f4', 2**24 - 1), ('>f8', MAX_ID), ('<f8', MAX_ID)]
+    )
+    def test_ids_in_a_float_field_are_taken_as_far_as_they_are_exact(self, id_type, largest):
+        dtype = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('id', id_type)])
+        cloud = records(dtype.newbyteorder(id_type[0]))
+        cloud['id'][0] = [-1, largest - 1, largest]
+        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        assert event.ids.tolist() == [-1, largest - 1, largest]
+        cloud['id'][0, 2] = largest + 1
+        reason = f'landmark id {largest + 1} .* whole number from -1 to {largest}$'
+        with pytest.raises(MessageError, match=reason):
+            point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
 
     def test_negative_id_is_refused(self):
         cloud = records(np.dtype([('x', 'f4'), ('y', 'f4'), ('z', 'f4'), ('id', 'i4')]))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_observer_ros.errors import MessageError
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_cloud_layout import (
@@ -70,7 +70,7 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[O
         if name == ID_NAME:
             if len(values) != len(points):
                 raise MessageError(f'{len(values)} ids for {len(points)} points')
-            ids[measured] = _ids_from_floats(values[measured])
+            ids[measured] = _ids_from_floats(values[measured], FLOAT32_ID_LIMIT)
     reader.finish()
     return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points).select(measured))
 
@@ -288,8 +288,9 @@ def _ids(records: Records) -> IntArray:
         return np.full(records.size, UNKNOWN_ID, dtype=np.int64)
     values = records[ID_NAME].ravel()
     if values.dtype.kind == 'f':
+        limit = FLOAT32_ID_LIMIT if values.itemsize == np.float32().itemsize else MAX_ID + 1
         with np.errstate(invalid='ignore'):
-            return _ids_from_floats(values.astype(np.float64))
+            return _ids_from_floats(values.astype(np.float64), limit)
     ids = values.astype(np.int64)
     ids[ids == UNKNOWN_UINT32_ID] = UNKNOWN_ID
     if np.any(ids < UNKNOWN_ID):
@@ -297,12 +298,12 @@ def _ids(records: Records) -> IntArray:
     return ids
 
 
-def _ids_from_floats(values: FloatArray) -> IntArray:
+def _ids_from_floats(values: FloatArray, limit: int) -> IntArray:
     # The comparison is written so that NaN fails it too.
-    exact = (values >= UNKNOWN_ID) & (values < FLOAT32_ID_LIMIT) & (values == np.floor(values))
+    exact = (values >= UNKNOWN_ID) & (values < limit) & (values == np.floor(values))
     if not exact.all():
         raise MessageError(
-            f'landmark id {values[~exact][0]:.9g} in a float channel is not a whole number '
-            f'from -1 to {FLOAT32_ID_LIMIT - 1}'
+            f'landmark id {values[~exact][0]:.10g} in a float channel is not a whole number '
+            f'from -1 to {limit - 1}'
         )
     return values.astype(np.int64)
