@@ -375,6 +375,11 @@ class TestCompression:
             Recording(directory)
 
 
+def cloud2_with(count: int, *fields: str) -> object:
+    """sensor_msgs/PointCloud2 of so many points."""
+    return ros.point_cloud2(np.zeros((1, count), [(name, '<f4') for name in fields]))
+
+
 class TestTopics:
     """What is found without asking, and what is asked."""
 
@@ -441,6 +446,27 @@ class TestTopics:
     def test_measured_velocity_comes_before_commands(self, tmp_path):
         messages = {'/cmd_vel': self.TWIST, '/odom': self.ODOMETRY, '/beacons': self.CLOUD}
         assert self.find(tmp_path, messages)['velocity'] == '/odom'
+
+    @pytest.mark.parametrize(
+        ('empty', 'full'),
+        [
+            (ros.point_cloud(np.zeros((0, 3)), {}), CLOUD),
+            (cloud2_with(0), cloud2_with(2, 'x', 'y', 'z', 'id')),
+            (cloud2_with(0, 'x', 'y', 'z'), cloud2_with(2, 'x', 'y', 'z', 'id')),
+        ],
+    )
+    def test_empty_clouds_do_not_hide_the_ids_of_those_that_follow(self, tmp_path, empty, full):
+        with RecordingWriter(tmp_path / 'run.mcap') as writer:
+            messages = ('/twist', self.TWIST), ('/beacons', empty), ('/beacons', full)
+            for index, (topic, message) in enumerate(messages):
+                data = ros.serialise(message)
+                writer.write(topic, message.__msgtype__, data, ros.STAMP_NS + index)
+        with Recording(tmp_path / 'run.mcap') as recording:
+            assert recording.missing_ids(recording.find_topics().landmarks) == ''
+
+    def test_a_topic_of_empty_clouds_only_is_taken_if_they_have_a_field_for_ids(self, tmp_path):
+        messages = {'/twist': self.TWIST, '/beacons': cloud2_with(0, 'x', 'y', 'z', 'id')}
+        assert self.find(tmp_path, messages)['landmarks'] == '/beacons'
 
     def test_clouds_without_ids_are_taken_only_by_name(self, tmp_path):
         messages = {'/twist': self.TWIST, '/lidar': self.LIDAR, '/beacons': self.CLOUD}

@@ -181,6 +181,21 @@ def field_names(raw: Buffer, message_type: str) -> tuple[str, ...]:
     return tuple(names)
 
 
+def has_points(raw: Buffer, message_type: str) -> bool:
+    """Return whether there is a point in a PointCloud or PointCloud2.
+
+    Raises
+    ------
+    MessageError
+        If the message is malformed.
+
+    """
+    reader = CdrReader(raw)
+    reader.header()
+    height = 1 if message_type.endswith('PointCloud') else reader.uint32()
+    return height * reader.uint32() > 0
+
+
 def missing_ids(names: Sequence[str], message_type: str) -> str:
     """Tell what there is instead of ids; empty if there are ids.
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 import dataclasses
-from itertools import pairwise
+from itertools import islice, pairwise
 import logging
 from pathlib import Path
 from types import TracebackType
@@ -34,7 +34,7 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
 )
 from slam_observer_ros.messages.point_cloud_layout import ID_NAME
-from slam_observer_ros.messages.point_clouds import field_names, missing_ids
+from slam_observer_ros.messages.point_clouds import field_names, has_points, missing_ids
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_landmarks,
@@ -49,6 +49,9 @@ from slam_observer_ros.recording.truth import base_in_frames, frames_beside, Tru
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
+
+MAX_EMPTY_CLOUDS = 1000
+"""Most clouds of a topic that are looked at for one with points, which tells of ids."""
 
 logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')
@@ -297,10 +300,13 @@ class Recording:
         return ID_NAME in self._field_names(topic)
 
     def _field_names(self, cloud_topic: Topic) -> tuple[str, ...]:
-        for raw in self._source.messages((cloud_topic,)):
-            with suppress(MessageError):
-                return field_names(raw.data, cloud_topic.message_type)
-        return ()
+        names: tuple[str, ...] = ()
+        for raw in islice(self._source.messages((cloud_topic,)), MAX_EMPTY_CLOUDS):
+            with suppress(MessageError):  # Empty clouds often come without any fields.
+                names = field_names(raw.data, cloud_topic.message_type)
+                if ID_NAME in names or has_points(raw.data, cloud_topic.message_type):
+                    break
+        return names
 
     def _frame(self, topic: Topic, decode: Decode) -> str:
         for raw in self._source.messages((topic,)):
