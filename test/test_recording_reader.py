@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 import shutil
 
+from mcap.writer import Writer
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -313,6 +314,56 @@ def test_a_lidars_scan_is_not_taken_for_landmarks(tmp_path, count):
         else:
             with pytest.raises(RecordingError, match=r'501 points without id .* not scans'):
                 list(events)
+
+
+ENCODINGS = {1: 'ros1', 2: 'cdr'}
+
+
+def write_foreign(path: Path, *others: str, profile: str = 'ros2', version: int = 2) -> Path:
+    """Write two messages as others' recorders may, and one of each of the other encodings."""
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start(profile)
+        for message in (
+            ros.twist([1.0] * 6),
+            ros.point_cloud(np.ones((1, 3)), {'id': np.ones(1)}),
+        ):
+            schema = writer.register_schema(message.__msgtype__, f'ros{version}msg', b'')
+            channel = writer.register_channel(f'/{schema}', ENCODINGS[version], schema)
+            writer.add_message(channel, ros.STAMP_NS, ros.serialise(message), ros.STAMP_NS)
+        for other in others:
+            schema = writer.register_schema(other, f'{other}schema', b'{}')
+            channel = writer.register_channel(f'/{other}', other, schema)
+            writer.add_message(channel, ros.STAMP_NS, b'{}', ros.STAMP_NS)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize('profile', ['', 'ros2'])
+@pytest.mark.parametrize(
+    ('others', 'warning'),
+    [
+        ((), None),
+        (('json', ''), 'foreign.mcap: 2 channels of other encodings are left out: json, unnamed'),
+    ],
+)
+def test_a_whole_mcap_file_that_is_not_only_of_ros_is_not_called_damaged(
+    tmp_path, profile, others, warning
+):
+    path = write_foreign(tmp_path / 'foreign.mcap', *others, profile=profile)
+    with Recording(path) as recording:
+        assert recording.warning == (warning and f'{tmp_path}/{warning}')
+        assert len(list(recording.events(recording.find_topics()))) == 2
+    path.write_bytes(path.read_bytes()[:-40])
+    with Recording(path) as recording:
+        assert 'cut off or damaged; only the 2 messages before' in recording.warning
+
+
+@pytest.mark.parametrize('profile', ['ros1', 'ros2'])
+def test_messages_of_ros_1_in_an_mcap_file_are_refused_with_what_to_do(tmp_path, profile):
+    path = write_foreign(tmp_path / 'old.mcap', profile=profile, version=1)
+    with pytest.raises(RecordingError, match=r'of ROS 1, .* give the \.bag that it was made of$'):
+        Recording(path)
 
 
 class TestNothingToRead:

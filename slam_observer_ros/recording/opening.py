@@ -161,9 +161,25 @@ def _open_file(path: Path) -> tuple[MessageSource, str | None]:
         return _salvage(path, error)
 
 
-def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str]:
+def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str | None]:
     source = SalvagedMcap(path)
-    count = sum(topic.count for topic in source.topics)
-    if count == 0:
-        raise RecordingError(f'{error}; no whole message is left') from error
-    return source, f'{path}: cut off or damaged; only the {count} messages before that are used'
+    if any(topic.count for topic in source.topics):
+        return source, _left_out(path, source)
+    if 'ros1' in source.other_encodings.values():
+        raise RecordingError(
+            f'{path}: its messages are of ROS 1, which are read of .bag files only; give the .bag '
+            'that it was made of'
+        ) from error
+    raise RecordingError(f'{error}; no whole message is left') from error
+
+
+def _left_out(path: Path, source: SalvagedMcap) -> str | None:
+    """Say what of an MCAP file is not read; None if all of it is."""
+    if not source.is_whole:
+        count = sum(topic.count for topic in source.topics)
+        return f'{path}: cut off or damaged; only the {count} messages before that are used'
+    encodings = source.other_encodings.values()
+    if not encodings:
+        return None
+    names = ', '.join(sorted({encoding or 'unnamed' for encoding in encodings}))
+    return f'{path}: {len(encodings)} channels of other encodings are left out: {names}'

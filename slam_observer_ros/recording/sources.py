@@ -10,7 +10,7 @@ import heapq
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, Footer, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
@@ -135,15 +135,26 @@ class BagSource:
 class SalvagedMcap:
     """What is whole in a truncated MCAP file: all chunks, or bare messages, before the damage.
 
+    Whole files that rosbags refuses, as those that hold other than ROS messages, are read, too.
+
     Parameters
     ----------
     path : Path
         The .mcap file.
 
+    Attributes
+    ----------
+    is_whole : bool
+        Whether it could be read to its end.
+    other_encodings : dict of int to str
+        How the messages of those channels are encoded that are left out, as they are no CDR.
+
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self.is_whole = False
+        self.other_encodings: dict[int, str] = {}
         counts: Counter[tuple[str, str]] = Counter()
         self.start_ns = self.end_ns = self._disorder_ns = 0
         for name, message_type, message in self._records():
@@ -180,10 +191,14 @@ class SalvagedMcap:
             while (record := _next_whole(records)) is not None:
                 if isinstance(record, Schema):
                     message_types[record.id] = record.name
-                elif isinstance(record, Channel) and record.message_encoding == 'cdr':
+                elif isinstance(record, Channel) and record.message_encoding != 'cdr':
+                    self.other_encodings[record.id] = record.message_encoding
+                elif isinstance(record, Channel):
                     channels[record.id] = record.topic, message_types.get(record.schema_id, '')
                 elif isinstance(record, Message) and record.channel_id in channels:
                     yield *channels[record.channel_id], record
+                elif isinstance(record, Footer):
+                    self.is_whole = True
 
 
 class SplitSource:
