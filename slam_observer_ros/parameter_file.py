@@ -98,11 +98,13 @@ def _is_misspelt(name: str, ours: str) -> bool:
 
 
 class _RosLoader(UniqueKeys, yaml.SafeLoader):
-    """Reads numbers as ROS does: 1e-3 is one, though YAML 1.1 wants 1.0e-3."""
+    """Reads numbers as ROS does: 1e-3 and 1.0e3, too, where YAML 1.1 wants 1.0e-3 and 1.0e+3."""
 
 
 _RosLoader.add_implicit_resolver(
-    'tag:yaml.org,2002:float', re.compile(r'^[-+]?\d+[eE][-+]?\d+$'), list('-+0123456789')
+    'tag:yaml.org,2002:float',
+    re.compile(r'^[-+]?(\d+\.?\d*[eE][-+]?\d+|\.\d+([eE][-+]?\d+)?)$'),
+    list('-+.0123456789'),
 )
 
 

@@ -324,11 +324,16 @@ def test_a_list_that_the_node_can_not_read_is_told(tmp_path, caplog, numbers, is
     assert ("the node can't read 'sensor_pose'" in caplog.text) == is_told
 
 
-def test_numbers_in_a_file_are_read_as_ros_reads_them(tmp_path):
-    file = tmp_path / 'numbers.yaml'
-    file.write_text('/**:\n  ros__parameters:\n    gain_k: 1e-3\n    gain_l: 2\n')
-    settings = from_parameters(Settings, read_parameter_file(file))
-    assert (settings.gain_k, settings.gain_l) == (0.001, 2.0)
+@pytest.mark.parametrize(
+    ('text', 'number'),
+    [
+        ('2', 2.0), ('1e-3', 0.001), ('1.0e2', 100.0), ('1.E+2', 100.0), ('.5', 0.5),
+        ('.5e1', 5.0), ('+.5', 0.5), ('+12.5e-1', 1.25),
+    ],
+)  # fmt: skip
+def test_numbers_in_a_file_are_read_as_ros_reads_them(tmp_path, text, number):
+    path = write(tmp_path, f'/**:\n  ros__parameters:\n    gain_k: {text}\n')
+    assert from_parameters(Settings, read_parameter_file(path)).gain_k == number
 
 
 @pytest.mark.parametrize(
