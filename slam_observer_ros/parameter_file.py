@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-import logging
 from pathlib import Path
 import re
 
@@ -12,8 +11,6 @@ import yaml
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.parameters import suggestion
 from slam_observer_ros.yaml_errors import reason_of, UniqueKeys
-
-logger = logging.getLogger(__name__)
 
 OBSERVER_NODE = 'observer_node'
 
@@ -72,20 +69,16 @@ def read_parameter_file(path: Path) -> dict[str, object]:
             f"parameter file {path} has no '/**: ros__parameters:' or "
             f"'{OBSERVER_NODE}: ros__parameters:' section"
         )
-    for name, value in values.items():
-        if _is_mixed(value):
-            logger.warning(
-                "%s: the node can't read '%s': in ROS all numbers of a list are written alike, "
-                '0.0 for 0.',
-                path,
-                name,
-            )
     return values
 
 
-def _is_mixed(value: object) -> bool:
-    """Return whether some of a list's numbers are integers and some are not."""
-    return isinstance(value, list) and {int, float} <= {type(entry) for entry in value}
+def mixed_lists(values: Mapping[str, object]) -> list[str]:
+    """Return the names of lists that ROS can't read: some numbers are integers, and some not."""
+    return [
+        name
+        for name, value in values.items()
+        if isinstance(value, list) and {int, float} <= {type(entry) for entry in value}
+    ]
 
 
 def _is_misspelt(name: str, ours: str) -> bool:

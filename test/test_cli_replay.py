@@ -585,6 +585,14 @@ class TestSettings:
         other = slam_observer.succeed('replay', simulated, '--config', config, '--json').json
         assert one | {'seconds': 0} == other | {'seconds': 0}
 
+    def test_a_list_that_the_node_can_not_read_is_told_once(
+        self, slam_observer, simulated, tmp_path
+    ):
+        config = self.config(tmp_path, 'range_noise: 0.1, linear_velocity_noise: [0.1, 0, 0]')
+        errors = slam_observer('replay', simulated, '--config', config).errors
+        assert errors.count("he node can't read") == 1
+        assert 'linear_velocity_noise of --config: in ROS all numbers of a list are' in errors
+
     def test_names_of_other_nodes_in_the_file_are_ignored(
         self, slam_observer, simulated, tmp_path
     ):

@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from slam_observer_ros.errors import ParameterError, UsageError
 from slam_observer_ros.node_settings import ObserverNodeSettings
-from slam_observer_ros.parameter_file import names_of_others, read_parameter_file
+from slam_observer_ros.parameter_file import mixed_lists, names_of_others, read_parameter_file
 from slam_observer_ros.parameters import from_parameters, Parameter, table, Value
 from slam_observer_ros.settings import Settings
 
@@ -114,6 +114,12 @@ def _for_estimator(values: Mapping[str, object]) -> dict[str, object]:
     unknown = names_of_others(written, _ESTIMATOR_NAMES | _NODE_NAMES)
     if unknown and len(unknown) == len(values):
         raise ParameterError("none of the parameters of --config is the observer's")
+    if mixed := mixed_lists(values):
+        logger.warning(
+            "The node can't read %s of --config: in ROS all numbers of a list are written alike, "
+            '0.0 for 0.',
+            ', '.join(mixed),
+        )
     if unknown:
         logger.warning('Unknown parameters of --config are ignored: %s.', ', '.join(unknown))
     return {name: value for name, value in values.items() if name in _ESTIMATOR_NAMES}
