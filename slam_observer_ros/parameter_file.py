@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 import re
 
@@ -36,7 +36,8 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     """Return the name → value mapping of a ROS 2 parameter file.
 
     The file has the usual form ``<node or /**>: ros__parameters: {name: value}``, the node maybe
-    below its namespace; nested mappings become dotted names. Sections of other nodes are left out.
+    below its namespaces; nested mappings become dotted names. Sections of other nodes are left
+    out. In the names of sections ``*`` stands for one name, and ``**`` for any number of them.
 
     Raises
     ------
@@ -45,30 +46,17 @@ def read_parameter_file(path: Path) -> dict[str, object]:
         package, or those of several robots.
 
     """
-    try:
-        content = yaml.load(path.read_bytes(), _RosLoader)
-    except OSError as error:
-        raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = reason_of(error)
-        raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
-    values: dict[str, object] = {}
-    found: list[str] = []
-    for section, body in _sections(content if isinstance(content, dict) else {}):
-        if section == '/**' or section.rsplit('/', 1)[-1] == OBSERVER_NODE:
-            found.append(section)
-            values.update(_flatten(body))
-    robots = [section for section in found if '*' not in section]
-    if len({section.strip('/') for section in robots}) > 1:
-        raise ParameterError(
-            f'parameter file {path} is of several robots: it has sections {" and ".join(robots)}; '
-            'leave one'
-        )
-    if not found:
+    sections = [(name, body) for name, body in _read_sections(path) if _fits(name, _node_of(name))]
+    if not sections:
         raise ParameterError(
             f"parameter file {path} has no '/**: ros__parameters:' or "
             f"'{OBSERVER_NODE}: ros__parameters:' section"
         )
+    node = _only_node(path, [name for name, _ in sections])
+    values: dict[str, object] = {}
+    for name, body in sections:
+        if _fits(name, node):
+            values.update(_flatten(body))
     return values
 
 
@@ -101,16 +89,60 @@ _RosLoader.add_implicit_resolver(
 )
 
 
-def _sections(tree: Mapping[object, object]) -> Iterator[tuple[str, dict[str, object]]]:
+def _read_sections(path: Path) -> list[tuple[str, dict[str, object]]]:
+    try:
+        content = yaml.load(path.read_bytes(), _RosLoader)
+        return list(_sections(content if isinstance(content, dict) else {}))
+    except OSError as error:
+        raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = reason_of(error)
+        raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
+
+
+def _sections(
+    tree: Mapping[object, object], namespace: str = ''
+) -> Iterator[tuple[str, dict[str, object]]]:
     """Yield the nodes of a parameter file by their full names, and their parameters."""
-    nodes = {name: body for name, body in tree.items() if isinstance(body, dict)}
-    for name, body in list(nodes.items()):
+    for key, body in tree.items():
+        name = f'{namespace}/{str(key).lstrip("/")}'
+        if not isinstance(body, dict):
+            continue
         if 'ros__parameters' not in body:  # the name is a namespace
-            nodes |= {f'{name}/{below}': node for below, node in body.items()}
-    for name, body in nodes.items():
-        parameters = body.get('ros__parameters') if isinstance(body, dict) else None
-        if isinstance(parameters, dict):
-            yield str(name), parameters
+            yield from _sections(body, name)
+        elif isinstance(body['ros__parameters'], dict):
+            yield name, body['ros__parameters']
+
+
+def _fits(section: str, node: str) -> bool:
+    """Return whether a section is of the node with this full name, as ROS has it."""
+    wildcards = {'*': '/[^/]+', '**': '(/[^/]+)*'}
+    names = section.split('/')[1:]
+    pattern = ''.join(wildcards.get(name, '/' + re.escape(name)) for name in names)
+    return re.fullmatch(pattern, node) is not None
+
+
+def _node_of(section: str) -> str:
+    """Return the full name of the observer's node that a section is of, if it is of one."""
+    names = [name for name in section.split('/')[1:] if name != '**']
+    namespaces = names[:-1] if names and names[-1] in ('*', OBSERVER_NODE) else names
+    return '/'.join(['', *namespaces, OBSERVER_NODE])
+
+
+def _only_node(path: Path, sections: Sequence[str]) -> str:
+    """Return the full name of the observer's node that a file is of.
+
+    Where a section names it, those with wildcards may be of other nodes.
+    """
+    named = [section for section in sections if '*' not in section] or sections
+    node = max(map(_node_of, named), key=lambda name: (name.count('/'), '*' not in name))
+    for section in named:
+        if not _fits(section, node):
+            raise ParameterError(
+                f'parameter file {path} is of several robots: it has sections for {section} and '
+                f'{node}; leave one'
+            )
+    return node
 
 
 def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:

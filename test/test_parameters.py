@@ -9,6 +9,7 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
+import yaml
 
 from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
@@ -220,8 +221,12 @@ def write(folder, text):
 
 
 @pytest.mark.parametrize(
-    'section', ['/**', 'observer_node', '/observer_node', '/robot/observer_node']
-)
+    'section',
+    [
+        '/**', '/*', 'observer_node', '/observer_node', '/robot/observer_node', '/robot/**',
+        '/robot/*', '/*/observer_node', '/**/observer_node', '/**/robot/*', '/fleet/*/**',
+    ],
+)  # fmt: skip
 def test_sections_of_this_node_are_read_and_those_of_others_left_out(tmp_path, section):
     path = write(
         tmp_path,
@@ -231,17 +236,37 @@ def test_sections_of_this_node_are_read_and_those_of_others_left_out(tmp_path, s
     assert read_parameter_file(path) == {'gains': 'constant', 'nested.deep': 1}
 
 
-def test_a_node_may_be_below_its_namespace(tmp_path):
-    path = write(
-        tmp_path,
-        'robot1:\n  observer_node:\n    ros__parameters:\n      gains: constant\n'
-        '  camera:\n    ros__parameters: {exposure: 3}\n',
-    )
-    assert read_parameter_file(path) == {'gains': 'constant'}
+@pytest.mark.parametrize('namespaces', [['robot1'], ['/fleet', 'robot1'], ['a', '/**', 'b/c']])
+def test_a_node_may_be_below_its_namespaces(tmp_path, namespaces):
+    tree = {
+        'observer_node': {'ros__parameters': {'gains': 'constant'}},
+        'camera': {'ros__parameters': {'exposure': 3}},
+    }
+    for name in reversed(namespaces):
+        tree = {name: tree}
+    assert read_parameter_file(write(tmp_path, yaml.dump(tree))) == {'gains': 'constant'}
+
+
+@pytest.mark.parametrize(
+    ('sections', 'used'),
+    [
+        (['/robot1/observer_node', '/robot1/**', '/*/observer_node', '/**'], 'abcd'),
+        (['/robot1/observer_node', '/camera/**', '/*', '/robot2/*', '/**/observer_node'], 'ae'),
+        (['/observer_node', '/*', '/camera/**', '/*/*'], 'ab'),
+        (['/**', '/robot1/**', '/*/observer_node', '/**/robot1/*'], 'abcd'),
+        (['/**/camera', 'observer*', '/camera/*/left', '/**'], 'd'),
+    ],
+)
+def test_wildcards_are_of_the_node_as_in_ros(tmp_path, sections, used):
+    tree = {
+        section: {'ros__parameters': {name: 1}}
+        for section, name in zip(sections, 'abcde', strict=False)
+    }
+    assert ''.join(sorted(read_parameter_file(write(tmp_path, yaml.dump(tree))))) == used
 
 
 def test_a_file_that_holds_itself_is_refused_in_one_line(tmp_path):
-    with pytest.raises(ParameterError, match='has no '):
+    with pytest.raises(ParameterError, match='not valid YAML'):
         read_parameter_file(write(tmp_path, 'a: &x {b: *x}\n'))
 
 
@@ -260,7 +285,12 @@ def test_later_sections_win(tmp_path):
         (
             'observer_node: {ros__parameters: {a: 1}}\n'
             '/robot1/observer_node: {ros__parameters: {a: 2}}\n',
-            'sections observer_node and /robot1/observer_node',
+            'sections for /observer_node and /robot1/observer_node',
+        ),
+        (
+            '/**: {ros__parameters: {a: 1}}\n/robot1/**: {ros__parameters: {a: 1}}\n'
+            '/robot2/**: {ros__parameters: {a: 2}}\n',
+            'sections for /robot2/** and /robot1/observer_node',
         ),
         ('', 'ros__parameters'),
         ('just a word', 'ros__parameters'),
