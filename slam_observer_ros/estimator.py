@@ -371,7 +371,7 @@ class Estimator:
 
     @property
     def landmark_covariances(self) -> FloatArray | None:
-        """(n, 3, 3) covariances of the same, world, m²; None where the gains know none."""
+        """(n, 3, 3) covariances of the landmarks at ``stamp_ns``, world, m²; None if unknown."""
         of_all = self._slam.landmark_covariances_after(self._timeline.lead_s)
         return None if of_all is None else of_all[self._slam.confirmed]
 

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
+import numpy as np
+
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.extrinsics import move_observation
@@ -65,7 +67,7 @@ class Timeline:
         self._newest_ns: dict[type, int] = {}
 
     def is_late(self, event: Event) -> bool:
-        """Return whether a newer event was used already."""
+        """Return whether what was in force at its stamp can't be changed any more."""
         return event.stamp_ns < self._in_force_ns
 
     def _begin(self, stamp_ns: int) -> int:
@@ -78,8 +80,8 @@ class Timeline:
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
         """Add a velocity; return whether it is in force: an angular one waits for a linear one.
 
-        Where a newer event was used before it, it leads on from there. After many of them the
-        states are moved on without an observation.
+        If it is late, it leads on from where velocities can still be changed. After many of them
+        the states are moved on without an observation.
 
         Raises
         ------
@@ -99,7 +101,8 @@ class Timeline:
         self._begin(event.stamp_ns)
         self._pending += 1
         if self._pending >= MAX_PENDING_VELOCITIES:
-            self.catch_up()
+            # No further: the stamp of an observation without points may be ahead of velocities.
+            self._advance(self._in_force_ns)
         return True
 
     @property
@@ -141,6 +144,7 @@ class Timeline:
         if event.stamp_ns < state_ns:
             event = self._carried_forward(event, state_ns)
         self._advance(event.stamp_ns)
+        self._in_force_ns = max(self._in_force_ns, event.stamp_ns)
         return event
 
     def motion(self, start_ns: int, end_ns: int) -> FloatArray:
@@ -155,11 +159,12 @@ class Timeline:
 
         Its points are as uncertain as any seen from there, and as that motion makes them. Its
         error is one and the same for all m, but is given to each as its own: m would average it
-        down.
+        down. Where velocities are estimated, v may be anything that they may be.
         """
         slam, back = self._frame.slam, self.motion(state_ns, event.stamp_ns)
         velocities = slam.velocities_of(event, slam.observer.A @ back)
-        shifts = velocities * to_s(state_ns - event.stamp_ns)
+        lag_s = to_s(state_ns - event.stamp_ns)
+        shifts = velocities * lag_s
         points = event.points + shifts
         # The sensor with it, so that it was measured from as far.
         sensor = shifts if event.sensor is None else event.sensor + shifts
@@ -170,4 +175,5 @@ class Timeline:
         )
         C = back[:3, :3] @ SPATIAL.output_matrix(points)
         shared = len(points) * C @ Q @ transpose(C)
-        return replace(moved, covariances=slam.covariances_of(moved) + shared)
+        own = (lag_s * slam.landmark_velocity_error) ** 2 * np.eye(3)
+        return replace(moved, covariances=slam.covariances_of(moved) + shared + own)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import gain_worlds
 from hypothesis import given
@@ -220,6 +221,26 @@ def test_an_observation_without_points_makes_no_velocity_late():
     np.testing.assert_allclose(estimator.pose, true_pose(0.5), atol=1e-9)
 
 
+def test_an_idle_sensor_whose_clock_is_ahead_makes_no_velocity_late():
+    """However many come: they are used as they change, and not as of its stamps."""
+    events, x_m = [], 0.0
+    for step in range(4 * MAX_PENDING_VELOCITIES):
+        speed = 1.0 if step % 20 < 10 else -0.5
+        x_m += 0.02 * speed
+        events.append(velocity(0.02 * step, [0, 0, 0, speed, 0, 0]))
+        events.append(observation(0.02 * step + 0.5, []))
+    estimator = run([*events, velocity(0.02 * len(events) / 2, np.zeros(6))], reorder_window=0.0)
+    assert not estimator.counts['late_velocity']
+    np.testing.assert_allclose(estimator.pose[0, 3], x_m, atol=1e-9)
+
+
+def test_a_velocity_older_than_the_first_observation_counts_from_that_on():
+    events = [observation(2.0), velocity(1.4), observation(2.3, [])]
+    estimator = run(events, reorder_window=0.0, velocity_timeout=0.5)
+    assert estimator.counts['late_velocity'] == 1
+    np.testing.assert_allclose(estimator.pose, true_pose(0.3), atol=1e-9)
+
+
 def test_however_many_velocities_come_late_no_motion_counts_twice():
     events = [velocity(0.0), observation(0.4, [])]
     events += [velocity(0.001 * step) for step in range(1, 3 * MAX_PENDING_VELOCITIES)]
@@ -275,6 +296,7 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
     R = so3.exp(np.array([0.0, 0.0, turn_rad]))
     np.testing.assert_allclose(carried.points, (seen + 0.9 * speed) @ R, atol=1e-9)
     expected = R.T @ ObservationNoise(settings).at(seen) @ R
+    expected = expected + (0.9 * settings.landmark_velocity_error) ** 2 * np.eye(3)
     np.testing.assert_allclose(carried.covariances, expected, rtol=1e-6)
 
 
@@ -927,7 +949,7 @@ def moving_landmark(speeds=None):
         stamp_ns = START_NS + step * 10**8
         estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         if step <= 10:
-            point = np.array([[5.0 + 0.02 * step, 0.0, 0.0]])
+            point = np.array([[5.0 + 0.2 * step, 0.0, 0.0]])
             estimator.add(ObservationEvent(stamp_ns, np.array([1]), point, velocities=speeds))
     return estimator
 
@@ -937,11 +959,33 @@ def test_a_landmark_that_moves_is_the_less_certain_the_longer_it_was_not_seen():
     told = estimator.landmark_covariances
     assert estimator.stamp_ns - estimator._timeline.state_ns > 10**9
     estimator.flush()
-    np.testing.assert_allclose(told, estimator.landmark_covariances, rtol=0.05, atol=1e-5)
+    np.testing.assert_allclose(told, estimator.landmark_covariances, rtol=1e-9, atol=1e-12)
 
 
 def test_where_velocities_of_landmarks_are_estimated_those_of_messages_are_not_used():
     assert_same_state(moving_landmark(np.array([[3.0, 2.0, 1.0]])), moving_landmark())
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled'])
+def test_gains_that_estimate_no_velocities_of_landmarks_take_them_as_messages_say(gains):
+    settings = Settings(gains=gains, landmark_velocity_error=0.5, confirmations=1)
+    estimator, speeds = Estimator(settings), np.full((5, 3), 0.1)
+    for time_s, told, expected in [(0.0, speeds, speeds), (0.1, None, 0.0 * speeds)]:
+        estimator.add(velocity(time_s, np.zeros(6)))
+        event = ObservationEvent(observation(time_s).stamp_ns, np.arange(5), LANDMARKS)
+        estimator.add(replace(event, velocities=told))
+        estimator.release()
+        np.testing.assert_allclose(estimator.landmark_velocities, expected, atol=1e-9)
+
+
+def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
+    """Scheduled gains put off moving those that were out of view."""
+    frame = MapFrame(Settings(gains='scheduled', confirmations=1))
+    event = observation(0.0, [0, 1])
+    frame.observe(event)
+    frame.slam.gains.recall = Mock()
+    frame.slam.covariances_of(event)
+    np.testing.assert_array_equal(frame.slam.gains.recall.call_args.args[1], [0, 1])
 
 
 def test_a_landmark_that_is_placed_anew_moves_as_its_sensor_says_from_then_on():

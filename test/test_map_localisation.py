@@ -191,6 +191,23 @@ def test_the_velocitys_scale_is_estimated_in_a_map_that_is_known(mode):
     assert scale.deviation < 0.02
 
 
+def test_in_a_fixed_map_a_late_message_with_velocities_moves_no_landmark_either():
+    world = World(3)
+    estimator = Estimator(world.settings(localization_mode='fixed'))
+    estimator.load_map(world.map(), world.pose(0.0))
+    seen = world.see(0.0, world.near(0.0, 5))
+    for later_ns, velocities in [
+        (0, None),
+        (200_000_000, None),
+        (100_000_000, np.full((5, 3), 3.0)),
+    ]:
+        stamp_ns = seen.stamp_ns + later_ns
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        estimator.add(replace(seen, stamp_ns=stamp_ns, velocities=velocities))
+    assert estimator.counts['late_observation'] == 1
+    assert np.linalg.norm(world.error(estimator, 0.0)[3:]) < 0.05
+
+
 @pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
 @pytest.mark.parametrize('is_told', [False, True])
 def test_of_a_map_with_heights_a_planar_estimate_takes_the_plan(mode, is_told):

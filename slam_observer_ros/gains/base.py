@@ -254,7 +254,9 @@ class GainDesign:
         """(n, 3, 3) covariances of the errors ã_i, reference frame, m²; None if unknown."""
         return None
 
-    def landmark_error_covariances_after(self, duration_s: float) -> FloatArray | None:
+    def landmark_error_covariances_after(
+        self, observer: Observer, duration_s: float
+    ) -> FloatArray | None:
         """Return what the same will be when landmarks that move have moved on."""
         return self.landmark_error_covariances
 

@@ -52,11 +52,15 @@ class FullMapGains(RiccatiGains):
     @property
     def landmark_error_covariances(self) -> FloatArray:
         """(n, 3, 3) covariances of the landmark errors ã_i."""
-        return self._joint.landmarks_after(0.0)
+        return self._joint.landmarks
 
-    def landmark_error_covariances_after(self, duration_s: float) -> FloatArray:
+    def landmark_error_covariances_after(
+        self, observer: Observer, duration_s: float
+    ) -> FloatArray:
         """Return what the same will be when landmarks that move have moved on."""
-        return self._joint.landmarks_after(duration_s)
+        if not observer.have_moved:
+            return self._joint.landmarks
+        return self._joint.landmarks_after(duration_s, observer.u)
 
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""

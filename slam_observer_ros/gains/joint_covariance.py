@@ -53,23 +53,32 @@ class JointCovariance:
         """(p, p) covariance of ε."""
         return self.P[: self._p, : self._p]
 
-    def landmarks_after(self, duration_s: float) -> FloatArray:
-        """Return the covariances (n, 3, 3) of ã_i + ũ_i t after t seconds, m²."""
-        k, everything = self._axes.point, np.arange(self.count)
-        a, u = self.columns(everything), self.velocity_columns(everything)
+    @property
+    def landmarks(self) -> FloatArray:
+        """(n, 3, 3) covariances of the landmark errors ã_i."""
+        k = self._axes.point
+        columns = self.columns(np.arange(self.count)).reshape(-1, k)
         covariances = np.zeros((self.count, 3, 3))
-        covariances[:, :k, :k] = self._blocks(a, a)
-        if len(u):
-            crossed = duration_s * self._blocks(a, u)
-            covariances[:, :k, :k] += crossed + transpose(crossed)
-            covariances[:, :k, :k] += duration_s**2 * self._blocks(u, u)
+        covariances[:, :k, :k] = self.P[columns[:, :, None], columns[:, None, :]]
         return covariances
 
-    def _blocks(self, left: IntArray, right: IntArray) -> FloatArray:
-        """Return the blocks (n, k, k) of P at the columns (n k,) of each landmark."""
-        k = self._axes.point
-        blocks: FloatArray = self.P[left.reshape(-1, k, 1), right.reshape(-1, 1, k)]
-        return blocks
+    def landmarks_after(self, duration_s: float, velocities: FloatArray) -> FloatArray:
+        """Return the same after t seconds at û_i (n, 3), once they are settled there.
+
+        The error is ã_i + t (û_i − u_i) then, where û_i − u_i = ũ_i − [û_i]× ω.
+        """
+        n, k, p, everything = self.count, self._axes.point, self._p, np.arange(self.count)
+        eye = np.tile(np.eye(k), (n, 1, 1))
+        parts = [duration_s * self._axes.turn_matrix(velocities), eye]
+        at = [np.tile(np.arange(p), (n, 1)), self.columns(everything).reshape(n, k)]
+        if self._velocity_error > 0.0:
+            parts.append(duration_s * eye)
+            at.append(self.velocity_columns(everything).reshape(n, k))
+        D, columns = np.concatenate(parts, axis=2), np.concatenate(at, axis=1)
+        covariances = np.zeros((n, 3, 3))
+        own = self.P[columns[:, :, None], columns[:, None, :]]
+        covariances[:, :k, :k] = D @ own @ transpose(D)
+        return covariances
 
     @property
     def map_columns(self) -> IntArray | slice:

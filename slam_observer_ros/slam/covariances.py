@@ -19,12 +19,8 @@ MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
 """Standard deviations of a pose that is told, rad and m, beyond which it is only 'unknown'."""
 
 
-def of_landmarks(observer: Observer, gains: GainDesign, duration_s: float) -> FloatArray | None:
-    """Return the covariances (n, 3, 3) of the landmarks along the world's axes, m².
-
-    Those that they will have when landmarks that move have moved on for ``duration_s``.
-    """
-    covariances = gains.landmark_error_covariances_after(duration_s)
+def of_landmarks(observer: Observer, covariances: FloatArray | None) -> FloatArray | None:
+    """Return those of landmarks along the world's axes, given ``covariances`` of ã_i (n, 3, 3)."""
     if covariances is None:
         return None
     R = observer.reference_pose[:3, :3]

@@ -107,11 +107,12 @@ class Slam:
     @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks, world, m²; None where the gains know none."""
-        return self.landmark_covariances_after(0.0)
+        return covariances.of_landmarks(self.observer, self.gains.landmark_error_covariances)
 
     def landmark_covariances_after(self, duration_s: float) -> FloatArray | None:
         """Return the same as they will be when landmarks that move have moved on."""
-        return covariances.of_landmarks(self.observer, self.gains, duration_s)
+        after = self.gains.landmark_error_covariances_after(self.observer, duration_s)
+        return covariances.of_landmarks(self.observer, after)
 
     def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
@@ -194,10 +195,10 @@ class Slam:
         return self._outlook.covariances(event, rows)
 
     @property
-    def _estimates_velocities(self) -> bool:
-        """Whether the gains find out how landmarks move, whatever a sensor says of that."""
-        name = 'landmark_velocity_error'
-        return name not in self.gains.ignores and getattr(self.settings, name) > 0.0
+    def landmark_velocity_error(self) -> float:
+        """How fast landmarks may move, m/s, where it is estimated; else 0, as sensors tell it."""
+        is_ignored = 'landmark_velocity_error' in self.gains.ignores
+        return 0.0 if self.is_fixed or is_ignored else self.settings.landmark_velocity_error
 
     def velocities_of(self, event: ObservationEvent, A: FloatArray) -> FloatArray:
         """Return how its landmarks (m, 3) move, m/s, along the axes of the body at Â = ``A``.
@@ -205,7 +206,9 @@ class Slam:
         As estimated, or else as the observation says, which is made there; zero if neither is.
         """
         velocities = np.zeros_like(event.points)
-        if not self._estimates_velocities:
+        if self.is_fixed:
+            return velocities
+        if not self.landmark_velocity_error:
             return velocities if event.velocities is None else event.velocities
         rows = self.landmarks.rows_of(event.ids)
         velocities[rows >= 0] = self.observer.u[rows[rows >= 0]]
@@ -328,7 +331,7 @@ class Slam:
         velocities = event.velocities
         if velocities is None and self.observer.have_moved:
             velocities = np.zeros((len(rows), 3))
-        if velocities is None or self._estimates_velocities or self.is_fixed:
+        if velocities is None or self.landmark_velocity_error or self.is_fixed:
             return
         used = self.landmarks.rejections[rows] == 0
         self.observer.set_landmark_velocities(rows[used], velocities[used])
