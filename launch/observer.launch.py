@@ -28,6 +28,9 @@ def generate_launch_description():
                 'map', default_value='map', description='topic of the landmark map'
             ),
             DeclareLaunchArgument(
+                'odometry', default_value='odometry', description='topic of the estimate'
+            ),
+            DeclareLaunchArgument(
                 'namespace', default_value='', description='namespace of the robot'
             ),
             DeclareLaunchArgument('use_sim_time', default_value='false'),
@@ -45,6 +48,7 @@ def generate_launch_description():
                     ('landmarks', LaunchConfiguration('landmarks')),
                     ('imu', LaunchConfiguration('imu')),
                     ('map', LaunchConfiguration('map')),
+                    ('odometry', LaunchConfiguration('odometry')),
                 ],
                 output='screen',
             ),

@@ -362,6 +362,23 @@ def test_parameters_that_are_not_given_to_ros_are_not_passed_over(ros, tmp_path,
     assert 'Traceback' not in node.output
 
 
+@pytest.mark.parametrize(
+    ('source', 'output', 'topic', 'remaps'),
+    [
+        ('twist', 'odometry', '/odometry', ['twist:=/odometry']),
+        ('twist', 'odometry', '/wheels', ['odometry:=/wheels', 'twist:=/wheels']),
+        ('landmarks', 'map', '/robot/map', ['__ns:=/robot', 'landmarks:=map']),
+    ],
+)
+def test_a_node_does_not_take_in_its_own_estimate(ros, tmp_path, source, output, topic, remaps):
+    arguments = [argument for remap in remaps for argument in ('-r', remap)]
+    node = NodeProcess('observer_node', tmp_path / 'log', *arguments)
+    assert node.wait() == 2
+    assert f"input '{source}' and the output '{output}' are both '{topic}'" in node.output
+    assert f'-r {output}:=observer/{output}' in node.output
+    assert 'Traceback' not in node.output
+
+
 def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path):
     file = tmp_path / 'robot.yaml'
     file.write_text('/**: {ros__parameters: {base_frame_id: body, wheel: {radius: 0.1}}}')

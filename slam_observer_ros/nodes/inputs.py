@@ -37,7 +37,7 @@ class Input(Generic[MessageT]):
     ----------
     node : Node
         Node that subscribes.
-    topic : str
+    name : str
         Topic name before remapping.
     decoders : mapping of str to callable
         From full type names to decoders, the preferred type first. If there is only one, it is
@@ -49,6 +49,8 @@ class Input(Generic[MessageT]):
 
     Attributes
     ----------
+    name : str
+        The same.
     topic : str
         Topic name after remapping.
     received : int
@@ -75,7 +77,7 @@ class Input(Generic[MessageT]):
     def __init__(
         self,
         node: Node,
-        topic: str,
+        name: str,
         decoders: Mapping[str, Decoder[MessageT]],
         on_message: Callable[[MessageT, int], None],
         qos: QoSProfile,
@@ -88,7 +90,8 @@ class Input(Generic[MessageT]):
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
         self._type_name = ''
-        self.topic = node.resolve_topic_name(topic)
+        self.name = name
+        self.topic = node.resolve_topic_name(name)
         self.received = 0
         self.malformed = 0
         self._fault = ''

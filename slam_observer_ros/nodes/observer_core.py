@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
+from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.node_settings import ObserverNodeSettings
@@ -16,9 +20,10 @@ from slam_observer_ros.nodes.diagnostics import Diagnostics
 from slam_observer_ros.nodes.entities import Entities
 from slam_observer_ros.nodes.initial_pose import InitialPose
 from slam_observer_ros.nodes.input_topics import open_inputs
+from slam_observer_ros.nodes.inputs import Input
 from slam_observer_ros.nodes.intake import Intake
 from slam_observer_ros.nodes.maps import Maps
-from slam_observer_ros.nodes.outputs import Outputs
+from slam_observer_ros.nodes.outputs import Outputs, TOPICS
 from slam_observer_ros.nodes.parameters import read_settings
 from slam_observer_ros.nodes.transform_listener import open_transforms
 from slam_observer_ros.settings import Settings
@@ -59,6 +64,7 @@ class ObserverCore:
         )
         self._outputs = Outputs(node, settings, self._estimator, self._transforms)
         self._inputs = open_inputs(node, settings, self._intake)
+        _refuse_own_outputs(node, self._inputs)
         self._diagnostics = Diagnostics(
             node, self._estimator, self._intake, self._inputs, self._outputs
         )
@@ -141,3 +147,14 @@ class ObserverCore:
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
         self._estimator.change_settings(read_settings(self._node, Settings))
+
+
+def _refuse_own_outputs(node: Node, inputs: Iterable[Input[Any]]) -> None:
+    """Refuse to take in the node's own estimate, which it would follow for ever."""
+    outputs = {node.resolve_topic_name(name): name for name in TOPICS}
+    for source in inputs:
+        if name := outputs.get(source.topic):
+            raise ParameterError(
+                f"the input '{source.name}' and the output '{name}' are both '{source.topic}': "
+                f'remap one of them, as with -r {name}:=observer/{name}'
+            )

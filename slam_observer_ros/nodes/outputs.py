@@ -34,6 +34,9 @@ from slam_observer_ros.nodes.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.types import FloatArray
 
+TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
+"""Topics of the estimate, before remapping."""
+
 PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
 
