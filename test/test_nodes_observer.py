@@ -334,6 +334,18 @@ def test_bad_parameter_at_the_start_is_refused_with_the_reason(ros, tmp_path):
     assert 'Traceback' not in node.output
 
 
+@pytest.mark.parametrize('name', ['observer_node', 'lifecycle_observer_node', 'simulator_node'])
+@pytest.mark.parametrize('value', ['1', '"yes"'])
+def test_a_parameter_of_ros_itself_that_has_a_wrong_type_is_refused(ros, tmp_path, name, value):
+    file = tmp_path / 'robot.yaml'
+    file.write_text(f'/**: {{ros__parameters: {{use_sim_time: {value}}}}}')
+    node = NodeProcess(name, tmp_path / name, '--params-file', str(file))
+    assert node.wait() == 2
+    assert "'use_sim_time'" in node.output
+    assert "expecting type 'BOOL'" in node.output
+    assert 'Traceback' not in node.output
+
+
 @pytest.mark.parametrize(
     ('name', 'written', 'meant'),
     [

@@ -7,7 +7,7 @@ import signal
 from types import FrameType
 
 import rclpy
-from rclpy.exceptions import InvalidParameterValueException
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -16,6 +16,9 @@ from rclpy.utilities import remove_ros_args
 
 from slam_observer_ros.errors import SlamObserverError
 from slam_observer_ros.threads import use_one_thread
+
+REFUSALS = (SlamObserverError, InvalidParameterValueException, InvalidParameterTypeException)
+"""What a node may raise at its start; the last one of what rclpy declares, as use_sim_time."""
 
 STOP_LATENCY_S = 0.1
 """Longest time that an idle node takes to notice a signal."""
@@ -80,7 +83,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int
 def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     try:
         node = make_node()
-    except (SlamObserverError, InvalidParameterValueException) as error:
+    except REFUSALS as error:
         get_logger('slam_observer_ros').fatal(str(error))
         return 2
     executor = SingleThreadedExecutor()
