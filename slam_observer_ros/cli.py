@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import io
 import logging
 import os
+from pathlib import Path
 import signal
 import sys
 from typing import Any, NoReturn
@@ -79,6 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Default: those that the program was started with.
 
     """
+    if sys.stdout is None:  # a shell has closed it
+        sys.stdout = Path(os.devnull).open('w', encoding='utf-8')  # noqa: SIM115 (till the end)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors='replace')  # a terminal without ± is no reason to end
     try:

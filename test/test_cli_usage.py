@@ -175,3 +175,19 @@ def test_reader_that_leaves_early():
             check=False,
         )
     assert (ended.returncode, ended.stderr) == (128 + signal.SIGPIPE, '')
+
+
+@pytest.mark.parametrize('json', [[], ['--json']])
+def test_closed_output(tmp_path, json):
+    output = tmp_path / 'run.mcap'
+    command = [*COMMAND, 'simulate', '--duration', '10', '--output', str(output), *json]
+    ended = subprocess.run(
+        ['sh', '-c', 'exec "$@" >&-', 'sh', *command],
+        cwd=CHECKOUT,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (0, '')
+    assert output.stat().st_size > 0
