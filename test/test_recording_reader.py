@@ -519,6 +519,17 @@ class TestTopics:
         messages = {'/twist': self.TWIST, '/beacons': cloud2_with(0, 'x', 'y', 'z', 'id')}
         assert self.find(tmp_path, messages)['landmarks'] == '/beacons'
 
+    @pytest.mark.parametrize('command', [TWIST, None])
+    def test_an_odometry_that_is_told_in_the_map_is_taken_only_where_nothing_else_is(
+        self, tmp_path, command
+    ):
+        estimate = ros.odometry([1.0] * 6, np.eye(6), frames=('map', 'base_link'))
+        messages = {'/odometry': estimate, '/beacons': self.CLOUD}
+        if command is not None:
+            messages['/cmd_vel'] = command
+        expected = '/odometry' if command is None else '/cmd_vel'
+        assert self.find(tmp_path, messages)['velocity'] == expected
+
     def test_clouds_without_ids_are_taken_only_by_name(self, tmp_path):
         messages = {'/twist': self.TWIST, '/lidar': self.LIDAR, '/beacons': self.CLOUD}
         assert self.find(tmp_path, messages)['landmarks'] == '/beacons'

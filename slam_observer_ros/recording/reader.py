@@ -143,7 +143,7 @@ class Recording:
             If no topic fits, or two do; it lists them, and names the option that decides.
 
         """
-        return select_topics(self.topics, names, inputs, self._identifies)
+        return select_topics(self.topics, names, inputs, self._identifies, self._pose_frame)
 
     def event_count(self, selected: SelectedTopics) -> int:
         """Count the messages that :meth:`events` makes events of, for a progress bar."""
@@ -307,6 +307,12 @@ class Recording:
                 if ID_NAME in names or has_points(raw.data, cloud_topic.message_type):
                     break
         return names
+
+    def _pose_frame(self, topic: Topic) -> str:
+        for raw in self._source.messages((topic,)):
+            with suppress(MessageError):
+                return decode_pose(raw).frame_id.lstrip('/')
+        return ''
 
     def _frame(self, topic: Topic, decode: Decode) -> str:
         for raw in self._source.messages((topic,)):

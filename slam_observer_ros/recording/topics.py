@@ -105,6 +105,7 @@ def select_topics(
     names: TopicNames,
     inputs: InputSettings,
     identifies: Callable[[Topic], bool],
+    pose_frame: Callable[[Topic], str],
 ) -> SelectedTopics:
     """Pick one topic for each purpose.
 
@@ -120,6 +121,9 @@ def select_topics(
         Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
         them, such as a lidar's, are taken only if they are chosen by name or by their type, or
         are called ``landmarks``.
+    pose_frame : callable
+        Tells the frame of an odometry's poses. Where it is that of the map, the velocity is an
+        estimate, as an observer's own, and taken only if there is no other.
 
     Raises
     ------
@@ -136,11 +140,17 @@ def select_topics(
             return False
         return topic.message_type not in CLOUD_DECODERS or identifies(topic)
 
+    def is_estimate(topic: Topic) -> bool:
+        return topic.message_type == ODOMETRY and pose_frame(topic) == inputs.map_frame
+
     def pick(role: _Role, name: str | None) -> Topic | None:
         if name is not None:
             return _named(topics, role, name)
         right = [topic for topic in used if _is_truth(topic.name) == role.is_truth]
-        found = _best([topic for topic in right if fits(topic, role)], role)
+        fitting = [topic for topic in right if fits(topic, role)]
+        if len(fitting) > 1 and not role.is_truth:
+            fitting = [topic for topic in fitting if not is_estimate(topic)] or fitting
+        found = _best(fitting, role)
         if found is None and role.is_typed:
             return _best([t for t in right if t.message_type in role.message_types], role)
         return found
