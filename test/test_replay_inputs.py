@@ -387,6 +387,80 @@ class TestZeroStamps:
         drive.writer.write_observation(seen, receive_stamp_ns=received_ns)
 
 
+class TestTiming:
+    """What falls silent, and what has another clock, is told."""
+
+    IMU = ('--imu', '/imu/data')
+
+    @pytest.fixture
+    def warnings_of(self, slam_observer, tmp_path):
+        """Replays a drive whose topics end or are stamped as told; returns the warnings."""
+
+        def replay(*options, ends=(), ahead_s=(), duration_s=12, slow_down=1.0):
+            path = tmp_path / 'timing.mcap'
+            with RecordingWriter(path) as writer:
+                for number in range(duration_s * 20):
+                    stamp_ns = ros.STAMP_NS + number * STEP_NS
+                    for topic in ('/odom', '/imu/data', '/tags'):
+                        if number * 0.05 < dict(ends).get(topic, duration_s):
+                            later_ns = int(dict(ahead_s).get(topic, 0.0) * 1e9)
+                            received_ns = ros.STAMP_NS + int(number * STEP_NS * slow_down)
+                            self.write(Drive(writer), topic, stamp_ns, later_ns, received_ns)
+            return slam_observer('replay', path, '--json', *options).errors
+
+        return replay
+
+    def write(self, drive, topic, stamp_ns, later_ns, received_ns):
+        if topic == '/tags':
+            event = ObservationEvent(stamp_ns + later_ns, IDS, seen_by_base(stamp_ns))
+            drive.writer.write_observation(event, topic, receive_stamp_ns=received_ns)
+            return
+        message = ros.imu(V[:3], np.zeros((3, 3)), 'base_link', stamp_ns + later_ns)
+        if topic == '/odom':
+            message = ros.odometry(V, np.zeros((6, 6)), stamp_ns=stamp_ns + later_ns)
+        drive.write(topic, message, received_ns)
+
+    def test_a_drive_without_fault_is_replayed_without_a_word(self, warnings_of):
+        assert warnings_of(*self.IMU) == ''
+
+    def test_velocities_that_end_early(self, warnings_of):
+        warnings = warnings_of(ends=[('/odom', 6.0)])
+        assert 'No velocity on /odom for 5.0 s of 12.0 s (velocity_timeout)' in warnings
+        assert warnings.count('warning') == 1
+
+    def test_velocities_that_hold_until_the_end_are_not_missed(self, warnings_of):
+        options = ('--set', 'velocity_timeout=10.0')
+        assert warnings_of(*options, ends=[('/odom', 6.0)]) == ''
+
+    def test_angular_velocities_that_end_early(self, warnings_of):
+        warnings = warnings_of(*self.IMU, ends=[('/imu/data', 6.0)])
+        assert 'No angular velocity on /imu/data for 5.0 s of 12.0 s' in warnings
+        assert 'that of /odom was taken' in warnings
+
+    @pytest.mark.parametrize(('end_s', 'is_told'), [(6.0, True), (9.0, False)])
+    def test_landmarks_that_come_no_more_for_the_last_third(self, warnings_of, end_s, is_told):
+        warnings = warnings_of(ends=[('/tags', end_s)])
+        assert ('No landmarks on /tags for the last 6.0 s of 12.0 s' in warnings) == is_told
+
+    @pytest.mark.parametrize(
+        ('topic', 'ahead_s', 'told'),
+        [
+            ('/tags', 2.0, 'Stamps of /tags are 2.0 s ahead of those of /odom'),
+            ('/tags', -2.0, 'Stamps of /tags are 2.0 s behind those of /odom'),
+            ('/tags', 3600.0, 'Stamps of /tags are 3600.0 s ahead of those of /odom'),
+            ('/imu/data', -2.0, 'Stamps of /imu/data are 2.0 s behind those of /odom'),
+        ],
+    )
+    def test_another_clock(self, warnings_of, topic, ahead_s, told):
+        warnings = warnings_of(*self.IMU, ahead_s=[(topic, ahead_s)])
+        assert warnings.count('Stamps of') == 1
+        assert told in warnings
+        assert 'correct_clock_offset' in warnings
+
+    def test_one_clock_that_is_slower_than_the_recorders_is_no_other(self, warnings_of):
+        assert 'Stamps of' not in warnings_of(ends=[('/odom', 4.0)], slow_down=3.0)
+
+
 @pytest.mark.parametrize('has_pose', [True, False])
 def test_truth_of_a_type_that_is_not_read_is_told(slam_observer, tmp_path, has_pose):
     path = tmp_path / 'path.mcap'

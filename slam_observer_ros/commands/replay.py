@@ -35,6 +35,7 @@ from slam_observer_ros.commands.replay_inputs import (
 )
 from slam_observer_ros.commands.replay_outcome import outcome_of, ReplayOutcome, with_smoothed
 from slam_observer_ros.commands.replay_report import as_json, print_summary
+from slam_observer_ros.commands.timing_checks import warn_of_timing
 from slam_observer_ros.errors import OutputError, SlamObserverError, UsageError
 from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.map_plot import plot_map
@@ -135,6 +136,7 @@ def _replay(
             check_place(args, result, landmark_map)
         outcome = outcome_of(recording, selected, result, truth)
         warn_of_input(recording, selected, result)
+        warn_of_timing(recording, selected, settings.velocity_timeout)
     return with_smoothed(outcome) if args.smooth else outcome
 
 

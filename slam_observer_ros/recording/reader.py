@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 import dataclasses
@@ -35,6 +35,7 @@ from slam_observer_ros.messages.message_types import (
 )
 from slam_observer_ros.messages.point_cloud_layout import ID_NAME
 from slam_observer_ros.messages.point_clouds import field_names, has_points, missing_ids
+from slam_observer_ros.recording.arrivals import Arrivals
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_landmarks,
@@ -81,6 +82,8 @@ class Recording:
         Measurements that did not become events so far, by reason; the first is logged.
     unstamped : Counter
         Measurements without stamp so far, by topic.
+    arrivals : dict of str to Arrivals
+        When the measurements so far were received, by topic.
 
     Raises
     ------
@@ -96,6 +99,7 @@ class Recording:
         self.malformed: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.unstamped: Counter[str] = Counter()
+        self.arrivals: defaultdict[str, Arrivals] = defaultdict(Arrivals)
         if self.message_count == 0:
             self.close()
             raise RecordingError(f'{path}: the recording is empty')
@@ -124,6 +128,11 @@ class Recording:
     def duration_s(self) -> float:
         """Seconds from the first message to the last, by receive time."""
         return to_s(self._source.end_ns - self._source.start_ns)
+
+    @property
+    def end_s(self) -> float:
+        """When the last message was received, seconds."""
+        return to_s(self._source.end_ns)
 
     def find_topics(
         self, names: TopicNames = TopicNames(), inputs: InputSettings = InputSettings()
@@ -286,6 +295,7 @@ class Recording:
         timed = with_receive_time(measured, raw.receive_stamp_ns)
         if timed is not measured:
             self.unstamped[raw.topic.name] += 1
+        self.arrivals[raw.topic.name].add(raw.receive_stamp_ns, timed.stamp_ns)
         return timed
 
     def _all_decoded(
