@@ -19,7 +19,7 @@ from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import Event
+from slam_observer_ros.events import AngularVelocityEvent, Event
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.recording.truth import Truth
@@ -67,6 +67,8 @@ class Replay:
         Stamp of the first event that was used, nanoseconds; 0 if none was.
     observations : int
         Observations of which points were used, also before the last start.
+    angular_velocities : int
+        Angular velocities of an Imu that were taken in, also before the last start.
 
     """
 
@@ -83,6 +85,7 @@ class Replay:
     in_known_map: bool
     start_ns: int
     observations: int
+    angular_velocities: int
 
     @property
     def restarts(self) -> int:
@@ -141,7 +144,7 @@ class _Run:
             self._estimator.load_map(landmark_map)
         self._landmark_tracks = truth.tracks if truth else None
         self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
-        self._observations = self._used_points = 0
+        self._observations = self._used_points = self._angular_velocities = 0
         self._events = 0
         self._seconds = 0.0
         self._start()
@@ -158,8 +161,9 @@ class _Run:
     def add(self, event: Event) -> None:
         self._events += 1
         start_s = time.thread_time()
-        self._estimator.add(event)
+        is_taken = self._estimator.add(event)
         self._seconds += time.thread_time() - start_s
+        self._angular_velocities += is_taken and isinstance(event, AngularVelocityEvent)
 
     def finish(self) -> Replay:
         start_s = time.thread_time()
@@ -183,6 +187,7 @@ class _Run:
             in_known_map=self._in_known_map,
             start_ns=self._start_ns or 0,
             observations=self._observations,
+            angular_velocities=self._angular_velocities,
         )
 
     def _untimed(self, callback: Callable[P, None]) -> Callable[P, None]:

@@ -334,6 +334,27 @@ class TestVelocities:
         )  # fmt: skip
         assert 'can not be the odometry topic' in error
 
+    @pytest.mark.parametrize(
+        ('frame_id', 'measures', 'reason'),
+        [('imu', True, 'no_transform'), ('base_link', False, 'malformed')],
+    )
+    def test_an_imu_of_which_nothing_can_be_used(
+        self, slam_observer, tmp_path, frame_id, measures, reason
+    ):
+        path = tmp_path / 'imu.mcap'
+        unknown = -np.eye(3)  # so an Imu says that it does not measure this
+        with RecordingWriter(path) as writer:
+            drive = Drive(writer)
+            drive.landmarks(ros.STAMP_NS)
+            for stamp_ns in stamps_ns():
+                writer.write_velocity(VelocityEvent(stamp_ns, V))
+                imu = ros.imu(V[:3], np.zeros((3, 3)) if measures else unknown, frame_id, stamp_ns)
+                drive.write('/imu', imu, stamp_ns)
+        ended = slam_observer('replay', path, '--json', '--imu', '/imu')
+        told = f'No angular velocity of /imu was used (dropped: {STEPS} {reason})'
+        assert ended.errors.count(told) == 1
+        assert 'that of /twist was taken' in ended.errors
+
     def test_an_imu_that_is_not_there(self, slam_observer, panning, wheels_and_gyroscope):
         error = slam_observer.fail('replay', panning, '--set', 'use_imu=true')
         assert 'no Imu topic' in error

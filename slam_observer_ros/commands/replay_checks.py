@@ -45,7 +45,7 @@ def check_used(
     inputs: InputSettings,
     result: Replay,
 ) -> None:
-    """Warn if no velocity was used, or no observation.
+    """Warn if no velocity was used, none of the Imu, or no observation.
 
     Raises
     ------
@@ -59,6 +59,13 @@ def check_used(
         logger.warning(
             'No velocity was used (dropped: %s); the landmarks alone move the robot.',
             list_dropped(dropped),
+        )
+    if selected.imu is not None and not result.angular_velocities:
+        logger.warning(
+            'No angular velocity of %s was used (dropped: %s); that of %s was taken.',
+            selected.imu.name,
+            list_dropped(dropped),
+            selected.velocity.name,
         )
     # In a map that was loaded there may be none because the place was not found: told elsewhere.
     if result.observations or (counts['observed_point'] and not result.estimator.is_localised):
