@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
-from slam_observer_ros.errors import ParameterError
 from slam_observer_ros.inputs.settings import AUTO, InputSettings
 from slam_observer_ros.parameters import parameter
 
@@ -85,18 +83,8 @@ class ObserverNodeSettings(InputSettings):
         """
         plain = self.with_plain_frames()
         plain.check_named('base_frame')
-        plain._check_frames_differ()
+        plain.check_frames_differ()
         return plain
-
-    def _check_frames_differ(self) -> None:
-        for one, other in combinations(('map_frame', 'odom_frame', 'base_frame'), 2):
-            frame = getattr(self, one)
-            if frame != getattr(self, other):
-                continue
-            advice = 'give each a name of its own'
-            if other == 'odom_frame':
-                advice += f", or set 'odom_frame' to '' to have '{frame}' to the base published"
-            raise ParameterError(f"'{one}' and '{other}' are both '{frame}': {advice}")
 
 
 @dataclass(frozen=True)

@@ -605,6 +605,17 @@ class TestSettings:
             'replay', simulated, '--config', others
         )
 
+    @pytest.mark.parametrize(
+        ('options', 'names'),
+        [
+            (('--set', 'odom_frame=base_link'), "'odom_frame' and 'base_frame'"),
+            (('--base-frame', '/odom'), "'odom_frame' and 'base_frame'"),
+            (('--set', 'map_frame=odom'), "'map_frame' and 'odom_frame'"),
+        ],
+    )
+    def test_frames_that_the_node_refuses(self, slam_observer, simulated, options, names):
+        assert f'{names} are both' in slam_observer.fail('replay', simulated, *options)
+
     def test_angles_in_degrees(self, slam_observer, simulated):
         for name, value in (('sensor_pose', '[0, 0, 0, 0, 0, 90]'), ('initial_yaw', '90')):
             error = slam_observer.fail('replay', simulated, '--set', f'{name}={value}')

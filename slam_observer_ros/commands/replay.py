@@ -26,6 +26,7 @@ from slam_observer_ros.commands.replay_checks import (
 )
 from slam_observer_ros.commands.replay_inputs import (
     add_input_options,
+    check_frames,
     INPUT_NAMES,
     INSTEAD,
     read_inputs,
@@ -122,6 +123,7 @@ def _replay(
             logger.warning('%s', recording.warning)
         selected = recording.find_topics(topic_names(args), inputs)
         inputs = with_base_frame(inputs, recording, selected)
+        check_frames(inputs)
         truth = recording.truth(selected, inputs.base_frame)
         truth = truth.flattened() if settings.two_d_mode else truth
         events = show_progress(

@@ -149,3 +149,9 @@ def with_base_frame(
                 base_frame,
             )
     return dataclasses.replace(inputs, base_frame='' if base_frame in world else base_frame)
+
+
+def check_frames(inputs: InputSettings) -> None:
+    """Raise a ParameterError if the node refuses these frames; an unnamed base has its default."""
+    base_frame = inputs.base_frame or InputSettings().base_frame
+    dataclasses.replace(inputs, base_frame=base_frame).check_frames_differ()

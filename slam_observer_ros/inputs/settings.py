@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TypeVar
 
 from slam_observer_ros.errors import ParameterError
@@ -89,3 +90,14 @@ class InputSettings:
         """Raise a ParameterError, which says what to do, if the name of a frame is empty."""
         if not getattr(self, parameter_name):
             raise ParameterError(f"'{parameter_name}' is empty: give it the name of a frame")
+
+    def check_frames_differ(self) -> None:
+        """Raise a ParameterError if two of map, odometry and base have the same name."""
+        for one, other in combinations(('map_frame', 'odom_frame', 'base_frame'), 2):
+            frame = getattr(self, one)
+            if not frame or frame != getattr(self, other):
+                continue
+            advice = 'give each a name of its own'
+            if other == 'odom_frame':
+                advice += f", or set 'odom_frame' to '' to have '{frame}' to the base published"
+            raise ParameterError(f"'{one}' and '{other}' are both '{frame}': {advice}")
