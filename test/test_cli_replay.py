@@ -685,6 +685,8 @@ class TestTroubledRecordings:
     def test_that_no_observation_was_used_is_told(self, slam_observer, unplaced):
         errors = slam_observer('replay', unplaced).errors
         assert 'warning: No observation was used (dropped: 50 no_transform)' in errors
+        assert '--set sensor_pose=[X,Y,Z,ROLL,PITCH,YAW]' in errors
+        assert '--base-frame' in errors
 
     def test_a_message_without_points_is_no_observation_and_its_map_replaces_none(
         self, slam_observer, tmp_path

@@ -204,6 +204,18 @@ def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observ
     assert ended.json['landmarks'] == 0
     assert ended.json['dropped'] == {'no_transform': 41}
     assert ended.errors.count('Dropped a message (no_transform)') == 1
+    assert 'fiducials are where /tf has them, which was not recorded' in ended.errors
+
+
+def test_tags_that_tf_has_by_another_name_are_told(tmp_path, monkeypatch, slam_observer):
+    monkeypatch.setitem(MESSAGES, '/tf', MESSAGES['/tags/tf'])
+    path = record(tmp_path / 'run', '/detections', '/tf')
+    told = slam_observer('replay', path).errors
+    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in told
+    assert 'dock0' in told
+    assert 'sensor_pose' not in told
+    renamed = slam_observer('replay', path, '--tag-frame-prefix', 'dock', '--json')
+    assert renamed.json['dropped'] == {}
 
 
 def test_fiducials_on_tf_by_another_name_are_told(recordings, slam_observer):

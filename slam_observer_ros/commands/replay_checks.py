@@ -14,6 +14,7 @@ from slam_observer_ros.commands.replay_outcome import unused_messages
 from slam_observer_ros.counts import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.errors import UsageError
 from slam_observer_ros.events import is_automatic
+from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.recording.reader import Recording
@@ -22,6 +23,12 @@ from slam_observer_ros.replay import Replay
 
 MAX_UNMAPPED = 0.5
 """Share of the points beyond which they are more than what a map lacks."""
+
+PLACES = (
+    '--set sensor_pose=[X,Y,Z,ROLL,PITCH,YAW] places a sensor that is not on /tf, '
+    '--base-frame names another frame of the robot'
+)
+"""What to do where /tf does not connect sensor and robot."""
 
 logger = logging.getLogger(__name__)
 
@@ -54,8 +61,29 @@ def check_used(
 
     """
     dropped = result.estimator.dropped + unused_messages(recording, selected)
+    _warn_of_unused_velocities(selected, result, dropped)
     counts = result.estimator.counts
-    if not counts['velocity']:
+    # In a map that was loaded there may be none because the place was not found: told elsewhere.
+    if result.observations or (counts['observed_point'] and not result.estimator.is_localised):
+        return
+    unused = Counter({'without a point that is used': counts['observation']})
+    unused += Counter({f'points {fate}': counts[name] for name, fate in UNUSED_POINTS.items()})
+    why = f'observation was used (dropped: {list_dropped(unused + dropped)})'
+    hint = ''
+    if recording.dropped[NO_TRANSFORM] or not unused + dropped:
+        hint = recording.missing_tags(selected, inputs.tag_frame_prefix)
+    if recording.dropped[NO_TRANSFORM]:
+        hint = hint or PLACES
+    why += f'; {hint}' if hint else ''
+    if args.smooth or args.map is not None or args.load_map is not None:
+        raise UsageError(f'no {why}; --smooth, --map and --load-map need some')
+    logger.warning('No %s; the trajectory is that of the velocities alone.', why)
+
+
+def _warn_of_unused_velocities(
+    selected: SelectedTopics, result: Replay, dropped: Counter[str]
+) -> None:
+    if not result.estimator.counts['velocity']:
         logger.warning(
             'No velocity was used (dropped: %s); the landmarks alone move the robot.',
             list_dropped(dropped),
@@ -67,18 +95,6 @@ def check_used(
             list_dropped(dropped),
             selected.velocity.name,
         )
-    # In a map that was loaded there may be none because the place was not found: told elsewhere.
-    if result.observations or (counts['observed_point'] and not result.estimator.is_localised):
-        return
-    unused = Counter({'without a point that is used': counts['observation']})
-    unused += Counter({f'points {fate}': counts[name] for name, fate in UNUSED_POINTS.items()})
-    why = f'observation was used (dropped: {list_dropped(unused + dropped)})'
-    if not unused + dropped:
-        hint = recording.missing_tags(selected.landmarks, inputs.tag_frame_prefix)
-        why += f'; {hint}' if hint else ''
-    if args.smooth or args.map is not None or args.load_map is not None:
-        raise UsageError(f'no {why}; --smooth, --map and --load-map need some')
-    logger.warning('No %s; the trajectory is that of the velocities alone.', why)
 
 
 def list_dropped(dropped: Mapping[str, int]) -> str:

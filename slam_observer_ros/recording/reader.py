@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 import dataclasses
 from itertools import islice, pairwise
@@ -26,8 +26,9 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.detections import no_tags
+from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.message_types import (
+    APRILTAGS,
     CLOUD_DECODERS,
     ODOMETRY,
     POSE_ARRAY,
@@ -234,12 +235,23 @@ class Recording:
             return ''
         return missing_ids(self._field_names(topic), topic.message_type)
 
-    def missing_tags(self, topic: Topic, tag_frame_prefix: str) -> str:
+    def missing_tags(self, selected: SelectedTopics, tag_frame_prefix: str) -> str:
         """Return why no frame on /tf is that of a fiducial; empty if one is, or none is wanted."""
-        if topic.message_type != TRANSFORMS:
+        topics: dict[str, Sequence[Topic]] = {
+            TRANSFORMS: (selected.landmarks,),
+            APRILTAGS: selected.transforms.moving,
+        }
+        if selected.landmarks.message_type not in topics:
             return ''
-        messages = self._all_decoded(topic, decode_transform_message)
-        frames = {transform.child_frame_id for transforms in messages for transform in transforms}
+        frames: set[str] = set()
+        for topic in topics[selected.landmarks.message_type]:
+            for transforms in self._all_decoded(topic, decode_transform_message):
+                with suppress(MessageError):  # of an id that is too large: told before
+                    if observed_tags(transforms, tag_frame_prefix):
+                        return ''
+                frames |= {transform.child_frame_id for transform in transforms}
+        if not frames:
+            return 'fiducials are where /tf has them, which was not recorded'
         return no_tags(tag_frame_prefix, frames)
 
     def poses_move(self, topic: Topic) -> bool:
@@ -319,10 +331,7 @@ class Recording:
         return names
 
     def _pose_frame(self, topic: Topic) -> str:
-        for raw in self._source.messages((topic,)):
-            with suppress(MessageError):
-                return decode_pose(raw).frame_id.lstrip('/')
-        return ''
+        return self._frame(topic, lambda raw: [decode_pose(raw)]).lstrip('/')
 
     def _frame(self, topic: Topic, decode: Decode) -> str:
         for raw in self._source.messages((topic,)):
