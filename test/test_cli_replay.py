@@ -222,6 +222,16 @@ class TestReport:
         assert main(['replay', str(simulated), '--set', 'velocity_delay_error=0.1']) == 0
         assert b'velocity_delay' in output.buffer.getvalue()
 
+    @pytest.mark.parametrize('columns', [24, 60])
+    def test_a_narrow_terminal_shortens_nothing(
+        self, slam_observer, simulated, monkeypatch, columns
+    ):
+        monkeypatch.setenv('COLUMNS', str(columns))
+        lines = slam_observer('replay', simulated).output.splitlines()
+        values = ''.join(line.split('│')[2].strip() for line in lines if line.count('│') == 3)
+        assert 'sensor_msgs/msg/PointCloud2' in values
+        assert '…' not in values
+
     def test_without_an_unknown_calibration_none_is_told(self, slam_observer, simulated):
         assert slam_observer.succeed('replay', simulated, '--json').json['calibration'] == {}
 

@@ -53,8 +53,8 @@ def print_json(result: Mapping[str, object]) -> None:
 def print_table(title: str, rows: Mapping[str, str]) -> None:
     """Print names and values on standard output."""
     table = Table(title=title, title_justify='left', show_header=False)
-    table.add_column(no_wrap=True)
-    table.add_column()
+    for _ in ('name', 'value'):
+        table.add_column(overflow='fold')  # a narrow terminal shortens nothing
     for name, value in rows.items():
         table.add_row(name, value)
     Console(highlight=False, markup=False).print(table)
