@@ -269,6 +269,16 @@ class TestVelocities:
         again = slam_observer('replay', path, '--velocity-source', 'pose_differences')
         assert again.errors == ''
 
+    def test_a_moment_of_motion_is_not_taken_for_none(self, slam_observer, tmp_path):
+        path = tmp_path / 'moment.mcap'
+        with RecordingWriter(path) as writer:
+            Drive(writer).landmarks(ros.STAMP_NS)
+            for stamp_ns in (ros.STAMP_NS, ros.STAMP_NS + 20 * MS):
+                position = true_pose(stamp_ns)[:3, 3]
+                odometry = ros.odometry(V, np.zeros((6, 6)), position, stamp_ns=stamp_ns)
+                Drive(writer).write('/odom', odometry, stamp_ns)
+        assert 'All velocities' not in slam_observer('replay', path).errors
+
     def test_an_odometry_that_is_reset_on_the_way(self, slam_observer, tmp_path):
         path = tmp_path / 'reset.mcap'
         restart_ns = ros.STAMP_NS + STEPS // 2 * STEP_NS

@@ -198,7 +198,7 @@ def _warn_of_unmapped(result: Replay) -> None:
 def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
     """Say where the motion is, if an odometry's velocities are all zero and its poses are not."""
     poses = result.dead_reckoning.poses
-    stands_still = len(poses) > 0 and bool((poses == poses[0]).all())
+    stands_still = len(poses) > 1 and bool((poses == poses[0]).all())
     if stands_still and recording.poses_move(selected.velocity):
         logger.warning(
             'All velocities on %s are zero, but its poses move; '
