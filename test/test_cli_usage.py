@@ -128,6 +128,12 @@ def wait_until_ready(process: subprocess.Popen[str]) -> None:
     raise TimeoutError(process.args)
 
 
+@pytest.mark.parametrize('command', ['replay run.mcap', 'simulate'])
+def test_figures_without_a_directory(slam_observer, command):
+    error = slam_observer.fail(*command.split(), '--plot', '')
+    assert 'argument --plot: a directory is needed' in error
+
+
 @pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
 def test_stopped_in_the_middle(tmp_path, stop):
     output = str(tmp_path / 'run.mcap')

@@ -26,6 +26,13 @@ def recording_path(text: str) -> Path:
     return path
 
 
+def figures_path(text: str) -> Path:
+    """Take the name of a directory for figures, as an argparse type."""
+    if not text:
+        raise argparse.ArgumentTypeError('a directory is needed: . for this one')
+    return Path(text)
+
+
 def check_outputs(files: Iterable[Path | None], force: bool) -> None:
     """Refuse files that can't be written, before any work is done.
 

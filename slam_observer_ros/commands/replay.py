@@ -16,6 +16,7 @@ from slam_observer_ros.commands.outputs import (
     check_inputs_stay,
     check_outputs,
     check_plots,
+    figures_path,
     filled_directory,
 )
 from slam_observer_ros.commands.replay_checks import (
@@ -90,7 +91,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help='trajectory, as evo reads it, at most 20 poses a second',
     )
     outputs.add_argument('--map', type=Path, metavar='FILE', help='landmarks, as YAML')
-    outputs.add_argument('--plot', type=Path, metavar='DIR', help=f'draw {", ".join(FIGURES)}')
+    outputs.add_argument(
+        '--plot', type=figures_path, metavar='DIR', help=f'draw {", ".join(FIGURES)}'
+    )
     outputs.add_argument('--json', action='store_true', help='print one JSON object')
     add_force_option(parser)
     add_settings_options(parser)

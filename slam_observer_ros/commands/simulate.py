@@ -15,6 +15,7 @@ from slam_observer_ros.commands.outputs import (
     add_force_option,
     check_outputs,
     check_plots,
+    figures_path,
     filled_directory,
     recording_path,
 )
@@ -64,7 +65,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         '--output', type=recording_path, metavar='OUT.mcap', help='write a recording'
     )
-    parser.add_argument('--plot', type=Path, metavar='DIR', help=f'draw {", ".join(FIGURES)}')
+    parser.add_argument(
+        '--plot', type=figures_path, metavar='DIR', help=f'draw {", ".join(FIGURES)}'
+    )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     add_force_option(parser)
     add_settings_options(parser)
