@@ -405,6 +405,19 @@ class TestZeroStamps:
                 self.write(Drive(writer), stamp_ns, stamp_ns)
         assert slam_observer.succeed('replay', path, '--json').json['dropped'] == {}
 
+    @pytest.mark.parametrize(('second_ns', 'is_stamp'), [(STEP_NS, True), (0, False)])
+    def test_a_simulated_clock_that_begins_at_zero_and_is_recorded_by_another(
+        self, slam_observer, tmp_path, second_ns, is_stamp
+    ):
+        path = tmp_path / 'simulated.mcap'
+        with RecordingWriter(path) as writer:
+            for number, received_ns in enumerate(stamps_ns()):
+                self.write(Drive(writer), received_ns, number * second_ns)
+        ended = slam_observer('replay', path, '--json')
+        assert ended.json['dropped'] == {}
+        assert ('Stamps are zero' in ended.errors) == (not is_stamp)
+        assert ended.json['ate_rmse_m'] < 1e-3
+
     def write(self, drive, received_ns, stamp_ns):
         pose = true_pose(received_ns)
         odometry = ros.odometry(

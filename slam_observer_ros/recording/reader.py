@@ -193,6 +193,7 @@ class Recording:
             BaseFrame(inputs, transforms), inputs.transform_timeout, velocity_timeout_s, self._drop
         )
         decoders = input_decoders(selected, inputs)
+        simulated = {topic for topic in decoders if self._begins_at_zero(topic, decoders[topic])}
         moving = selected.transforms.moving
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:
@@ -200,7 +201,8 @@ class Recording:
             events = builder.retry(raw.receive_stamp_ns)
             if raw.topic in decoders:
                 for measured in self._decoded(raw, decoders[raw.topic]) or ():
-                    events += builder.add(self._timed(measured, raw), raw.receive_stamp_ns)
+                    timed = self._timed(measured, raw, raw.topic in simulated)
+                    events += builder.add(timed, raw.receive_stamp_ns)
             for event in events:
                 yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
         yield from builder.finish()
@@ -303,8 +305,20 @@ class Recording:
             self.malformed[raw.topic.name] += 1
             return None
 
-    def _timed(self, measured: Measured, raw: RawMessage) -> Measured:
-        timed = with_receive_time(measured, raw.receive_stamp_ns)
+    def _begins_at_zero(self, topic: Topic, decode: Decode) -> bool:
+        """Return whether the stamps are of a simulated clock, of which zero is the first."""
+        stamps_ns: list[int] = []
+        for raw in self._source.messages((topic,)):
+            with suppress(MessageError):
+                stamps_ns += [measured.stamp_ns for measured in decode(raw)]
+            if len(stamps_ns) > 1:
+                # Else it is the first message alone that has no stamp, as before a clock is set.
+                return stamps_ns[0] == 0 < stamps_ns[1] < raw.receive_stamp_ns // 2
+        return False
+
+    def _timed(self, measured: Measured, raw: RawMessage, is_simulated: bool) -> Measured:
+        receive_stamp_ns = 0 if is_simulated else raw.receive_stamp_ns
+        timed = with_receive_time(measured, receive_stamp_ns)
         if timed is not measured:
             self.unstamped[raw.topic.name] += 1
         self.arrivals[raw.topic.name].add(raw.receive_stamp_ns, timed.stamp_ns)
