@@ -101,9 +101,9 @@ class TestFormats:
 
     def test_frames_are_those_of_the_messages(self, paths):
         with Recording(paths['own mcap']) as recording:
-            assert recording.frames(recording.find_topics()) == ('base_link', 'base_link')
+            assert recording.contents.frames(recording.find_topics()) == ('base_link', 'base_link')
         with Recording(paths['mcap file']) as recording:  # Its Twists have no frame.
-            assert recording.frames(recording.find_topics()) == ('', 'base_link')
+            assert recording.contents.frames(recording.find_topics()) == ('', 'base_link')
 
     def test_events_come_as_received_with_the_stamps_of_their_headers(self, tmp_path):
         late = ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3)))
@@ -513,7 +513,7 @@ class TestTopics:
                 data = ros.serialise(message)
                 writer.write(topic, message.__msgtype__, data, ros.STAMP_NS + index)
         with Recording(tmp_path / 'run.mcap') as recording:
-            assert recording.missing_ids(recording.find_topics().landmarks) == ''
+            assert recording.contents.missing_ids(recording.find_topics().landmarks) == ''
 
     def test_a_topic_of_empty_clouds_only_is_taken_if_they_have_a_field_for_ids(self, tmp_path):
         messages = {'/twist': self.TWIST, '/beacons': cloud2_with(0, 'x', 'y', 'z', 'id')}

@@ -71,7 +71,7 @@ def check_used(
     why = f'observation was used (dropped: {list_dropped(unused + dropped)})'
     hint = ''
     if recording.dropped[NO_TRANSFORM] or not unused + dropped:
-        hint = recording.missing_tags(selected, inputs.tag_frame_prefix)
+        hint = recording.contents.missing_tags(selected, inputs.tag_frame_prefix)
     if recording.dropped[NO_TRANSFORM]:
         hint = hint or PLACES
     why += f'; {hint}' if hint else ''
@@ -199,7 +199,7 @@ def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result
     """Say where the motion is, if an odometry's velocities are all zero and its poses are not."""
     poses = result.dead_reckoning.poses
     stands_still = len(poses) > 1 and bool((poses == poses[0]).all())
-    if stands_still and recording.poses_move(selected.velocity):
+    if stands_still and recording.contents.poses_move(selected.velocity):
         logger.warning(
             'All velocities on %s are zero, but its poses move; '
             'try --velocity-source pose_differences.',

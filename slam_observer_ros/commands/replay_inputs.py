@@ -135,12 +135,12 @@ def with_base_frame(
     if inputs.base_frame:
         return inputs
     world, default = ('', inputs.map_frame, inputs.odom_frame), InputSettings().base_frame
-    velocity_frame, base_frame = recording.frames(selected, inputs)
+    velocity_frame, base_frame = recording.contents.frames(selected, inputs)
     base_frame = inputs.sensor_frame or base_frame
     if velocity_frame not in world:
         base_frame = velocity_frame
     elif base_frame not in (*world, default):
-        if recording.places(default, selected):
+        if recording.contents.transform_places(default, selected):
             base_frame = default
         else:
             logger.warning(

@@ -40,7 +40,7 @@ class ReplayOutcome:
     unused : Counter
         Messages that did not become events, by reason.
     missing_ids : str
-        What :meth:`.Recording.missing_ids` says of the landmarks.
+        What :meth:`.Contents.missing_ids` says of the landmarks.
     smoothed, smoothed_errors, smoothed_landmark_rmse_m
         Trajectory and map in hindsight and how far they are off; None if not asked for.
 
@@ -104,7 +104,7 @@ def outcome_of(
         measure(result, truth),
         recording.duration_s,
         unused_messages(recording, selected),
-        recording.missing_ids(selected.landmarks),
+        recording.contents.missing_ids(selected.landmarks),
     )
 
 

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 import dataclasses
-from itertools import islice, pairwise
 import logging
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
-
-import numpy as np
 
 from slam_observer_ros.errors import MessageError, RecordingError
 from slam_observer_ros.events import Event
@@ -26,19 +22,9 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.detections import no_tags, observed_tags
-from slam_observer_ros.messages.message_types import (
-    APRILTAGS,
-    CLOUD_DECODERS,
-    ODOMETRY,
-    POSE_ARRAY,
-    TRANSFORMS,
-)
-from slam_observer_ros.messages.point_cloud_layout import ID_NAME
-from slam_observer_ros.messages.point_clouds import field_names, has_points, missing_ids
 from slam_observer_ros.recording.arrivals import Arrivals
+from slam_observer_ros.recording.contents import Contents
 from slam_observer_ros.recording.decoding import (
-    Decode,
     decode_landmarks,
     decode_pose,
     decode_transform_message,
@@ -51,9 +37,6 @@ from slam_observer_ros.recording.truth import base_in_frames, frames_beside, Tru
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
-
-MAX_EMPTY_CLOUDS = 1000
-"""Most clouds of a topic that are looked at for one with points, which tells of ids."""
 
 logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')
@@ -85,6 +68,8 @@ class Recording:
         Measurements without stamp so far, by topic.
     arrivals : dict of str to Arrivals
         When the measurements so far were received, by topic.
+    contents : Contents
+        What its messages tell before they are used.
 
     Raises
     ------
@@ -97,6 +82,7 @@ class Recording:
         self.path = Path(path)
         self._source, self.warning = open_source(self.path)
         self.topics = self._source.topics
+        self.contents = Contents(self._source)
         self.malformed: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.unstamped: Counter[str] = Counter()
@@ -153,7 +139,8 @@ class Recording:
             If no topic fits, or two do; it lists them, and names the option that decides.
 
         """
-        return select_topics(self.topics, names, inputs, self._identifies, self._pose_frame)
+        contents = self.contents
+        return select_topics(self.topics, names, inputs, contents.has_ids, contents.pose_frame)
 
     def event_count(self, selected: SelectedTopics) -> int:
         """Count the messages that :meth:`events` makes events of, for a progress bar."""
@@ -193,7 +180,9 @@ class Recording:
             BaseFrame(inputs, transforms), inputs.transform_timeout, velocity_timeout_s, self._drop
         )
         decoders = input_decoders(selected, inputs)
-        simulated = {topic for topic in decoders if self._begins_at_zero(topic, decoders[topic])}
+        simulated = {
+            topic for topic in decoders if self.contents.begins_at_zero(topic, decoders[topic])
+        }
         moving = selected.transforms.moving
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:
@@ -206,62 +195,6 @@ class Recording:
             for event in events:
                 yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
         yield from builder.finish()
-
-    def frames(
-        self, selected: SelectedTopics, inputs: InputSettings = InputSettings()
-    ) -> tuple[str, str]:
-        """Return the frames of the first velocity and of the first observation.
-
-        A frame is empty if the message names none, as a Twist.
-        """
-        decoders = input_decoders(selected, dataclasses.replace(inputs, velocity_source='twist'))
-        velocity_frame = self._frame(selected.velocity, decoders[selected.velocity])
-        return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
-
-    def places(self, frame: str, selected: SelectedTopics) -> bool:
-        """Return whether /tf_static or /tf has a frame."""
-        transforms = selected.transforms
-        for raw in self._source.messages((*transforms.static, *transforms.moving)):
-            with suppress(MessageError):
-                for transform in decode_transform_message(raw):
-                    names = transform.frame_id, transform.child_frame_id
-                    if frame in (name.lstrip('/') for name in names):
-                        return True
-        return False
-
-    def missing_ids(self, topic: Topic) -> str:
-        """Return what a landmark topic's points have in place of ids; empty if they have ids."""
-        if topic.message_type == POSE_ARRAY:
-            return 'without ids'
-        if topic.message_type not in CLOUD_DECODERS:
-            return ''
-        return missing_ids(self._field_names(topic), topic.message_type)
-
-    def missing_tags(self, selected: SelectedTopics, tag_frame_prefix: str) -> str:
-        """Return why no frame on /tf is that of a fiducial; empty if one is, or none is wanted."""
-        topics: dict[str, Sequence[Topic]] = {
-            TRANSFORMS: (selected.landmarks,),
-            APRILTAGS: selected.transforms.moving,
-        }
-        if selected.landmarks.message_type not in topics:
-            return ''
-        frames: set[str] = set()
-        for topic in topics[selected.landmarks.message_type]:
-            for transforms in self._all_decoded(topic, decode_transform_message):
-                with suppress(MessageError):  # of an id that is too large: told before
-                    if observed_tags(transforms, tag_frame_prefix):
-                        return ''
-                frames |= {transform.child_frame_id for transform in transforms}
-        if not frames:
-            return 'fiducials are where /tf has them, which was not recorded'
-        return no_tags(tag_frame_prefix, frames)
-
-    def poses_move(self, topic: Topic) -> bool:
-        """Return whether a topic holds an odometry's poses, and they are not all the same."""
-        if topic.message_type != ODOMETRY:
-            return False
-        poses = (message.pose for message in self._all_decoded(topic, decode_pose))
-        return any(not np.array_equal(pose, after) for pose, after in pairwise(poses))
 
     def truth(self, selected: SelectedTopics, base_frame: str = '') -> Truth:
         """Read the true poses and landmarks.
@@ -305,17 +238,6 @@ class Recording:
             self.malformed[raw.topic.name] += 1
             return None
 
-    def _begins_at_zero(self, topic: Topic, decode: Decode) -> bool:
-        """Return whether the stamps are of a simulated clock, of which zero is the first."""
-        stamps_ns: list[int] = []
-        for raw in self._source.messages((topic,)):
-            with suppress(MessageError):
-                stamps_ns += [measured.stamp_ns for measured in decode(raw)]
-            if len(stamps_ns) > 1:
-                # Else it is the first message alone that has no stamp, as before a clock is set.
-                return stamps_ns[0] == 0 < stamps_ns[1] < raw.receive_stamp_ns // 2
-        return False
-
     def _timed(self, measured: Measured, raw: RawMessage, is_simulated: bool) -> Measured:
         receive_stamp_ns = 0 if is_simulated else raw.receive_stamp_ns
         timed = with_receive_time(measured, receive_stamp_ns)
@@ -331,28 +253,6 @@ class Recording:
             message = self._decoded(raw, decode)
             if message is not None:
                 yield message
-
-    def _identifies(self, topic: Topic) -> bool:
-        return ID_NAME in self._field_names(topic)
-
-    def _field_names(self, cloud_topic: Topic) -> tuple[str, ...]:
-        names: tuple[str, ...] = ()
-        for raw in islice(self._source.messages((cloud_topic,)), MAX_EMPTY_CLOUDS):
-            with suppress(MessageError):  # Empty clouds often come without any fields.
-                names = field_names(raw.data, cloud_topic.message_type)
-                if ID_NAME in names or has_points(raw.data, cloud_topic.message_type):
-                    break
-        return names
-
-    def _pose_frame(self, topic: Topic) -> str:
-        return self._frame(topic, lambda raw: [decode_pose(raw)]).lstrip('/')
-
-    def _frame(self, topic: Topic, decode: Decode) -> str:
-        for raw in self._source.messages((topic,)):
-            with suppress(MessageError):
-                for measured in decode(raw):
-                    return measured.frame_id
-        return ''
 
     def _insert(self, transforms: TransformBuffer, raw: RawMessage, *, is_static: bool) -> None:
         messages = self._decoded(raw, decode_transform_message)

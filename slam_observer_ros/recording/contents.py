@@ -1,0 +1,150 @@
+"""What the messages of a recording hold, before any is used or when none could be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
+import dataclasses
+from itertools import islice, pairwise
+from typing import TypeVar
+
+import numpy as np
+
+from slam_observer_ros.errors import MessageError
+from slam_observer_ros.inputs.settings import InputSettings
+from slam_observer_ros.messages.detections import no_tags, observed_tags
+from slam_observer_ros.messages.message_types import (
+    APRILTAGS,
+    CLOUD_DECODERS,
+    ODOMETRY,
+    POSE_ARRAY,
+    TRANSFORMS,
+)
+from slam_observer_ros.messages.point_cloud_layout import ID_NAME
+from slam_observer_ros.messages.point_clouds import field_names, has_points, missing_ids
+from slam_observer_ros.recording.decoding import (
+    Decode,
+    decode_pose,
+    decode_transform_message,
+    input_decoders,
+)
+from slam_observer_ros.recording.sources import MessageSource, RawMessage, Topic
+from slam_observer_ros.recording.topics import SelectedTopics
+
+MAX_EMPTY_CLOUDS = 1000
+"""Most clouds of a topic that are looked at for one with points, which tells of ids."""
+
+_Decoded = TypeVar('_Decoded')
+
+
+class Contents:
+    """Frames, ids and clocks of a recording, from as few of its messages as tell.
+
+    Malformed messages tell nothing.
+
+    Parameters
+    ----------
+    source : MessageSource
+        The open recording.
+
+    """
+
+    def __init__(self, source: MessageSource) -> None:
+        self._source = source
+
+    def frames(
+        self, selected: SelectedTopics, inputs: InputSettings = InputSettings()
+    ) -> tuple[str, str]:
+        """Return the frames of the first velocity and of the first observation.
+
+        A frame is empty if the message names none, as a Twist.
+        """
+        decoders = input_decoders(selected, dataclasses.replace(inputs, velocity_source='twist'))
+        velocity_frame = self._frame(selected.velocity, decoders[selected.velocity])
+        return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
+
+    def pose_frame(self, odometry: Topic) -> str:
+        """Return the frame that the poses of an odometry are told in."""
+        return self._frame(odometry, lambda raw: [decode_pose(raw)]).lstrip('/')
+
+    def transform_places(self, frame: str, selected: SelectedTopics) -> bool:
+        """Return whether /tf_static or /tf has a frame."""
+        transforms = selected.transforms
+        return any(
+            frame in (name.lstrip('/') for name in (transform.frame_id, transform.child_frame_id))
+            for message in self._decoded(
+                (*transforms.static, *transforms.moving), decode_transform_message
+            )
+            for transform in message
+        )
+
+    def has_ids(self, cloud: Topic) -> bool:
+        """Return whether the points of a PointCloud or PointCloud2 have ids."""
+        return ID_NAME in self._field_names(cloud)
+
+    def missing_ids(self, topic: Topic) -> str:
+        """Return what a landmark topic's points have in place of ids; empty if they have ids."""
+        if topic.message_type == POSE_ARRAY:
+            return 'without ids'
+        if topic.message_type not in CLOUD_DECODERS:
+            return ''
+        return missing_ids(self._field_names(topic), topic.message_type)
+
+    def missing_tags(self, selected: SelectedTopics, tag_frame_prefix: str) -> str:
+        """Return why no frame on /tf is that of a fiducial; empty if one is, or none is wanted."""
+        topics: dict[str, Sequence[Topic]] = {
+            TRANSFORMS: (selected.landmarks,),
+            APRILTAGS: selected.transforms.moving,
+        }
+        if selected.landmarks.message_type not in topics:
+            return ''
+        frames: set[str] = set()
+        of_tags = topics[selected.landmarks.message_type]
+        for transforms in self._decoded(of_tags, decode_transform_message):
+            with suppress(MessageError):  # of an id that is too large
+                if observed_tags(transforms, tag_frame_prefix):
+                    return ''
+            frames |= {transform.child_frame_id for transform in transforms}
+        if not frames:
+            return 'fiducials are where /tf has them, which was not recorded'
+        return no_tags(tag_frame_prefix, frames)
+
+    def poses_move(self, topic: Topic) -> bool:
+        """Return whether a topic holds an odometry's poses, and they are not all the same."""
+        if topic.message_type != ODOMETRY:
+            return False
+        poses = (message.pose for message in self._decoded((topic,), decode_pose))
+        return any(not np.array_equal(pose, after) for pose, after in pairwise(poses))
+
+    def begins_at_zero(self, topic: Topic, decode: Decode) -> bool:
+        """Return whether the stamps are of a simulated clock, of which zero is the first."""
+        stamps_ns: list[int] = []
+        for raw in self._source.messages((topic,)):
+            with suppress(MessageError):
+                stamps_ns += [measured.stamp_ns for measured in decode(raw)]
+            if len(stamps_ns) > 1:
+                # Else it is the first message alone that has no stamp, as before a clock is set.
+                return stamps_ns[0] == 0 < stamps_ns[1] < raw.receive_stamp_ns // 2
+        return False
+
+    def _field_names(self, cloud: Topic) -> tuple[str, ...]:
+        names: tuple[str, ...] = ()
+        for raw in islice(self._source.messages((cloud,)), MAX_EMPTY_CLOUDS):
+            with suppress(MessageError):  # Empty clouds often come without any fields.
+                names = field_names(raw.data, cloud.message_type)
+                if ID_NAME in names or has_points(raw.data, cloud.message_type):
+                    break
+        return names
+
+    def _frame(self, topic: Topic, decode: Decode) -> str:
+        for measured in self._decoded((topic,), decode):
+            for first in measured:
+                return first.frame_id
+        return ''
+
+    def _decoded(
+        self, topics: Collection[Topic], decode: Callable[[RawMessage], _Decoded]
+    ) -> Iterator[_Decoded]:
+        for raw in self._source.messages(topics):
+            with suppress(MessageError):
+                yield decode(raw)
