@@ -16,8 +16,8 @@ from odometry import Event
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.motion.held_velocities import HeldVelocities
 from slam_observer_ros.motion.noise import MotionNoise
-from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.parameter_file import read_parameter_file
 from slam_observer_ros.parameters import from_parameters, table

@@ -9,8 +9,8 @@ import numpy as np
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.motion.held_velocities import HeldVelocities
 from slam_observer_ros.motion.noise import MotionNoise
-from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray

@@ -21,9 +21,10 @@ from slam_observer_ros.extrinsics import move_observation, move_velocity
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.held_velocities import HeldVelocities
 from slam_observer_ros.motion.integration import transition, transition_covariance
 from slam_observer_ros.motion.noise import MotionNoise
-from slam_observer_ros.motion.velocity_history import HeldVelocities, VelocityHistory
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
 

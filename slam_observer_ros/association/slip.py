@@ -10,8 +10,8 @@ from slam_observer_ros.association.joint_compatibility import huber_loss
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.matrices import transpose
+from slam_observer_ros.motion.held_velocities import HeldVelocities
 from slam_observer_ros.motion.motion import Motion
-from slam_observer_ros.motion.velocity_history import HeldVelocities
 from slam_observer_ros.slam.sighting import Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray

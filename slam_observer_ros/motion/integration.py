@@ -8,9 +8,10 @@ import numpy as np
 
 from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.motion.calibration import Calibration
+from slam_observer_ros.motion.held_velocities import HeldVelocities
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.motion.noise import MotionNoise
-from slam_observer_ros.motion.velocity_history import HeldVelocities, VelocityHistory
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.matrices import limited
-from slam_observer_ros.motion.velocity_history import HeldVelocities
+from slam_observer_ros.motion.held_velocities import HeldVelocities
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import FloatArray, Immutable
 
