@@ -5,7 +5,6 @@ No Python object is made per point: a cloud of 1000 points costs microseconds, n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.cloud_fields import read_field
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_cloud_layout import (
     CloudField,
@@ -102,7 +102,7 @@ def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     height, width = reader.uint32(), reader.uint32()
-    fields = tuple(_read_field(reader) for _ in range(reader.uint32()))
+    fields = tuple(read_field(reader) for _ in range(reader.uint32()))
     byte_order = '>' if reader.uint8() else '<'
     point_step, row_step = reader.uint32(), reader.uint32()
     data = reader.data(reader.uint32())
@@ -145,76 +145,6 @@ def scan_trouble(event: ObservationEvent) -> str:
         f'{unknown} points without id in one message, more than {MAX_UNKNOWN_POINTS}: landmarks '
         'are wanted, a few to a few hundred a message, not scans'
     )
-
-
-def field_names(raw: Buffer, message_type: str) -> tuple[str, ...]:
-    """Return what a PointCloud2 tells of its points, or a PointCloud beside where they are.
-
-    Parameters
-    ----------
-    raw : Buffer
-        The serialised message.
-    message_type : str
-        ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
-
-    Returns
-    -------
-    tuple of str
-        Names of the fields, or of the channels; with ``id`` the points have ids.
-
-    Raises
-    ------
-    MessageError
-        If the message is malformed.
-
-    """
-    reader = CdrReader(raw)
-    reader.header()
-    if message_type.endswith('PointCloud2'):
-        reader.uint32(), reader.uint32()
-        return tuple(_read_field(reader).name for _ in range(reader.uint32()))
-    reader.float32(3 * reader.uint32())
-    names = []
-    for _ in range(reader.uint32()):
-        names.append(reader.string())
-        reader.float32(reader.uint32())
-    return tuple(names)
-
-
-def has_points(raw: Buffer, message_type: str) -> bool:
-    """Return whether there is a point in a PointCloud or PointCloud2.
-
-    Raises
-    ------
-    MessageError
-        If the message is malformed.
-
-    """
-    reader = CdrReader(raw)
-    reader.header()
-    height = 1 if message_type.endswith('PointCloud') else reader.uint32()
-    return height * reader.uint32() > 0
-
-
-def missing_ids(names: Sequence[str], message_type: str) -> str:
-    """Tell what there is instead of ids; empty if there are ids.
-
-    Parameters
-    ----------
-    names : sequence of str
-        From :func:`field_names`.
-    message_type : str
-        ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
-
-    """
-    if ID_NAME in names:
-        return ''
-    kind = 'fields' if message_type.endswith('PointCloud2') else 'channels'
-    return f'without ids; {kind} {" ".join(names) or "none"}'
-
-
-def _read_field(reader: CdrReader) -> CloudField:
-    return CloudField(reader.string(), reader.uint32(), reader.uint8(), reader.uint32())
 
 
 @lru_cache(maxsize=64)

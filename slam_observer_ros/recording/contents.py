@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.inputs.settings import InputSettings
+from slam_observer_ros.messages.cloud_fields import field_names, has_points, missing_ids
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
@@ -21,7 +22,6 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
 )
 from slam_observer_ros.messages.point_cloud_layout import ID_NAME
-from slam_observer_ros.messages.point_clouds import field_names, has_points, missing_ids
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_pose,
