@@ -93,21 +93,21 @@ class ObservationNoise(Immutable):
 def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
     """Return by what factors (m,) the variances of observations grow if their errors last.
 
-    An error with the correlation time τ is ρ = e^(−dt/τ) times what it was ``dt_s`` before, and
-    noise beside. n observations of one thing then weigh as much as one, and n − 1 whose variance
-    is (1 + ρ)/(1 − ρ) times as large: exactly so if they come at a steady rate.
+    An error with the correlation time T is c = e^(−dt/T) times what it was ``dt_s`` before, plus
+    new noise. n observations of one thing then weigh as much as one, and n − 1 whose variance is
+    (1 + c)/(1 − c) times as large: exactly so if they come at a steady rate.
 
     Parameters
     ----------
     dt_s : FloatArray
         (m,) seconds since each landmark was seen before; infinite if it was not.
     error_time_s : float
-        τ, seconds; with 0 all errors are new.
+        T, seconds; with 0 all errors are new.
 
     """
     if error_time_s == 0.0:
         return np.ones(len(dt_s))
-    new = -np.expm1(-np.maximum(dt_s, MIN_INTERVAL_S) / error_time_s)  # 1 − ρ
+    new = -np.expm1(-np.maximum(dt_s, MIN_INTERVAL_S) / error_time_s)  # 1 − c
     factors: FloatArray = (2.0 - new) / new
     return factors
 

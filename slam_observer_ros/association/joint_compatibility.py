@@ -5,11 +5,11 @@ test*, 2001. All points of an observation share the error of the pose, so pairs 
 gate alone may contradict each other, and a pair that is sure tells which of the others are right.
 A pairing takes each point for one landmark, or for none that is known. It costs
 
-    Σ over its pairs  ρ(d) + ln(|S| / |R|)    and    ρ(gate) for each point without a landmark,
+    Σ over its pairs  h(d) + ln(|S| / |R|)    and    h(gate) for each point without a landmark,
 
 where a pair's d is the Mahalanobis distance of its residual as the pairs before it foretell it,
 S its covariance and R the sensor's: the less the state foretells where a landmark is seen, the
-less it says that something is seen there. ρ is Huber's loss: where wheels slip a true pair may be
+less it says that something is seen there. h is Huber's loss: where wheels slip a true pair may be
 at 6 σ, and by d² it would outweigh much that speaks for it.
 """
 
@@ -32,7 +32,7 @@ A search in depth would spend its time below the first pair, and never see that 
 """
 
 MARGIN = 35.0
-"""How much more than the cheapest something may cost: at odds of e¹⁷ it is given up."""
+"""How much more than the cheapest something may cost: at odds of e^17.5 it is given up."""
 
 RESOLUTION = 2.0
 """Two places are one if the sensor can't tell them apart by this many standard deviations."""
@@ -237,7 +237,7 @@ def unpaired_cost(gate: float) -> float:
 
 
 def huber_loss(distances: FloatArray | float) -> FloatArray:
-    """Return ρ(d): d² near zero, and from ``HEAVY_TAIL`` on a line."""
+    """Return h(d): d² near zero, and from ``HEAVY_TAIL`` on a line."""
     near = np.minimum(distances, HEAVY_TAIL)
     loss: FloatArray = near * (2.0 * distances - near)
     return loss
