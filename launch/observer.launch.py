@@ -33,7 +33,9 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'namespace', default_value='', description='namespace of the robot'
             ),
-            DeclareLaunchArgument('use_sim_time', default_value='false'),
+            DeclareLaunchArgument(
+                'use_sim_time', default_value='false', description='whether time is that of /clock'
+            ),
             Node(
                 package='slam_observer_ros',
                 executable='observer_node',

@@ -44,8 +44,8 @@ class Settings(Immutable):
     )
     max_innovation_time: float = parameter(
         0.2,
-        'Constant gains: longest time step of one observation, which is the time since the '
-        'landmark was last seen',
+        'Constant gains: longest time for which one observation acts; else that is the time since '
+        'the landmark was last seen',
         unit='s',
         minimum=1e-3,
         read_only=False,
@@ -257,14 +257,14 @@ class Settings(Immutable):
     )
     hindsight_interval: int = parameter(
         20,
-        'Riccati gains: new observations that it takes at least to look back; after many of them '
-        'a tenth of all so far, up to 300; 0 for never',
+        'Riccati gains: fewest new observations before looking back; a tenth of all so far if '
+        'that is more, but at most 300; 0 for never',
         minimum=0,
     )
     hindsight_turn: float = parameter(
         0.2,
-        'Riccati gains: root sum square of attitude corrections after which to look back; a tenth '
-        'of the interval will do after a single one of this size',
+        'Riccati gains: look back once attitude corrections have come to this as a root sum '
+        'square; after a single one of this size a tenth of the interval will do',
         unit='rad',
         minimum=0.0,
     )

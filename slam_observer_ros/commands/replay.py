@@ -75,13 +75,13 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         '--load-map',
         type=Path,
         metavar='FILE',
-        help='known landmarks, as --map writes them: the estimate is then in their frame, and no '
-        'ANEES of the pose is told (of the configuration neither if they are fixed)',
+        help='known landmarks, as --map writes them: the estimate is then in their frame, and has '
+        'no ANEES of the pose (nor of the configuration, if they are fixed)',
     )
     parser.add_argument(
         '--smooth',
         action='store_true',
-        help='estimate trajectory and map in hindsight, too: the outputs are of these then',
+        help='estimate trajectory and map in hindsight, too; --tum and --map then write these',
     )
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument(

@@ -78,6 +78,7 @@ def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
     rows = {row.name: row for row in table(Scenario)}
     for option, name in _SCENARIO_OPTIONS.items():
         row = rows[name]
+        text = row.description[0].lower() + row.description[1:]
         unit = f' [{row.unit}]' if row.unit else ''
         parser.add_argument(
             option,
@@ -85,7 +86,7 @@ def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
             type=value_of(row),
             default=row.default,
             metavar='N' if isinstance(row.default, int) else 'M',
-            help=f'{row.description}{unit} (default {row.default})',
+            help=f'{text}{unit} (default {row.default})',
         )
 
 
