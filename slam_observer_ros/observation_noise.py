@@ -93,9 +93,9 @@ class ObservationNoise(Immutable):
 def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
     """Return by what factors (m,) the variances of observations grow if their errors last.
 
-    An error with the correlation time t_e is c = e^(−dt/t_e) times what it was ``dt_s`` before, plus
-    new noise. n observations of one thing then weigh as much as one, and n − 1 whose variance is
-    (1 + c)/(1 − c) times as large: exactly so if they come at a steady rate.
+    An error with the correlation time t_e is c = e^(−dt/t_e) times what it was ``dt_s`` before,
+    plus new noise. n observations of one thing then weigh as much as one, and n − 1 whose variance
+    is (1 + c)/(1 − c) times as large: exactly so if they come at a steady rate.
 
     Parameters
     ----------
