@@ -7,6 +7,7 @@ whole recordings.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 
@@ -26,6 +27,7 @@ REPEATS = 12
 
 def main() -> None:
     """Measure all designs and print one table a design."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     use_one_thread()  # as the nodes do
     measured = {
         (design, n, m): update_s(design, n, m)

@@ -14,6 +14,7 @@ import pytest
 import recordings
 
 import slam_observer_ros
+from slam_observer_ros.commands.options import find_config
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 COMMAND = [sys.executable, '-m', 'slam_observer_ros.cli']
@@ -197,3 +198,15 @@ def test_closed_output(tmp_path, json):
     )
     assert (ended.returncode, ended.stderr) == (0, '')
     assert output.stat().st_size > 0
+
+
+def test_configurations_are_found_wherever_pip_has_put_them(tmp_path, monkeypatch):
+    site, share = tmp_path / 'lib' / 'site-packages', tmp_path / 'share' / 'slam_observer_ros'
+    about = site / 'slam_observer_ros-1.0.dist-info'
+    about.mkdir(parents=True)
+    (about / 'METADATA').write_text('Name: slam_observer_ros\nVersion: 1.0\n')
+    (about / 'RECORD').write_text('../../share/slam_observer_ros/config/blimp.yaml,,\n')
+    (share / 'config').mkdir(parents=True)
+    (share / 'config' / 'blimp.yaml').write_text('/**: {ros__parameters: {gains: scheduled}}\n')
+    monkeypatch.syspath_prepend(str(site))
+    assert find_config('blimp').samefile(share / 'config' / 'blimp.yaml')

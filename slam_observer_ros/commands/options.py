@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
+from importlib import metadata
 import json
 import logging
 import os
 from pathlib import Path
-import sys
 from types import MappingProxyType
 
 from slam_observer_ros.errors import ParameterError, UsageError
@@ -150,11 +150,18 @@ def _is_for_observer(file: Path) -> bool:
 
 
 def _shipped_configs() -> Iterable[Path]:
-    """List the files in config/ of the source tree or of the places where it is installed."""
-    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix]
-    folders = [Path(prefix) / 'share' / _PACKAGE / 'config' for prefix in prefixes if prefix]
-    folders.append(Path(__file__).parents[2] / 'config')
-    return (file for folder in reversed(folders) for file in sorted(folder.glob('*.yaml')))
+    """List the files in config/ of the source tree, or of where pip or ROS has installed it."""
+    share = Path('share') / _PACKAGE / 'config'
+    names = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    prefixes = [Path(name) for name in names if name]
+    installed: Iterable[metadata.PackagePath] = ()
+    with suppress(metadata.PackageNotFoundError):
+        installed = metadata.files(_PACKAGE) or ()
+    return (
+        *(Path(__file__).parents[2] / 'config').glob('*.yaml'),
+        *(Path(str(file.locate())) for file in installed if file.match(f'{share}/*.yaml')),
+        *(file for prefix in reversed(prefixes) for file in (prefix / share).glob('*.yaml')),
+    )
 
 
 def _parse_assignment(text: str) -> tuple[str, object]:
