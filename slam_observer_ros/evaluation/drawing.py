@@ -50,10 +50,10 @@ TRUE_LANDMARKS: Any = {
     'color': BLUE, 'marker': '*', 'markersize': 10, 'linestyle': 'none', 'zorder': 4,
     'label': 'true landmarks',
 }  # fmt: skip
-TRACKS: Any = {'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2, 'label': 'landmark estimates'}
+TRACKS: Any = {'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2}  # they end in LANDMARKS
 LANDMARKS: Any = {
     'color': GREEN, 'marker': 'o', 'markersize': 9, 'markerfacecolor': 'none',
-    'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5,
+    'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5, 'label': 'estimated landmarks',
 }  # fmt: skip
 LEGEND_BELOW: Any = {'loc': 'outside lower center', 'ncols': 5}  # of a figure, not of its axes
 LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}

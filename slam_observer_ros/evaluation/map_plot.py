@@ -124,7 +124,7 @@ def _map_layers(
     layers: list[tuple[FloatArray, Any]] = [
         (estimate.positions, {**PATH, 'linestyle': '-', 'linewidth': 0.9}),
         (estimate.positions[-1:], END),
-        (world_points, {**LANDMARKS, 'label': 'estimated landmarks'}),
+        (world_points, LANDMARKS),
     ]
     if truth is not None:
         layers[:0] = [(truth.positions, TRUE_PATH), (truth.positions[-1:], TRUE_END)]

@@ -129,7 +129,7 @@ def plot_configuration(
     estimate = estimate.moved(correction)
     tracks = se3.transform(correction, landmark_tracks[:, known])
 
-    # All tracks are one line with a break after each, so that the legend names them once.
+    # All tracks are one line, with a break after each.
     breaks = np.full((1, tracks.shape[1], 3), np.nan)
     joined = np.concatenate([tracks, breaks]).swapaxes(0, 1).reshape(-1, 3)
 
