@@ -75,7 +75,7 @@ class Outcome:
 
 def is_contradiction(rejected: BoolArray) -> bool:
     """Return whether most of the known landmarks (m,) seen are rejected: the pose may be wrong."""
-    return bool(2 * np.sum(rejected) > len(rejected))
+    return bool(2 * np.count_nonzero(rejected) > len(rejected))
 
 
 class Outlook:

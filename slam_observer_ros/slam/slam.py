@@ -317,13 +317,14 @@ class Slam:
         self.observer.correct(correction)
         self.gains.settle(self.observer)
         rejected: BoolArray = weights == 0.0
-        self.rejected_in_a_row = self.rejected_in_a_row + 1 if rejected.all() else 0
+        count = int(np.count_nonzero(rejected))
+        self.rejected_in_a_row = self.rejected_in_a_row + 1 if count == len(rows) else 0
         self.was_contradicted = is_contradiction(rejected)
         self.landmarks.accept(rows[~rejected], event.stamp_ns)
-        if rejected.any():
+        if count:
             places = self._outlook.places(event.select(rejected))
             self.landmarks.reject(rows[rejected], *places)
-            self.counts['rejected_landmark'] += int(np.sum(rejected))
+            self.counts['rejected_landmark'] += count
         return rejected
 
     def _note_velocities(self, event: ObservationEvent, rows: IntArray) -> None:
