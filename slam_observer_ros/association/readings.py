@@ -106,7 +106,8 @@ def readings(
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(slam, residuals)
     is_contradicted = not some_are_unknown and is_contradiction(rejected)
-    suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals)]]
+    own = _own_distances(slam, residuals)
+    suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals, own)]]
     if not is_contradicted and (some_are_unknown or may_name(slam, event)):
         return _named(slam, gains, event, new_ids, suspects, budget)
     if is_contradicted:
@@ -143,9 +144,12 @@ def _without(
 def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
     gains, residuals = slam.gains, sighting.residuals
-    if not isinstance(gains, RiccatiGains) or _are_all_near(slam, residuals):
+    if not isinstance(gains, RiccatiGains):
         return False
-    some_are_suspect = bool(_suspects(slam, gains, residuals).any())
+    own = _own_distances(slam, residuals)
+    if (own <= slam.settings.rejection_distance).all():  # by all of S they are no further off
+        return False
+    some_are_suspect = bool(_suspects(slam, gains, residuals, own).any())
     return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
 
 
@@ -236,13 +240,9 @@ def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> floa
     return cost + _cost(slipped, gains, len(event.ids), residuals)
 
 
-def _are_all_near(slam: Slam, residuals: Residuals) -> bool:
-    """Return whether all points pass the gate even by the sensor's noise alone.
-
-    This is quickly told, and by all of S they are no further off.
-    """
-    own = mahalanobis(*residuals.on(slam.axes))
-    return bool((own <= slam.settings.rejection_distance).all())
+def _own_distances(slam: Slam, residuals: Residuals) -> FloatArray:
+    """Return how far off points are by the sensor's noise alone (m,): this is quickly told."""
+    return mahalanobis(*residuals.on(slam.axes))
 
 
 def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:
@@ -250,11 +250,14 @@ def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:
     return np.asarray(slam.gains.distances(residuals) > slam.settings.rejection_distance)
 
 
-def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals) -> BoolArray:
-    """Return which points (m,) only pass the gate since the state is so uncertain."""
-    r, noise = residuals.on(slam.axes)
-    far = are_far(r, noise, slam.settings)
+def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals, own: FloatArray) -> BoolArray:
+    """Return which points (m,) only pass the gate since the state is so uncertain.
+
+    ``own`` (m,) are their :func:`_own_distances`.
+    """
+    far = are_far(own, slam.settings)
     if far.any():
+        r, noise = residuals.on(slam.axes)
         far &= far_from_the_others(r, gains.predicted(residuals), noise, slam.settings)
     return far
 

@@ -60,9 +60,12 @@ def observation_weights(
     return weights
 
 
-def are_far(r: FloatArray, noise: FloatArray, settings: Settings) -> BoolArray:
-    """Return which residuals (m,) are too large for a state that was known; see SUSPICION."""
-    return mahalanobis(r, noise) > SUSPICION * settings.rejection_distance
+def are_far(own: FloatArray, settings: Settings) -> BoolArray:
+    """Return which residuals are too large for a state that was known; see SUSPICION.
+
+    ``own`` (m,) are their distances by the sensor's noise alone.
+    """
+    return own > SUSPICION * settings.rejection_distance
 
 
 def far_from_the_others(
@@ -77,7 +80,7 @@ def far_from_the_others(
     pull = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
     blocks = diagonal_blocks(information, r.shape[1])
     left = np.asarray(np.linalg.solve(blocks, pull)[:, :, 0])
-    passed[passed] = are_far(left, noise[passed], settings)
+    passed[passed] = are_far(mahalanobis(left, noise[passed]), settings)
     return passed
 
 
