@@ -215,8 +215,8 @@ def _cost_of_staying(slam: Slam, sighting: Sighting) -> tuple[BoolArray, FloatAr
     place, one that goes on moving would pay for one and the same shift each time. No landmark
     costs more than another outlier.
     """
-    k, seen = slam.axes.point, sighting.event.select(sighting.known)
-    noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(seen))
+    k, known = slam.axes.point, sighting.known
+    noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(known))
     again, shifts = slam.rejected_before(sighting)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
     return again, np.minimum(costs, _outlier_cost(slam))

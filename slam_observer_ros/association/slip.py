@@ -58,7 +58,7 @@ def slip(slam: Slam, sighting: Sighting) -> float:
 def _duration_s(slam: Slam, sighting: Sighting) -> float:
     """Return after how long without odometry a robot might see what it does, seconds."""
     settings, k, residuals = slam.settings, slam.axes.point, sighting.residuals
-    points = sighting.event.points[sighting.known]
+    points = sighting.known.points
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
     needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE)
@@ -81,8 +81,8 @@ def _likeliest_pose(slam: Slam, sighting: Sighting, variances: FloatArray) -> Fl
     """Return Â (4, 4) by Gauss-Newton steps, as if landmarks and start were known exactly."""
     A, axes = slam.observer.A, slam.axes
     landmarks = slam.observer.points[sighting.residuals.rows]
-    points = sighting.event.points[sighting.known]
-    W = np.linalg.inv(sighting.covariances[sighting.known][:, : axes.point, : axes.point])
+    points = sighting.known.points
+    W = np.linalg.inv(sighting.covariances[sighting.rows >= 0][:, : axes.point, : axes.point])
     found = A
     if len(points) >= axes.point:
         weights = np.trace(W, axis1=1, axis2=2)

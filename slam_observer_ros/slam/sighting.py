@@ -31,8 +31,10 @@ class Sighting:
         (m,) row of the landmark that each of them is, −1 where it is new.
     covariances : FloatArray
         (m, 3, 3) their covariances, body frame, m².
+    known : ObservationEvent
+        The part of ``event`` that is of landmarks which are not new.
     residuals : Residuals
-        Of those that are not new.
+        Of this part.
     left_out : int
         How many points of the observation are not in ``event``.
 
@@ -41,13 +43,9 @@ class Sighting:
     event: ObservationEvent
     rows: IntArray
     covariances: FloatArray
+    known: ObservationEvent
     residuals: Residuals
     left_out: int
-
-    @property
-    def known(self) -> BoolArray:
-        """(m,) which of the points are of landmarks that are not new."""
-        return self.rows >= 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +104,10 @@ class Outlook:
 
     def sighting(self, event: ObservationEvent, rows: IntArray, left_out: int) -> Sighting:
         """Return what the points of ``event`` tell, of landmarks ``rows`` (m,)."""
-        known, covariances = rows >= 0, self.covariances(event, rows)
-        residuals = self.residuals(event.select(known), rows[known], covariances[known])
-        return Sighting(event, rows, covariances, residuals, left_out)
+        is_known, covariances = rows >= 0, self.covariances(event, rows)
+        known = event.select(is_known)
+        residuals = self.residuals(known, rows[is_known], covariances[is_known])
+        return Sighting(event, rows, covariances, known, residuals, left_out)
 
     def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray

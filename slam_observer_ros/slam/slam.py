@@ -238,15 +238,15 @@ class Slam:
         if len(forgotten):
             # A history without them would lose what they have told of the pose.
             self.gains.restart(self.observer, 'landmarks had to make room (max_landmarks)')
-        seen_before = event.select(known)
-        rejected = self._correct(seen_before, sighting.residuals)
-        if not known.all():
+        rejected = self._correct(known, sighting.residuals)
+        if len(known.ids) < len(rows):
+            is_new = rows < 0
             self._forget(forgotten, 'forgotten_landmark')
-            self._initialise(event.select(~known), sighting.covariances[~known])
+            self._initialise(event.select(is_new), sighting.covariances[is_new])
             event, rows = self._mapped(event)
         moved_ids = self._look_back(event, rows)
         self._note_velocities(event, rows)
-        return Outcome(seen_before.ids, sighting.residuals.r, rejected, moved_ids)
+        return Outcome(known.ids, sighting.residuals.r, rejected, moved_ids)
 
     def disbelieve(self, event: ObservationEvent) -> None:
         """Count points as rejected although the gate lets them pass.
@@ -266,7 +266,7 @@ class Slam:
         frame.
         """
         rows = sighting.residuals.rows
-        points, tolerances_m = self._outlook.places(sighting.event.select(sighting.known))
+        points, tolerances_m = self._outlook.places(sighting.known)
         again = self.landmarks.are_rejected_again(rows, points, tolerances_m)
         return again, points - self.landmarks.rejected_last[rows]
 
