@@ -27,8 +27,7 @@ def usable_points(
         repeated = np.isin(event.ids, repeated_ids)
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
-    unknown = event.ids == UNKNOWN_ID
-    if settings.gains != 'riccati' and unknown.any():
+    if settings.gains != 'riccati' and (unknown := event.ids == UNKNOWN_ID).any():
         warnings.unknown_ids(settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)

@@ -126,7 +126,7 @@ class Hypotheses:
         if len(self._states) == 1 and not is_unknown.any():
             sighting = self.best.look(event)
             is_clear = self._limit == 1 or not is_ambiguous(self.best, sighting)
-            if is_clear and not may_name(self.best, event):
+            if is_clear and not may_name(self.best, sighting):
                 return self.best.observe(sighting)
         possible = self._possible(event)
         uses = Counter(number for number, _ in possible)

@@ -108,7 +108,7 @@ def readings(
     is_contradicted = not some_are_unknown and is_contradiction(rejected)
     own = _own_distances(slam, residuals)
     suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals, own)]]
-    if not is_contradicted and (some_are_unknown or may_name(slam, event)):
+    if not is_contradicted and (some_are_unknown or may_name(slam, sighting)):
         return _named(slam, gains, event, new_ids, suspects, budget)
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(slam, gains, sighting, event, rejected)
@@ -153,11 +153,12 @@ def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
 
 
-def may_name(slam: Slam, event: ObservationEvent) -> bool:
+def may_name(slam: Slam, sighting: Sighting) -> bool:
     """Return whether a point's id may be that of a landmark which had none of its own so far."""
-    if not is_automatic(slam.landmarks.ids).any() or not isinstance(slam.gains, RiccatiGains):
+    all_are_known = len(sighting.known.ids) == len(sighting.rows) + sighting.left_out
+    if all_are_known or not isinstance(slam.gains, RiccatiGains):
         return False
-    return bool((slam.landmarks.rows_of(event.ids) < 0).any())
+    return bool(is_automatic(slam.landmarks.ids).any())
 
 
 def _rejected_or_slipped(
