@@ -458,7 +458,7 @@ class Estimator:
             warnings.more_than_max(len(event.ids), settings.max_landmarks)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
-        warnings.lost_places(self._frame.counts)
+        warnings.lost_places(self._frame.count)
         if settings.gains == 'riccati':
             warnings.large_map(len(self._slam.landmarks))
 

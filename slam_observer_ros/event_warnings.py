@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 import logging
 
 from slam_observer_ros.errors import InvalidEventError
@@ -101,12 +101,12 @@ class EventWarnings:
             )
             self._warn('many_moved', text)
 
-    def lost_places(self, counts: Mapping[str, int]) -> None:
-        """Tell that the robot is not where it was taken to be, if ``counts`` say so once more."""
+    def lost_places(self, count: Callable[[str], int]) -> None:
+        """Tell that the robot is not where it was taken to be, if ``count`` says so again."""
         for name, text in LOST_PLACES.items():
-            if counts[name] > self._places[name]:
+            if count(name) > self._places[name]:
                 self._warn(name, text)
-                self._places[name] = counts[name]
+                self._places[name] = count(name)
 
     def _warn(self, kind: str, text: str) -> None:
         """Count one more of a kind; ``text`` is logged if their number is a power of ten."""

@@ -82,6 +82,10 @@ class MapFrame:
         """What befell the landmarks, and how often the place in the map was not known or lost."""
         return self._counts + self.slam.counts
 
+    def count(self, name: str) -> int:
+        """Return one of the :attr:`counts`, without adding up all of them."""
+        return self._counts[name] + self.slam.counts[name]
+
     @property
     def landmark_map(self) -> LandmarkMap:
         """The present map; see :attr:`slam_observer_ros.estimator.Estimator.landmark_map`."""
