@@ -57,15 +57,17 @@ def integrate(
     delay's error does to all of them depends on their two ends alone.
     """
     held = _held(velocities, calibration, start_ns, end_ns)
-    if at_start is None:
-        at_start = _around(velocities, calibration, start_ns)
+    at_ends = None
+    if calibration.delay_error_ns:
+        at_start = _around(velocities, calibration, start_ns) if at_start is None else at_start
+        at_ends = np.array([at_start, _around(velocities, calibration, end_ns)])
     return Motion(
         path=_path(A, held, calibration),
         measured_velocities=held.body_velocities,
         dt_s=held.dt_s,
         covariances=noise.covariances(held),
         duration_s=float((held.dt_s + held.gap_s).sum()),
-        at_ends=np.array([at_start, _around(velocities, calibration, end_ns)]),
+        at_ends=at_ends,
     )
 
 
@@ -91,8 +93,5 @@ def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int
     The velocity at the very stamp would pass its own noise off as a turn to tell time by. In a
     mean there is less noise. What is yet to come of it, the latest velocity stands in for.
     """
-    reach_ns = calibration.delay_error_ns
-    if not reach_ns:
-        return np.zeros(6)
-    centre_ns = stamp_ns - calibration.delay_ns
+    reach_ns, centre_ns = calibration.delay_error_ns, stamp_ns - calibration.delay_ns
     return velocities.mean(centre_ns - reach_ns, centre_ns + reach_ns)
