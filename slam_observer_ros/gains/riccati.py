@@ -101,13 +101,14 @@ class RiccatiGains(GainDesign):
         weights = observation_weights(r, self.predicted(residuals), noise, self._settings)
         passed = weights > 0.0
         used = residuals.select(passed)
+        r, noise = used.on(self._axes)
         CP, CPC = self._project(used)
         share = weights[passed] / repetition_factors(
             used.dt_s, self._settings.observation_error_time
         )
-        S = with_blocks(CPC, noise[passed] / share[:, None, None])
+        S = with_blocks(CPC, noise / share[:, None, None])
         K = condition(self._joint.P, CP, S)
-        return self._as_correction(-K @ r[passed].ravel()), weights  # for (30) and (31)
+        return self._as_correction(K @ -r.ravel()), weights  # for (30) and (31)
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
