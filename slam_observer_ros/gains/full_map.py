@@ -64,7 +64,8 @@ class FullMapGains(RiccatiGains):
 
     def predict(self, observer: Observer, motion: Motion) -> None:
         """Add the motion's noise to the pose block, and what the calibration's error adds."""
-        self.settle(observer)  # landmarks with a velocity have moved
+        if observer.have_moved:
+            self.settle(observer)
         if self._is_moving:
             self._predict_moving(observer, motion)
             return

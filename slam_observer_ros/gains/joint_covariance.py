@@ -156,8 +156,6 @@ class JointCovariance:
         ã_i = â_i − R_Ã a_i turns with the noise of the pose unless a_i is small, which prediction
         in the pose block alone leaves out. With y_i° + â_i for y_i°, ã_i becomes ã_i − [â_i]× ω.
         """
-        if not observer.a.any():
-            return
         self.turn(self.map_columns, observer.a)
         observer.rebase(observer.points)
 
