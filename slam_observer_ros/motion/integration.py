@@ -66,7 +66,7 @@ def integrate(
         measured_velocities=held.body_velocities,
         dt_s=held.dt_s,
         covariances=noise.covariances(held),
-        duration_s=float((held.dt_s + held.gap_s).sum()),
+        duration_s=to_s(end_ns - start_ns),
         at_ends=at_ends,
     )
 
