@@ -191,7 +191,10 @@ class GainDesign:
         """Take ``covariance`` (6, 6) for that of ε, independent of all else."""
 
     def recall(self, observer: Observer, rows: IntArray) -> None:
-        """Move landmarks (m,) that are about to be used, where the design had put that off."""
+        """Move landmarks that are about to be used, where the design had put that off.
+
+        ``rows`` (m,) are −1 where one is new.
+        """
 
     def postponed_shifts(self) -> FloatArray:
         """Return how far landmarks have yet to be moved, (n, 3), metres; (1, 3) if it is zero."""

@@ -161,7 +161,7 @@ class ScheduledGains(GainDesign):
 
     def recall(self, observer: Observer, rows: IntArray) -> None:
         """Move landmarks that are about to be used to where they should have been moved by now."""
-        rows = np.union1d(rows, self._leaves.due())
+        rows = np.union1d(rows[rows >= 0], self._leaves.due())
         F, N, shifts = self._leaves.now(rows)
         self._leaves.update(rows, F, N)
         observer.a[rows] += shifts

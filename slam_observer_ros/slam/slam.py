@@ -191,7 +191,7 @@ class Slam:
         It moves landmarks whose gains had put that off.
         """
         rows = self.landmarks.rows_of(event.ids)
-        self.gains.recall(self.observer, rows[rows >= 0])
+        self.gains.recall(self.observer, rows)
         return self._outlook.covariances(event, rows)
 
     @property
@@ -222,7 +222,7 @@ class Slam:
         m, rows = len(event.ids), self.landmarks.rows_of(event.ids)
         if not self.is_mapping:
             event, rows = self._mapped(event)
-        self.gains.recall(self.observer, rows[rows >= 0])
+        self.gains.recall(self.observer, rows)
         return self._outlook.sighting(event, rows, m - len(event.ids))
 
     def _mapped(self, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
