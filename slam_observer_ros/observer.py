@@ -140,7 +140,7 @@ class Observer:
     def rebase(self, y_ref: FloatArray) -> None:
         """Put the landmarks at ``y_ref`` (n, 3), reference frame, with â_i = 0."""
         self.y_ref = y_ref
-        self.a = np.zeros_like(y_ref)
+        self.a = np.zeros(y_ref.shape)
 
     def remove_landmarks(self, rows: IntArray) -> None:
         """Delete the landmarks at ``rows``; those behind move up."""

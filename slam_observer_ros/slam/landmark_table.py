@@ -79,7 +79,7 @@ class LandmarkTable:
         """Return the row of each id (m,), −1 where it is unknown."""
         if not len(self.ids):
             return np.full(len(ids), -1)
-        place = np.searchsorted(self.ids, ids, sorter=self._order)
+        place = self.ids.searchsorted(ids, sorter=self._order)
         rows = self._order[np.minimum(place, len(self.ids) - 1)]
         return np.where(self.ids[rows] == ids, rows, -1)
 
