@@ -19,7 +19,6 @@ import numpy as np
 
 from slam_observer_ros.association.joint_compatibility import MARGIN, RESOLUTION
 from slam_observer_ros.association.readings import is_ambiguous, may_name, Reading, readings
-from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
@@ -133,7 +132,8 @@ class Hypotheses:
         followed: list[_Followed] = []
         for number, reading in possible:
             uses[number] -= 1
-            slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
+            own = self._states[number]
+            slam = reading.slipped or (deepcopy(own) if uses[number] else own)
             state = self._follow(slam, reading, event)
             if not any(
                 are_one(slam, reading.event, other.slam, other.reading.event) for other in followed
@@ -149,8 +149,6 @@ class Hypotheses:
     def _follow(self, slam: Slam, reading: Reading, event: ObservationEvent) -> _Followed:
         """Let a state use an observation as one reading has it; return what comes of it."""
         slam.landmarks.renumber(reading.named_rows, reading.names)
-        if reading.has_slipped:
-            slip(slam, slam.look(reading.event))
         outcome = slam.observe(slam.look(reading.event))
         if reading.disbelieved is not None:
             slam.disbelieve(reading.disbelieved)

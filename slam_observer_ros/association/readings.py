@@ -58,8 +58,8 @@ class Reading:
         The observation with all ids filled in, without points that are taken for outliers.
     cost : float
         −2 ln of its likelihood, up to what all readings of the observation share.
-    has_slipped : bool
-        Whether the robot may have moved in any way since the observation before.
+    slipped : Slam or None
+        The state if the robot may have moved in any way since the observation before; else None.
     disbelieved : ObservationEvent or None
         Of the points that were left out though the gate lets them pass, those of landmarks that
         were seen so seldom that these may be the outliers; None or empty if there are none.
@@ -70,7 +70,7 @@ class Reading:
 
     event: ObservationEvent
     cost: float
-    has_slipped: bool = False
+    slipped: Slam | None = None
     disbelieved: ObservationEvent | None = None
     named_rows: IntArray = field(default_factory=_none)
     names: IntArray = field(default_factory=_none)
@@ -176,15 +176,14 @@ def _rejected_or_slipped(
     residuals, m = sighting.residuals, len(event.ids)
     cost, is_news = _rejection_cost(slam, sighting, rejected)
     as_told = _cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
-    slipped = _after_slip(slam, sighting, event) if is_news else None
-    if slipped is None:
+    after_slip = _after_slip(slam, sighting, event) if is_news else None
+    if after_slip is None:
         return [Reading(event, as_told + cost)]
-    after_slip = Reading(event, SLIP_COST + slipped, has_slipped=True)
     if slam.was_contradicted:
         return [Reading(event, as_told + cost), after_slip]
     as_outliers = as_told + float(np.sum(rejected)) * _outlier_cost(slam)
     # A garbled message explains what happens to be where it should be, too.
-    garbled = max(cost, min(slipped, as_outliers))
+    garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
     return [Reading(event, garbled), after_slip]
 
 
@@ -228,8 +227,8 @@ def _outlier_cost(slam: Slam) -> float:
     return unpaired_cost(slam.settings.rejection_distance)
 
 
-def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> float | None:
-    """Return what it costs to see this after a slip; None if that does not explain all of it."""
+def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> Reading | None:
+    """Return the reading that the robot has slipped; None if that does not explain all of it."""
     settings = slam.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return None
@@ -238,7 +237,8 @@ def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> floa
     residuals, gains = slipped.look(event).residuals, slipped.gains
     if not isinstance(gains, RiccatiGains) or _are_rejected(slipped, residuals).any():
         return None
-    return cost + _cost(slipped, gains, len(event.ids), residuals)
+    cost += SLIP_COST + _cost(slipped, gains, len(event.ids), residuals)
+    return Reading(event, cost, slipped)
 
 
 def _own_distances(slam: Slam, residuals: Residuals) -> FloatArray:
