@@ -116,11 +116,9 @@ class LandmarkTable:
         """Count one more accepted observation of ``rows`` (m,)."""
         self.counts[rows] += 1
         self.rejections[rows] = 0
-        last_ns = self.last_seen_ns[rows]
-        self.seen_before_ns[rows] = np.where(
-            last_ns < stamp_ns, last_ns, self.seen_before_ns[rows]
-        )
-        self.last_seen_ns[rows] = np.maximum(last_ns, stamp_ns)
+        later = rows[self.last_seen_ns[rows] < stamp_ns]
+        self.seen_before_ns[later] = self.last_seen_ns[later]
+        self.last_seen_ns[later] = stamp_ns
 
     def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
         """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
