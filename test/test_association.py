@@ -484,7 +484,8 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
             observe(estimator, 0.1 * step, [*points, *far], [1, 2, *[UNKNOWN_ID] * len(far)])
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
-        (reading,) = readings(estimator._slam, event, np.arange(3), np.inf)
+        slam = estimator._slam
+        (reading,) = readings(slam, event, slam.look(event), np.arange(3), np.inf)
         costs.append(reading.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 

@@ -29,7 +29,7 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.matrices import mahalanobis
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.sighting import Outcome
+from slam_observer_ros.slam.sighting import Outcome, Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
 
@@ -122,12 +122,12 @@ class Hypotheses:
         """Use an observation made at the states' instant; return what the best one makes of it."""
         is_unknown = event.ids == UNKNOWN_ID
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
+        sightings = [slam.look(event) for slam in self._states]
         if len(self._states) == 1 and not is_unknown.any():
-            sighting = self.best.look(event)
-            is_clear = self._limit == 1 or not is_ambiguous(self.best, sighting)
-            if is_clear and not may_name(self.best, sighting):
-                return self.best.observe(sighting)
-        possible = self._possible(event)
+            is_clear = self._limit == 1 or not is_ambiguous(self.best, sightings[0])
+            if is_clear and not may_name(self.best, sightings[0]):
+                return self.best.observe(sightings[0])
+        possible = self._possible(event, sightings)
         uses = Counter(number for number, _ in possible)
         followed: list[_Followed] = []
         for number, reading in possible:
@@ -158,7 +158,9 @@ class Hypotheses:
         slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
         return _Followed(slam, reading, outcome, cost)
 
-    def _possible(self, event: ObservationEvent) -> list[tuple[int, Reading]]:
+    def _possible(
+        self, event: ObservationEvent, sightings: list[Sighting]
+    ) -> list[tuple[int, Reading]]:
         """Return what each state may take an observation for, by the number of the state.
 
         The cheapest comes first; the cost is that of the state as well. A point has the same id
@@ -170,8 +172,9 @@ class Hypotheses:
         new_ids = self._next_id + np.arange(len(event.ids))
         possible: list[tuple[int, Reading]] = []
         worst = math.inf
-        for number, (slam, cost) in enumerate(zip(self._states, self._costs, strict=True)):
-            for reading in readings(slam, event, new_ids, worst - cost):
+        states = zip(self._states, self._costs, sightings, strict=True)
+        for number, (slam, cost, sighting) in enumerate(states):
+            for reading in readings(slam, event, sighting, new_ids, worst - cost):
                 possible.append((number, replace(reading, cost=cost + reading.cost)))
                 worst = min(worst, cost + reading.cost + MARGIN)
         possible.sort(key=lambda pair: pair[1].cost)

@@ -77,7 +77,7 @@ class Reading:
 
 
 def readings(
-    slam: Slam, event: ObservationEvent, new_ids: IntArray, budget: float
+    slam: Slam, event: ObservationEvent, sighting: Sighting, new_ids: IntArray, budget: float
 ) -> list[Reading]:
     """Return what an observation may mean.
 
@@ -87,6 +87,8 @@ def readings(
         The state at the observation's instant.
     event : ObservationEvent
         The observation, of m points.
+    sighting : Sighting
+        What it tells the state.
     new_ids : IntArray
         (m,) ids of points that are taken for landmarks not seen before.
     budget : float
@@ -101,7 +103,6 @@ def readings(
     gains = slam.gains
     if not isinstance(gains, RiccatiGains):
         return [Reading(event, 0.0)]
-    sighting = slam.look(event)
     residuals, m = sighting.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(slam, residuals)
