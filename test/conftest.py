@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import atexit
 from collections.abc import Iterator
+from contextlib import suppress
 import os
 from pathlib import Path
 import shutil
 import signal
 import socket
 import tempfile
+import time
 from typing import TYPE_CHECKING
 
 from hypothesis import settings
@@ -27,6 +29,10 @@ SESSION_VARIABLE = 'SLAM_OBSERVER_TEST_SESSION'
 DOMAIN_IDS = range(1, 102)
 SHARED_MEMORY = Path('/dev/shm')
 DDS_FILES = '*fastrtps_*'
+
+MAPPED_S = 2.0
+"""Longest time that a process takes to map shared memory that it has made."""
+
 SCRATCH = Path(tempfile.mkdtemp(prefix='slam_observer_test_'))
 atexit.register(shutil.rmtree, SCRATCH)
 
@@ -96,12 +102,27 @@ def nothing_is_left_behind() -> Iterator[None]:
     processes = processes_of_these_tests()
     for process_id in processes:
         os.kill(process_id, signal.SIGKILL)
-    used = segments_in_use()
-    for left in set(SHARED_MEMORY.glob(DDS_FILES)) - before:
-        # Another user's processes can't be looked into.
-        if segment_of(left.name) not in used and left.stat().st_uid == os.getuid():
-            left.unlink(missing_ok=True)
+    left = unused_files() - before
+    if left:
+        # A node of other tests may be about to map what it has just made: it would be deaf.
+        time.sleep(MAPPED_S)
+        left &= unused_files()
+    for file in left:
+        file.unlink(missing_ok=True)
     assert not processes, f'processes left running: {list(processes.values())}'
+
+
+def unused_files() -> set[Path]:
+    """Return this user's files of shared memory that no process has mapped."""
+    files = set(SHARED_MEMORY.glob(DDS_FILES))
+    used = segments_in_use()  # after the files: one that comes meanwhile would seem unused
+    unused = set()
+    for file in files:
+        with suppress(FileNotFoundError):  # its process has removed it meanwhile
+            # Another user's processes can't be looked into.
+            if segment_of(file.name) not in used and file.stat().st_uid == os.getuid():
+                unused.add(file)
+    return unused
 
 
 def segments_in_use() -> set[str]:
