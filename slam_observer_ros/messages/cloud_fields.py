@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.point_cloud_layout import CloudField, ID_NAME
@@ -13,8 +14,25 @@ def read_field(reader: CdrReader) -> CloudField:
     return CloudField(reader.string(), reader.uint32(), reader.uint8(), reader.uint32())
 
 
-def field_names(raw: Buffer, message_type: str) -> tuple[str, ...]:
-    """Return what a PointCloud2 tells of its points, or a PointCloud beside where they are.
+class CloudFields(NamedTuple):
+    """What a cloud has.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What a PointCloud2 tells of its points: the names of its fields. Of a PointCloud the
+        channels, which tell what there is beside where they are. With ``id`` the points have ids.
+    points : int
+        How many points there are.
+
+    """
+
+    names: tuple[str, ...]
+    points: int
+
+
+def read_fields(raw: Buffer, message_type: str) -> CloudFields:
+    """Return what a PointCloud or PointCloud2 has.
 
     Parameters
     ----------
@@ -22,11 +40,6 @@ def field_names(raw: Buffer, message_type: str) -> tuple[str, ...]:
         The serialised message.
     message_type : str
         ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
-
-    Returns
-    -------
-    tuple of str
-        Names of the fields, or of the channels; with ``id`` the points have ids.
 
     Raises
     ------
@@ -37,29 +50,15 @@ def field_names(raw: Buffer, message_type: str) -> tuple[str, ...]:
     reader = CdrReader(raw)
     reader.header()
     if message_type.endswith('PointCloud2'):
-        reader.uint32(), reader.uint32()
-        return tuple(read_field(reader).name for _ in range(reader.uint32()))
-    reader.float32(3 * reader.uint32())
+        points = reader.uint32() * reader.uint32()
+        return CloudFields(tuple(read_field(reader).name for _ in range(reader.uint32())), points)
+    points = reader.uint32()
+    reader.float32(3 * points)
     names = []
     for _ in range(reader.uint32()):
         names.append(reader.string())
         reader.float32(reader.uint32())
-    return tuple(names)
-
-
-def has_points(raw: Buffer, message_type: str) -> bool:
-    """Return whether there is a point in a PointCloud or PointCloud2.
-
-    Raises
-    ------
-    MessageError
-        If the message is malformed.
-
-    """
-    reader = CdrReader(raw)
-    reader.header()
-    height = 1 if message_type.endswith('PointCloud') else reader.uint32()
-    return height * reader.uint32() > 0
+    return CloudFields(tuple(names), points)
 
 
 def missing_ids(names: Sequence[str], message_type: str) -> str:
@@ -68,7 +67,7 @@ def missing_ids(names: Sequence[str], message_type: str) -> str:
     Parameters
     ----------
     names : sequence of str
-        From :func:`field_names`.
+        From :func:`read_fields`.
     message_type : str
         ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
 

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.messages.cloud_fields import field_names, missing_ids
+from slam_observer_ros.messages.cloud_fields import missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import CLOUD_DECODERS
@@ -58,7 +58,8 @@ class CloudDecoder:
         return message
 
     def _look(self, raw: Buffer) -> None:
-        missing = missing_ids(field_names(raw, self._message_type), self._message_type)
+        names = read_fields(raw, self._message_type).names
+        missing = missing_ids(names, self._message_type)
         if missing:
             topic = self._node.resolve_topic_name('landmarks')
             self._node.get_logger().warning(

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_observer_ros.errors import MessageError
 from slam_observer_ros.inputs.settings import InputSettings
-from slam_observer_ros.messages.cloud_fields import field_names, has_points, missing_ids
+from slam_observer_ros.messages.cloud_fields import missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
@@ -101,9 +101,8 @@ class Contents:
         frames: set[str] = set()
         of_tags = topics[selected.landmarks.message_type]
         for transforms in self._decoded(of_tags, decode_transform_message):
-            with suppress(MessageError):  # of an id that is too large
-                if observed_tags(transforms, tag_frame_prefix):
-                    return ''
+            if observed_tags(transforms, tag_frame_prefix):
+                return ''
             frames |= {transform.child_frame_id for transform in transforms}
         if not frames:
             return 'fiducials are where /tf has them, which was not recorded'
@@ -118,21 +117,24 @@ class Contents:
 
     def begins_at_zero(self, topic: Topic, decode: Decode) -> bool:
         """Return whether the stamps are of a simulated clock, of which zero is the first."""
-        stamps_ns: list[int] = []
+        has_begun = False
         for raw in self._source.messages((topic,)):
             with suppress(MessageError):
-                stamps_ns += [measured.stamp_ns for measured in decode(raw)]
-            if len(stamps_ns) > 1:
-                # Else it is the first message alone that has no stamp, as before a clock is set.
-                return stamps_ns[0] == 0 < stamps_ns[1] < raw.receive_stamp_ns // 2
+                for measured in decode(raw):
+                    if has_begun:
+                        # Else the first message alone has no stamp, as before a clock is set.
+                        return 0 < measured.stamp_ns < raw.receive_stamp_ns // 2
+                    if measured.stamp_ns:
+                        return False
+                    has_begun = True
         return False
 
     def _field_names(self, cloud: Topic) -> tuple[str, ...]:
         names: tuple[str, ...] = ()
         for raw in islice(self._source.messages((cloud,)), MAX_EMPTY_CLOUDS):
             with suppress(MessageError):  # Empty clouds often come without any fields.
-                names = field_names(raw.data, cloud.message_type)
-                if ID_NAME in names or has_points(raw.data, cloud.message_type):
+                names, points = read_fields(raw.data, cloud.message_type)
+                if ID_NAME in names or points:
                     break
         return names
 
