@@ -128,12 +128,13 @@ class Hypotheses:
             if is_clear and not may_name(self.best, sightings[0]):
                 return self.best.observe(sightings[0])
         possible = self._possible(event, sightings)
-        uses = Counter(number for number, _ in possible)
+        uses = Counter(number for number, reading in possible if reading.slipped is None)
         followed: list[_Followed] = []
         for number, reading in possible:
-            uses[number] -= 1
-            own = self._states[number]
-            slam = reading.slipped or (deepcopy(own) if uses[number] else own)
+            slam = reading.slipped
+            if slam is None:
+                uses[number] -= 1
+                slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
             state = self._follow(slam, reading, event)
             if not any(
                 are_one(slam, reading.event, other.slam, other.reading.event) for other in followed
