@@ -55,7 +55,6 @@ LANDMARKS: Any = {
     'color': GREEN, 'marker': 'o', 'markersize': 9, 'markerfacecolor': 'none',
     'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5, 'label': 'estimated landmarks',
 }  # fmt: skip
-LEGEND_BELOW: Any = {'loc': 'outside lower center', 'ncols': 5}  # of a figure, not of its axes
 LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
 
 _PLANAR_RATIO = 0.01

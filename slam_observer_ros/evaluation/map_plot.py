@@ -15,7 +15,6 @@ from slam_observer_ros.evaluation.drawing import (
     END,
     is_flat,
     LANDMARKS,
-    LEGEND_BELOW,
     PATH,
     save,
     STYLE,
@@ -35,6 +34,12 @@ _MAX_LABELS = 80
 
 _LABEL_RIGHT_PT, _LABEL_UP_PT = 8.0, 12.0
 """From the middle of a marker to its label's side, however long that is, and to its middle."""
+
+_PANELS_IN = 6.3
+"""Largest width and height of what is drawn, inches."""
+
+_LABELS_IN, _LEGEND_IN = 0.7, 0.9
+"""Room for the labels of an axis, and for the title and two lines of legend."""
 
 _NEAR = 0.03
 """Markers nearer than this share of the map touch: of several it matters where their middle is."""
@@ -93,25 +98,46 @@ def plot_map(
     margin = 0.06 * float(np.max(high - low)) or 1.0
     low, high = low - margin, high + margin
 
-    upward = [1] if is_flat(layers[0][0]) else [1, 2]
-    spans = (high - low)[upward]
-    height = float(np.clip(1.5 + 6.3 * spans.sum() / (high - low)[0], 4.0, 9.0))
-    figure = Figure(figsize=(7.2, height))
-    panels = figure.subplots(len(upward), 1, squeeze=False, height_ratios=spans)[:, 0]
-    for axes, up in zip(panels, upward, strict=True):
+    views = [(0, 1)] if is_flat(layers[0][0]) else [(0, 1), _side_view(high - low)]
+    figure, panels = _panels(views, high - low)
+    for axes, (across, up) in zip(panels, views, strict=True):
         for points, style in layers:
-            axes.plot(points[:, 0], points[:, up], **style)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[up], high[up]), aspect='equal')
-        axes.set_ylabel(f'{"xyz"[up]} [m]')
+            axes.plot(points[:, across], points[:, up], **style)
+        axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]), aspect='equal')
+        axes.set(xlabel=f'{"xyz"[across]} [m]', ylabel=f'{"xyz"[up]} [m]')
     named = ~is_automatic(ids)
     if np.sum(named) <= _MAX_LABELS:
         _label_landmarks(panels[0], ids[named], world_points[named], landmark_truth)
     aligned = '' if truth is None else ' after rigid alignment'
-    panels[0].set_title(f'Trajectory and map{aligned}')
-    panels[-1].set_xlabel('x [m]')
+    figure.suptitle(f'Trajectory and map{aligned}', fontsize=11, fontweight='bold')
     figure.align_ylabels(panels)
-    figure.legend(*panels[-1].get_legend_handles_labels(), **LEGEND_BELOW)
+    figure.legend(*panels[-1].get_legend_handles_labels(), loc='outside lower center', ncols=3)
     return save(figure, path)
+
+
+def _side_view(spans_m: FloatArray) -> tuple[int, int]:
+    """Return the axes, across and up, of a view from the side that shows the longer one."""
+    return (1, 2) if spans_m[1] > spans_m[0] else (0, 2)
+
+
+def _panels(views: list[tuple[int, int]], spans_m: FloatArray) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each view, all at one scale.
+
+    One below the other if they share the axis across; else side by side.
+    """
+    widths_m, heights_m = (spans_m[list(axis)] for axis in zip(*views, strict=True))
+    side_by_side = len({across for across, _ in views}) > 1
+    if side_by_side:
+        width_m, height_m = widths_m.sum(), heights_m.max()
+        layout: dict[str, Any] = {'ncols': len(views), 'width_ratios': widths_m}
+    else:
+        width_m, height_m = widths_m[0], heights_m.sum()
+        layout = {'nrows': len(views), 'height_ratios': heights_m}
+    in_per_m = min(_PANELS_IN / width_m, _PANELS_IN / height_m)
+    width_in = in_per_m * width_m + _LABELS_IN * layout.get('ncols', 1)
+    height_in = in_per_m * height_m + _LABELS_IN * layout.get('nrows', 1) + _LEGEND_IN
+    figure = Figure(figsize=(max(width_in, 5.0), height_in))
+    return figure, figure.subplots(squeeze=False, **layout).ravel().tolist()
 
 
 def _map_layers(

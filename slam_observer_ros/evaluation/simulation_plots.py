@@ -16,7 +16,6 @@ from slam_observer_ros.evaluation.drawing import (
     GREY,
     is_flat,
     LANDMARKS,
-    LEGEND_BELOW,
     PATH,
     save,
     STYLE,
@@ -152,7 +151,7 @@ def plot_configuration(
     else:
         limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
         axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.1)
-    figure.legend(**LEGEND_BELOW)
+    figure.legend(loc='outside lower center', ncols=5)
     return save(figure, path)
 
 
