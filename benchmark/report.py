@@ -11,22 +11,32 @@ from typing import Any, TypeAlias
 
 import estimators
 from estimators import BATCH, EKF, ISAM2, ISAM2_DEFAULT, SMOOTHED, UNCALIBRATED
+import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullLocator
 from monte_carlo import BATCH as BATCH_OF_RUNS
 from monte_carlo import Consistency
 import numpy as np
 from scores import Scores
 from variants import CLEAN, FALSE_POINTS, LEFT_OUT, NO_IDS, OUTLIER_COLUMNS, OUTLIERS, WORST
 
+from slam_observer_ros.evaluation.drawing import BLUE, GREEN, GREY, RED, save, STYLE
 from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.types import FloatArray
 
 LEFT_OUT_COLUMN = 'riccati, these points left out'
 GROWTH_COLUMNS = (*OUTLIER_COLUMNS, 'riccati' + WORST, LEFT_OUT_COLUMN)
 
-DRAWN = {column: f'C{i}' for i, column in enumerate((*DESIGNS, EKF, ISAM2))}
-"""Estimators in the figure, with their colours."""
+DRAWN: dict[str, dict[str, Any]] = {
+    column: {'color': colour, 'marker': marker}
+    for column, colour, marker in zip(
+        (*DESIGNS, EKF), (GREY, BLUE, GREEN, RED), 'sD^o', strict=True
+    )
+}
+"""Estimators in the figure, and how they are drawn."""
+
+RATIO_TICKS = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0)
 
 STARRY_NIGHT = 'Starry Night'
 MRCLAM_MEAN = 'MRCLAM 6, mean'
@@ -39,6 +49,7 @@ Tables: TypeAlias = dict[str, Table]
 
 AIMS = (
     ('configuration_rmse_m', 'riccati', ISAM2, 'mean ≤ 1, each ≤ 1.15'),
+    ('configuration_rmse_m', 'riccati', ISAM2_DEFAULT, ''),
     ('configuration_rmse_m', UNCALIBRATED, ISAM2, ''),
     ('configuration_rmse_m', 'scheduled', 'riccati', '≤ 1.2'),
     ('configuration_rmse_m', EKF, 'riccati', '≥ 0.98'),
@@ -195,15 +206,16 @@ def to_json(results: Results) -> dict[str, Any]:
     return converted
 
 
+@mpl.rc_context(STYLE)
 def draw(results: Results, path: Path) -> None:
-    """Draw the configuration errors as bars and the ANEES over time."""
+    """Draw the configuration errors and the ANEES over time."""
     loops = results.consistency
-    figure = Figure(figsize=(11.0, 4.0 + 3.0 * bool(loops)), layout='constrained')
+    figure = Figure(figsize=(10.0, 3.6 + 2.8 * bool(loops)))
     grid = figure.add_gridspec(1 + bool(loops), max(len(loops), 1))
-    _draw_bars(figure.add_subplot(grid[0, :]), results.tables[CLEAN])
+    _draw_ratios(figure.add_subplot(grid[0, :]), results.tables[CLEAN])
     for i, (loop, columns) in enumerate(loops.items()):
         _draw_consistency(figure.add_subplot(grid[1, i]), loop, columns)
-    figure.savefig(path, dpi=120)
+    save(figure, path)
 
 
 def _table(title: str, rows: dict[str, dict[str, str]], columns: tuple[str, ...]) -> str:
@@ -356,25 +368,31 @@ def _with_aim(ratios: dict[str, float], aim: str) -> dict[str, str]:
     return {**cells, 'aim': aim}
 
 
-def _draw_bars(axes: Axes, table: Table) -> None:
+def _draw_ratios(axes: Axes, table: Table) -> None:
+    """Draw configuration errors as multiples of iSAM2's, one place for each world."""
+    isam2 = _values(table, table, ISAM2, 'configuration_rmse_m')
     places = np.arange(len(table))
-    width = 0.8 / len(DRAWN)
-    for i, (column, colour) in enumerate(DRAWN.items()):
-        heights = _values(table, table, column, 'configuration_rmse_m')
-        shifted = places + (i - 0.5 * (len(DRAWN) - 1)) * width
-        axes.bar(shifted, heights, width, label=column, color=colour)
+    axes.axhline(1.0, color='#555555', linewidth=1.0, zorder=1)
+    axes.text(-0.45, 1.0, 'iSAM2', fontsize=8, verticalalignment='bottom')
+    for column, style in DRAWN.items():
+        ratios = _values(table, table, column, 'configuration_rmse_m') / isam2
+        axes.plot(places, ratios, linestyle='none', label=column, **style)
     axes.set_yscale('log')
+    axes.yaxis.set_major_locator(FixedLocator(RATIO_TICKS))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter('{x:g}')
     axes.set_xticks(places, [fill(world, 12) for world in table], fontsize=8)
-    axes.set_ylabel('configuration error, m')
-    axes.legend(ncols=len(DRAWN), fontsize=8, frameon=False)
+    axes.set_xlim(-0.5, len(table) - 0.5)
+    axes.set_title('Configuration error as a multiple of that of iSAM2')
+    axes.legend(ncols=len(DRAWN), fontsize=8)
 
 
 def _draw_consistency(axes: Axes, loop: str, columns: dict[str, Consistency]) -> None:
     for name, consistency in columns.items():
-        axes.plot(consistency.times_s, consistency.pose, '.-', label=name, color=DRAWN[name])
-        axes.axhspan(*consistency.band, color='#DDDDDD', zorder=0)
+        axes.plot(consistency.times_s, consistency.pose, markersize=4, label=name, **DRAWN[name])
+    band = next(iter(columns.values())).band  # that of the number of runs
+    axes.axhspan(*band, color='#DDDDDD', zorder=0, label='95 % of honest estimators')
     axes.set_ylim(bottom=0.0)
-    axes.set_xlabel('time, s')
-    axes.set_ylabel("pose's ANEES")
-    axes.set_title(f'{loop}; grey: 95 % of honest estimators', fontsize=9)
-    axes.legend(fontsize=8, frameon=False)
+    axes.set_xlabel('time [s]')
+    axes.set_title(f'ANEES of the pose, {loop}')
+    axes.legend(fontsize=8, loc='lower right')
