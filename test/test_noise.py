@@ -426,6 +426,19 @@ def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor(ga
 
 
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_the_range_that_counts_is_expected_and_the_direction_measured(gains):
+    """As a state whose heading is off by 0.2 rad sees a stereo camera's point, and 1 m too far."""
+    noise = {'observation_model': 'stereo', 'stereo_baseline': 0.1}
+    estimator = Estimator(Settings(gains=gains, reorder_window=0.0, confirmations=1, **noise))
+    points = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]])
+    estimator.add(VelocityEvent(0, np.zeros(6)))
+    estimator.add(ObservationEvent(0, np.arange(3), points))
+    turned = points @ so3.exp(np.array([0.0, 0.0, 0.2]))
+    found = estimator._slam.look(ObservationEvent(10**8, np.arange(3), 1.25 * turned)).covariances
+    np.testing.assert_allclose(found, observed(turned, **noise), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 def test_of_a_landmark_in_doubt_what_counts_is_where_it_was_measured(gains):
     """One that is not is as uncertain as where it should be is far."""
     noise = {'bearing_noise': 0.1, 'range_noise': 0.05}

@@ -231,11 +231,9 @@ def test_nor_does_it_however_many_landmarks_it_tells_of(seed, seen):
     assert max(errors_m.values()) < 0.3
 
 
-@modes
-@pytest.mark.parametrize('shift_m', [1.0, 2.0])
-def test_a_landmark_that_moved_and_is_seen_alone_does_not_throw_the_pose(settings, shift_m):
-    """However long; what is seen next tells that it was the landmark."""
-    world = gain_worlds.drive(settings, 60.0, 1, noise=0.5, landmarks=6)
+def is_thrown_by_a_moved_landmark(settings, seed):
+    """Two metres are beyond the gate in most worlds; in some one can't tell who has moved."""
+    world = gain_worlds.drive(settings, 60.0, seed, noise=0.5, landmarks=6)
     counts = np.bincount(np.concatenate([event.ids for event in world.observations()]))
     one = int(np.argmax(counts))
 
@@ -244,12 +242,18 @@ def test_a_landmark_that_moved_and_is_seen_alone_does_not_throw_the_pose(setting
             return event
         event = event.select(event.ids == one)
         back = world.true_pose(event.stamp_ns)[:3, :3].T
-        return replace(event, points=event.points + back @ [shift_m, 0.0, 0.0])
+        return replace(event, points=event.points + back @ [2.0, 0.0, 0.0])
 
     estimator, errors_m = run(world.with_observations(change), settings)
     _, plain_m = run(world, settings)
     assert estimator.counts['rejected_landmark'] >= 1
-    assert max(errors_m.values()) < max(plain_m.values()) + 0.3
+    return max(errors_m.values()) > max(plain_m.values()) + 0.3
+
+
+@modes
+def test_a_landmark_that_moved_and_is_seen_alone_seldom_throws_the_pose(settings):
+    """However long; what is seen next tells that it was the landmark."""
+    assert sum(is_thrown_by_a_moved_landmark(settings, seed) for seed in range(6)) <= 1
 
 
 @modes

@@ -331,7 +331,7 @@ def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkey
     settings = replace(settings, angular_velocity_noise=(0.3,) * 3)
     estimator = Estimator(settings)
     points = np.array([[4.0, 0.0, 0.0], [3.2, 2.4, 0.0], [3.2, 0.0, 2.4]])
-    turned = points @ so3.exp(np.array([0.0, 0.0, 0.3]))
+    turned = points @ so3.exp(np.array([0.0, 0.0, 0.2]))
     for step, seen in enumerate([points, points, points, turned]):
         estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
         estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))

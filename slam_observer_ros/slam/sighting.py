@@ -9,7 +9,7 @@ import numpy as np
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.gains.base import Residuals, Seen
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observation_noise import ObservationNoise
+from slam_observer_ros.observation_noise import ObservationNoise, RESOLUTION_M
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.landmark_table import LandmarkTable
@@ -143,11 +143,15 @@ class Outlook:
     def covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return what observed points may be off by: (m, 3, 3), body frame, m².
 
-        The noise model is told where a landmark should be, not where it was measured: a landmark
-        measured too near would be believed more than one measured too far, and all would be
-        drawn towards the robot.
+        The noise model is told how far off a landmark should be, not how far it was measured:
+        one measured too near would be believed more than one measured too far, and all would be
+        drawn towards the robot. In which direction, the sensor knows better than a state does
+        whose heading is yet to be corrected.
         """
-        return self._noise.covariances(event, self._sights(event, rows))
+        measured, expected = event.sights, self._sights(event, rows)
+        measured_m = np.maximum(np.linalg.norm(measured, axis=1), RESOLUTION_M)
+        shares = np.linalg.norm(expected, axis=1) / measured_m
+        return self._noise.covariances(event, shares[:, None] * measured)
 
     def _sights(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return where points should be (m, 3), from the sensor, metres, body frame.
