@@ -19,6 +19,9 @@ RECENT = 1000
 More than inputs keep while the node is busy: those were received late, and tell of no delay.
 """
 
+HELD_UP_NS = 250_000_000
+"""Stamps far behind that are received so soon after one in time tell of no jump of the clock."""
+
 MIN_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
 
@@ -36,6 +39,11 @@ class EventQueue:
     got there, or when ``AGREEING_STAMPS`` stamps agree that there was a pause; at once where
     events come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
     received for as long: then it was a silence, not the clock.
+
+    Stamps behind all others are refused. ``AGREEING_STAMPS`` in a row tell that the clock has
+    jumped back, but only where those of one kind of event go back themselves, as a sensor that is
+    always too late goes on from its own last stamp, and not right after an event that is in time:
+    then they were held up on the way, and come in a burst.
 
     Parameters
     ----------
@@ -61,13 +69,16 @@ class EventQueue:
         self._heap: list[tuple[Key, Event]] = []
         self._known: set[Key] = set()
         self._most_known = MIN_KNOWN
-        self._strays = 0
+        self._strays: set[int] = set()
         self._stray_ns = 0
+        # Newest stamp of each kind of event that was not ahead of all others.
+        self._newest_of_kind_ns: dict[type, int] = {}
         # The newest stamp that is taken, believed or not.
         self._lead_ns = 0
         # How far ahead a stamp may be that is believed at once.
         self._usual_ns = min(self._near_ns, max_jump_ns)
         self._ahead_of_reception_ns: deque[int] = deque(maxlen=RECENT)
+        self._in_time_receive_ns: int | None = None
         self.newest_ns: int | None = None
 
     def push(self, event: Event) -> bool:
@@ -90,12 +101,14 @@ class EventQueue:
                 raise _refusal(ahead_ns)
             self._insert(event)
             self._note_reception(event)
-            self._strays = 0
+            self._goes_on(event)
+            self._strays.clear()
             self._believe(max(self.newest_ns, stamp_ns))
             return False
         too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
         if too_late or too_early:
-            if self._count_stray(stamp_ns):
+            is_no_jump = too_late and (self._goes_on(event) or self._is_held_up(event))
+            if not is_no_jump and self._count_stray(stamp_ns):
                 return True
             raise _refusal(ahead_ns)
         self._insert(event)
@@ -141,6 +154,7 @@ class EventQueue:
     def _note_reception(self, event: Event) -> None:
         if event.receive_ns is not None:
             self._ahead_of_reception_ns.append(event.stamp_ns - event.receive_ns)
+            self._in_time_receive_ns = event.receive_ns
 
     def _was_silent(self, event: Event) -> bool:
         """Return whether the time of reception has gone on as far as the stamp, or nearly."""
@@ -155,6 +169,20 @@ class EventQueue:
             self._usual_ns = min(max(self._near_ns, 2 * step_ns), self._max_jump_ns)
         self.newest_ns = self._lead_ns = newest_ns
 
+    def _goes_on(self, event: Event) -> bool:
+        """Return whether stamps of an event's kind have not gone back; the first has not."""
+        kind = type(event)
+        goes_on = event.stamp_ns > self._newest_of_kind_ns.get(kind, event.stamp_ns - 1)
+        if goes_on:
+            self._newest_of_kind_ns[kind] = event.stamp_ns
+        return goes_on
+
+    def _is_held_up(self, event: Event) -> bool:
+        """Return whether an event was received right after one that was in time."""
+        if event.receive_ns is None or self._in_time_receive_ns is None:
+            return False
+        return 0 <= event.receive_ns - self._in_time_receive_ns < HELD_UP_NS
+
     def _count_stray(self, stamp_ns: int) -> bool:
         """Count a stamp far from the newest one; return whether enough have agreed on it now.
 
@@ -162,13 +190,13 @@ class EventQueue:
         """
         newest_ns = self.newest_ns or 0
         same_side = (stamp_ns > newest_ns) == (self._stray_ns > newest_ns)
-        agrees = same_side and abs(stamp_ns - self._stray_ns) <= self._max_jump_ns
-        is_next = agrees and self._strays > 0
-        self._strays = self._strays + (stamp_ns != self._stray_ns) if is_next else 1
+        if not (same_side and abs(stamp_ns - self._stray_ns) <= self._max_jump_ns):
+            self._strays.clear()
+        self._strays.add(stamp_ns)
         self._stray_ns = stamp_ns
-        if self._strays < AGREEING_STAMPS:
+        if len(self._strays) < AGREEING_STAMPS:
             return False
-        self._strays = 0
+        self._strays.clear()
         return True
 
 

@@ -337,3 +337,51 @@ def test_strays_among_good_events_never_add_up():
         with pytest.raises(InvalidEventError):
             queue.push(velocity(10**15 + k))
         assert not queue.push(velocity(k))
+
+
+def push_or_reason(queue, event):
+    try:
+        return queue.push(event)
+    except InvalidEventError as error:
+        return error.reason
+
+
+@pytest.mark.parametrize('held_up_since_s', [6, 2])
+def test_a_burst_of_what_was_held_up_tells_of_no_jump_of_the_clock(held_up_since_s):
+    """Of one detector, or of a second one: then observations have gone on meanwhile."""
+    queue = make_queue()
+    for event in dense(10 * SECOND):
+        stamp_ns = event.stamp_ns - START_NS
+        queue.push(received(event, stamp_ns))
+        if stamp_ns < 6 * SECOND:
+            queue.push(received(observation(stamp_ns), stamp_ns))
+    burst = [
+        received(observation(held_up_since_s * SECOND + n * SECOND // 10), 10 * SECOND + n)
+        for n in range(20)
+    ]
+    assert {push_or_reason(queue, event) for event in burst} == {'too_late'}
+
+
+def test_a_sensor_that_is_always_too_late_goes_on_alone_without_a_jump_of_the_clock():
+    queue = make_queue()
+    for event in dense(10 * SECOND):
+        assert not queue.push(event)
+        push_or_reason(queue, observation(event.stamp_ns - START_NS - 3 * SECOND))
+    alone = [observation(7 * SECOND + n * SECOND // 20) for n in range(18)]
+    assert {push_or_reason(queue, event) for event in alone} == {'too_late'}
+    assert queue.newest_ns == event.stamp_ns
+
+
+def test_two_clocks_that_stand_still_confirm_no_jump():
+    queue = filled(*dense(SECOND))
+    stuck = [velocity(n % 2 - 20 * SECOND) for n in range(4 * AGREEING_STAMPS)]
+    assert {push_or_reason(queue, event) for event in stuck} == {'too_late'}
+
+
+def test_a_looped_recording_is_a_jump_of_the_clock_within_half_a_second():
+    queue = make_queue()
+    lap = dense(10 * SECOND)
+    for event in lap:
+        assert not queue.push(received(event, event.stamp_ns))
+    again = [received(event, event.stamp_ns + 10 * SECOND) for event in lap[:25]]
+    assert True in [push_or_reason(queue, event) for event in again]
