@@ -47,8 +47,8 @@ GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
 def scale_and_bias(estimator):
     """Estimated factors (6,) and biases (6,), as they are applied to a velocity."""
     calibrated = estimator._slam.gains.calibration.apply
-    bias = calibrated(np.zeros((1, 6)))[0]
-    return calibrated(np.ones((1, 6)))[0] - bias, bias
+    once, twice = calibrated(np.array([np.ones(6), 2.0 * np.ones(6)]))
+    return twice - once, 2.0 * once - twice
 
 
 def deviations(estimator, count):
@@ -86,6 +86,22 @@ def test_a_gyroscopes_bias_is_found_within_three_sigma(seed):
     assert np.all(sigma < 0.01)
     np.testing.assert_allclose(scale, 1.0)
     np.testing.assert_array_equal(found[3:], 0.0)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_a_robot_whose_wheels_stand_does_not_turn_by_a_bias(gains):
+    world = drive(GYROSCOPE, 60.0, bias=GYROSCOPE_BIAS)
+    estimator = estimate(world, with_gains(GYROSCOPE, gains))
+    start_ns = estimator.stamp_ns
+    estimator.add(VelocityEvent(start_ns + 1, np.zeros(6)))
+    estimator.flush()
+    parked, variances = estimator.pose, estimator._slam.gains.calibration_variances.copy()
+    for n in range(1, 1000):
+        estimator.add(VelocityEvent(start_ns + n * 10**8, np.zeros(6)))
+    estimator.flush()
+    np.testing.assert_allclose(estimator.pose, parked, atol=1e-9)
+    np.testing.assert_array_equal(estimator.body_velocity, 0.0)
+    np.testing.assert_array_equal(estimator._slam.gains.calibration_variances, variances)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])

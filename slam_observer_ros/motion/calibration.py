@@ -13,7 +13,7 @@ from slam_observer_ros.geometry import paths
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.units import to_ns
 
 NAMES = (
@@ -97,8 +97,13 @@ class Calibration:
         return to_ns(float(self._all[DELAY]))
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (…, 6) as (1 + s) ∘ V + b."""
-        return body_velocities * self._all[:6] + self._all[6:DELAY]
+        """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so.
+
+        Wheels that stand don't turn the robot, however unlike they are, and no gyroscope gives
+        zero on all axes.
+        """
+        biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
+        return body_velocities * self._all[:6] + biases
 
     def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
         """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
@@ -110,7 +115,7 @@ class Calibration:
         if not self.count:
             return np.empty((Ad.shape[1], 0))
         rates = motion.measured_velocities[:, self._calibrated]
-        rates[:, self._scales :] = 1.0
+        rates[:, self._scales :] = _moves(motion.measured_velocities)[:, None]
         shares = paths.at_poses(rates * motion.dt_s[:, None])
         of_rates = Ad[:, :, self._calibrated] * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
@@ -124,3 +129,8 @@ class Calibration:
         """Add ``change`` (c,) to the estimates."""
         self._all[self._estimated] += change
         self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)
+
+
+def _moves(body_velocities: FloatArray) -> BoolArray:
+    """Return whether velocities (…, 6) are not exactly zero (…)."""
+    return np.asarray(body_velocities.any(axis=-1))
