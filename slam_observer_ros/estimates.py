@@ -7,6 +7,9 @@ import math
 
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
+IMPLAUSIBLE = 4.0
+"""Standard deviations as stated by which no calibration is off: something else is wrong."""
+
 
 @dataclass(frozen=True, slots=True)
 class Update:
@@ -50,6 +53,9 @@ class CalibrationEstimate:
         multiplied by.
     unit : str
         Unit of both; '' for a factor.
+    nominal, stated : float
+        What it was taken for at the start, and the standard deviation that the settings state;
+        infinite where it may drift away from there.
 
     """
 
@@ -57,6 +63,20 @@ class CalibrationEstimate:
     value: float
     deviation: float
     unit: str
+    nominal: float = 0.0
+    stated: float = math.inf
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong if it is further from nominal than the settings can mean; else ''."""
+        times = abs(self.value - self.nominal) / self.stated
+        if times <= IMPLAUSIBLE:
+            return ''
+        return (
+            f'{self.name} is {self.value:.3g}, {times:.0f} times its stated error '
+            f'({self.stated:g}) from {self.nominal:g}: are signs, units and frames of velocity '
+            'and points right?'
+        )
 
     def __str__(self) -> str:
         """Write it with its uncertainty, of which at least two digits can be seen."""

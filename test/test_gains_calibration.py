@@ -351,3 +351,20 @@ def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
 )
 def test_an_estimate_is_told_as_far_as_it_is_known(deviation, expected):
     assert str(CalibrationEstimate('angular_bias_x', 0.012345, deviation, 'rad/s')) == expected
+
+
+def test_a_calibration_that_nobody_can_mean_is_told():
+    """Yaw rates with the wrong sign, for which the scale makes up; real wheels are not."""
+    wrong = drive(WHEELS, 60.0, scale=np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0]))
+    angular, linear = estimate(wrong, WHEELS).calibration
+    assert angular.trouble.startswith('angular_scale_z is -')
+    assert 'times its stated error (0.1) from 1: are signs' in angular.trouble
+    assert not linear.trouble
+    right = estimate(drive(WHEELS, 60.0, scale=WHEEL_SCALE), WHEELS)
+    assert not any(part.trouble for part in right.calibration)
+
+
+def test_a_bias_that_may_drift_is_plausible_wherever_it_is():
+    drifts = replace(GYROSCOPE, angular_bias_error=(0.002,) * 3, calibration_drift=1.0)
+    estimator = estimate(drive(drifts, 60.0, bias=5.0 * GYROSCOPE_BIAS), drifts)
+    assert not any(part.trouble for part in estimator.calibration)

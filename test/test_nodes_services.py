@@ -24,6 +24,7 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes import diagnostics as node_diagnostics
@@ -314,6 +315,13 @@ def test_more_rejected_points_than_outliers_are_told_once_there_are_enough(
     text = f'{100 * rejected / points:.0f} % of the points seen lately were rejected'
     assert (text in status.message) == warns
     assert status.level == (DiagnosticStatus.WARN if warns else DiagnosticStatus.OK)
+
+
+def test_a_calibration_that_nobody_can_mean_is_told():
+    wrong = CalibrationEstimate('angular_scale_z', -0.5, 0.01, '', nominal=1.0, stated=0.03)
+    status = Told(calibration=[wrong]).publish(observation=1)
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message == wrong.trouble
 
 
 def test_points_rejected_long_ago_are_told_of_no_more():

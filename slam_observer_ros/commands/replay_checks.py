@@ -156,6 +156,7 @@ def warn_of_input(recording: Recording, selected: SelectedTopics, result: Replay
     """Say what of the recording, or of the settings, is likely to be wrong."""
     _warn_of_missing_stamps(recording)
     _warn_of_rejections(result)
+    _warn_of_calibration(result)
     _warn_of_unmapped(result)
     _warn_of_unused_poses(recording, selected, result)
 
@@ -180,6 +181,13 @@ def _warn_of_rejections(result: Replay) -> None:
             100.0 * share,
             ', and whether the map is still true' if result.in_known_map else '',
         )
+
+
+def _warn_of_calibration(result: Replay) -> None:
+    """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
+    for part in result.estimator.calibration:
+        if part.trouble:
+            logger.warning('%s', part.trouble)
 
 
 def _warn_of_unmapped(result: Replay) -> None:

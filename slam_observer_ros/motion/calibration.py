@@ -23,7 +23,7 @@ NAMES = (
 )
 """Names of six scales, six biases and the delay τ."""
 
-DELAY = NAMES.index('velocity_delay')
+SCALES, DELAY = range(6), NAMES.index('velocity_delay')
 
 MIN_DELAY_S = -0.2
 """An odometry's velocity, averaged over the time before its stamp, shows in observations before
@@ -66,7 +66,7 @@ class Calibration:
         pose = np.arange(6)[axes.pose]
         possible = np.concatenate([pose, 6 + pose, [DELAY]])
         self._estimated: IntArray = possible[errors[possible] > 0.0]
-        self._scales = int(np.sum(self._estimated < 6))
+        self._scales = int(np.sum(self._estimated < len(SCALES)))
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._all: FloatArray = np.repeat([1.0, 0.0], [6, 7])
         self.count = len(self._estimated)
@@ -83,9 +83,17 @@ class Calibration:
 
     def estimates(self, variances: FloatArray) -> list[CalibrationEstimate]:
         """Return the estimates with what the gains know of them: ``variances`` (c,)."""
+        stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
         return [
-            CalibrationEstimate(NAMES[i], float(self._all[i]), float(np.sqrt(variance)), UNITS[i])
-            for i, variance in zip(self._estimated, variances, strict=True)
+            CalibrationEstimate(
+                NAMES[i],
+                float(self._all[i]),
+                float(np.sqrt(variance)),
+                UNITS[i],
+                nominal=float(i in SCALES),
+                stated=float(error),
+            )
+            for i, variance, error in zip(self._estimated, variances, stated, strict=True)
         ]
 
     @property

@@ -138,6 +138,7 @@ class Diagnostics:
         warnings.append(self._rejections_warning(new))
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
+        warnings += [part.trouble for part in self._estimator.calibration]
         warnings.append(self._outputs.trouble)
         if not self._estimator.is_localised:
             warnings.append('the place in the loaded map is not known yet: no pose is published')
