@@ -1024,3 +1024,12 @@ def test_a_saved_map_leaves_out_what_is_estimated_to_move():
         estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         estimator.add(ObservationEvent(stamp_ns, np.arange(4), points + 0.1 * step * speed))
     assert estimator.landmark_map.ids.tolist() == [0, 1, 3]
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_a_map_made_in_the_plane_says_so_in_space(two_d_mode, caplog):
+    points = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [4.0, 4.0, 0.0]])
+    planar = np.diag([0.01, 0.01, 0.0])
+    known = LandmarkMap(np.arange(3), points, np.tile(planar, (3, 1, 1)), np.full(3, 9))
+    Estimator(Settings(two_d_mode=two_d_mode)).load_map(known)
+    assert ('two_d_mode, which is off' in caplog.text) == (not two_d_mode)

@@ -41,6 +41,13 @@ class LandmarkMap:
             self.ids[rows], self.world_points[rows], covariances, self.counts[rows], self.frame_id
         )
 
+    @property
+    def is_planar(self) -> bool:
+        """Whether all heights are zero and exact, as those of a map made with ``two_d_mode``."""
+        if self.covariances is None or not len(self.ids):
+            return False
+        return not (self.world_points[:, 2].any() or self.covariances[:, 2].any())
+
     def flattened(self) -> LandmarkMap:
         """Return the map with all landmarks in the plane z = 0."""
         return replace(self, world_points=self.world_points * np.array([1.0, 1.0, 0.0]))

@@ -162,6 +162,11 @@ class MapFrame:
         someone has placed it elsewhere; else its place follows from what it sees, or has seen.
         """
         self.loaded = landmark_map.flattened() if self.settings.two_d_mode else landmark_map
+        if landmark_map.is_planar and not self.settings.two_d_mode:
+            logger.warning(
+                'The map was made with two_d_mode, which is off: in space its heights of zero are '
+                'taken for exact (use two_d_mode: true for a robot on a floor).'
+            )
         self.is_localised = False
         self._trial = None
         self._search = PlaceSearch()
