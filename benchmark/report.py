@@ -100,17 +100,17 @@ from one observation to the next. Where errors last (`observation_error_time`, f
 all estimators are given the same larger covariances.
 
 - **constant, scheduled, riccati**: this project's gain designs. In the wheeled configuration
-  `scheduled` and `riccati` also estimate scale, bias and delay of the odometry, which GTSAM and the
-  EKF don't do here; `riccati, no calibration` has that switched off, for a comparison on equal
+  `scheduled` and `riccati` also estimate scale, bias and delay of the odometry, which GTSAM and
+  the EKF don't do here; `riccati, no calibration` has that switched off, for a comparison on equal
   terms.
 - **textbook EKF**: world-frame errors and absolute landmarks (`benchmark/ekf_slam.py`), with the
   observer's gate and Huber weights.
 - **iSAM2**: GTSAM, updated and read out in full after each observation; relinearizeSkip 1,
-  threshold 0.01 (the more accurate setting), and also with GTSAM's default parameters. One odometry
-  factor between consecutive observations, bearing-range factors with Huber's loss, Pose2/Point2 for
-  planar data.
-- **smoothed** and **GTSAM batch** use all data, including later observations: `riccati` followed by
-  Gauss–Newton over everything; Levenberg–Marquardt from iSAM2's last estimate.
+  threshold 0.01 (the more accurate setting), and also with GTSAM's default parameters. One
+  odometry factor between consecutive observations, bearing-range factors with Huber's loss,
+  Pose2/Point2 for planar data.
+- **smoothed** and **GTSAM batch** use all data, including later observations: `riccati` followed
+  by Gauss–Newton over everything; Levenberg–Marquardt from iSAM2's last estimate.
 
 Configuration error: after each observation, the RMS over all landmarks seen three times or more so
 far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. A landmark without id
@@ -128,8 +128,8 @@ The aims of the first table are for Starry Night and the mean of MRCLAM 6, in bo
 missed; the other columns are single worlds.
 
 ANEES: every 5 s, the mean over the Monte Carlo runs of the squared error of the pose (or the
-landmarks) normalised by its covariance and its degrees of freedom; then the mean and the range over
-the run. The band in each table contains 95 % of a consistent estimator's values.
+landmarks) normalised by its covariance and its degrees of freedom; then the mean and the range
+over the run. The band in each table contains 95 % of a consistent estimator's values.
 
 ![Configuration error and consistency](images/benchmark.png)
 

@@ -41,7 +41,7 @@ PACKAGES_OF_EVERY_NODE = ('rcl_interfaces/', 'type_description_interfaces/')
 
 INPUTS = {
     'twist': 'the velocity of the robot in its own frame',
-    'imu': 'the angular velocity, if `use_imu` is set; `twist` then gives only the linear velocity',
+    'imu': 'the angular velocity, if `use_imu` is set; `twist` then gives only the linear one',
     'landmarks': "the landmarks seen at one instant in the sensor's frame, with ids or without",
     '/tf': 'sensor poses; `odom_frame` → `base_frame`; fiducials, if asked for',
     '/tf_static': 'sensor poses',
