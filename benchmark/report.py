@@ -93,43 +93,43 @@ INTRODUCTION = """\
 # Accuracy, consistency and cost, compared
 
 Written by `python benchmark/accuracy.py --write-docs`; `make benchmark-accuracy` only prints. One
-run, the same events and the same noise figures for all: those of
-`config/wheeled_bearing_range.yaml` and `config/stereo_inertial.yaml`, which come from descriptions
-of the sensors and not from these recordings. The simulated worlds are made with the noise that
-these files state, but with errors that are new in each observation. Where errors last
-(`observation_error_time`, for wheeled robots) all are given the same larger covariances.
+run, with the same events and noise figures for all: those of `config/wheeled_bearing_range.yaml`
+and `config/stereo_inertial.yaml`, which come from descriptions of the sensors and not from these
+recordings. The simulated worlds have the noise that these files state, but with errors independent
+from one observation to the next. Where errors last (`observation_error_time`, for wheeled robots)
+all estimators are given the same larger covariances.
 
-- **constant, scheduled, riccati**: this project's gain designs. The wheeled configuration also
-  lets `scheduled` and `riccati` estimate scale, bias and delay of the odometry, which GTSAM and
+- **constant, scheduled, riccati**: this project's gain designs. In the wheeled configuration
+  `scheduled` and `riccati` also estimate scale, bias and delay of the odometry, which GTSAM and
   the EKF don't do here; `riccati, no calibration` has that switched off, for a comparison on equal
   terms.
 - **textbook EKF**: world-frame errors and absolute landmarks (`benchmark/ekf_slam.py`), with the
   observer's gate and Huber weights.
 - **iSAM2**: GTSAM, updated and read out in full after each observation; relinearizeSkip 1,
-  threshold 0.01 (the more accurate setting), and beside it GTSAM's default parameters. One
-  odometry factor from one observation to the next, bearing-range factors with Huber's loss,
+  threshold 0.01 (the more accurate setting), and also with GTSAM's default parameters. One
+  odometry factor between consecutive observations, bearing-range factors with Huber's loss,
   Pose2/Point2 for planar data.
-- **smoothed** and **GTSAM batch** know the future: `riccati` and then Gauss–Newton over
-  everything; Levenberg–Marquardt from iSAM2's last estimate.
+- **smoothed** and **GTSAM batch** use all data, including later observations: `riccati` followed
+  by Gauss–Newton over everything; Levenberg–Marquardt from iSAM2's last estimate.
 
-Configuration error: after each observation, the RMS over all landmarks seen three times or more
-so far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. A landmark without
-id is compared with the true one that it was nearest to most of the time so far. ATE and heading
+Configuration error: after each observation, the RMS over all landmarks seen three times or more so
+far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. A landmark without id
+is compared with the true one that it was nearest to for most of the time so far. ATE and heading
 are those of the poses right after the observations, after one rigid alignment of their positions.
 CPU time is that of the estimator's own calls, the least of three runs (of one, where ids are left
-out), in which the estimators take turns, so that all meet the machine busy and idle alike;
+out), in which the estimators take turns, so that the load of the machine affects all alike;
 integrating the velocities, which all but the observer do by the same code, costs what dead
 reckoning costs. `failed`: GTSAM gave up with a singular system, or nothing was mapped. Outliers
-cost something even if each is recognised, since fewer points are left; a column with these very
-points left out shows how much. How much depends on which points they are, so outliers are drawn
-four times; all figures of them are means, and a column has the worst of the four.
+cost something even if each is recognised, since fewer points are left; a column with just these
+points left out shows how much. The cost depends on which points are hit, so outliers are drawn
+four times; all their figures are means, and one column has the worst of the four.
 
 The aims of the first table are for Starry Night and the mean of MRCLAM 6, in bold where they are
-missed; the other columns are of single worlds.
+missed; the other columns are single worlds.
 
-ANEES: every 5 s, the mean over the Monte Carlo runs of the pose's (the landmarks') squared error
-divided by what its covariance says, and by its degrees of freedom; then the mean and the range
-over the run. In each table's band are 95 % of an honest estimator's.
+ANEES: every 5 s, the mean over the Monte Carlo runs of the squared error of the pose (or the
+landmarks) normalised by its covariance and its degrees of freedom; then the mean and the range
+over the run. The band in each table contains 95 % of a consistent estimator's values.
 
 ![Configuration error and consistency](images/benchmark.png)
 
@@ -391,7 +391,7 @@ def _draw_consistency(axes: Axes, loop: str, columns: dict[str, Consistency]) ->
     for name, consistency in columns.items():
         axes.plot(consistency.times_s, consistency.pose, markersize=4, label=name, **DRAWN[name])
     band = next(iter(columns.values())).band  # that of the number of runs
-    axes.axhspan(*band, color='#DDDDDD', zorder=0, label='95 % of honest estimators')
+    axes.axhspan(*band, color='#DDDDDD', zorder=0, label='95 % of consistent estimators')
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel('time [s]')
     axes.set_title(f'ANEES of the pose, {loop}')

@@ -41,10 +41,10 @@ PACKAGES_OF_EVERY_NODE = ('rcl_interfaces/', 'type_description_interfaces/')
 
 INPUTS = {
     'twist': 'the velocity of the robot in its own frame',
-    'imu': 'the angular velocity, if `use_imu` is set; the linear one then comes from `twist`',
+    'imu': 'the angular velocity, if `use_imu` is set; `twist` then gives only the linear one',
     'landmarks': "the landmarks seen at one instant in the sensor's frame, with ids or without",
-    '/tf': 'where sensors are; `odom_frame` → `base_frame`; fiducials, if asked for',
-    '/tf_static': 'where sensors are',
+    '/tf': 'sensor poses; `odom_frame` → `base_frame`; fiducials, if asked for',
+    '/tf_static': 'sensor poses',
     'initialpose': "where the robot is in the map, as RViz's *2D Pose Estimate* gives it",
     '~/set_pose': 'the same, for programs',
     '~/forget_landmark': 'the id of a landmark to forget',
@@ -59,15 +59,15 @@ OUTPUTS = {
     'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
     'map': 'landmarks seen `confirmations` times or more, with ids; with covariances where the '
     'gains know them',
-    'landmark_estimates': 'the same landmarks for tools that read PointCloud; none if one of them '
-    'has an id from 2²⁴ on, which it has no room for',
-    'markers': 'landmarks, residuals, and of the first 200 landmarks ids and ellipsoids of 3σ, '
+    'landmark_estimates': 'the same landmarks for tools that read PointCloud; not published if '
+    'an id is 2²⁴ or more, which its float32 channel cannot hold',
+    'markers': 'landmarks and residuals; for the first 200 landmarks also ids and 3σ ellipsoids, '
     'for RViz and Foxglove',
     'lyapunov': 'the Lyapunov value L (34) of the last observation',
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
-    'else `map_frame` → `base_frame`',
+    'otherwise `map_frame` → `base_frame`',
     '/diagnostics': 'rates, ages, what was used, what was dropped and why, '
-    'and how the velocity is calibrated',
+    'and the calibration of the velocity',
 }
 
 SERVICES = {
@@ -213,7 +213,7 @@ def input_table(subscribed: dict[str, Topic]) -> str:
     for name, parameter in TYPE_PARAMETERS.items():
         types[name] = ', '.join(t for t in choices[parameter] if t not in (AUTO, 'tf'))
     return markdown(
-        ('topic', 'type', 'what it tells'),
+        ('topic', 'type', 'what it gives'),
         [(f'`{name}`', types[name], text) for name, text in INPUTS.items()],
     )
 

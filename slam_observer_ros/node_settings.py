@@ -19,12 +19,12 @@ class ObserverNodeSettings(InputSettings):
     )
     twist_qos: str = parameter(
         'best_effort',
-        'Reliability asked of twist and imu; best_effort hears any publisher',
+        'Reliability requested of twist and imu; best_effort fits any publisher',
         choices=('best_effort', 'reliable'),
     )
     landmarks_qos: str = parameter(
         'best_effort',
-        'Reliability asked of landmarks; best_effort hears any publisher',
+        'Reliability requested of landmarks; best_effort fits any publisher',
         choices=('best_effort', 'reliable'),
     )
     queue_depth: int = parameter(
@@ -108,6 +108,6 @@ class SimulatorNodeSettings:
     )
     truth_frame: str = parameter('world', 'Frame of the true pose and landmarks')
     map_frame: str = parameter(
-        'map', "Frame of the observer's estimate; /tf_static tells where in truth_frame it starts"
+        'map', "Frame of the observer's estimate; /tf_static has its pose in truth_frame"
     )
     base_frame: str = parameter('base_link', 'Frame of the velocity and the observations')

@@ -44,8 +44,8 @@ class Settings(Immutable):
     )
     max_innovation_time: float = parameter(
         0.2,
-        'Constant gains: longest time for which one observation acts; else that is the time since '
-        'the landmark was last seen',
+        'Constant gains: an observation acts for the time since its landmark was last seen, at '
+        'most this long',
         unit='s',
         minimum=1e-3,
         read_only=False,
@@ -154,9 +154,9 @@ class Settings(Immutable):
     )
     observation_error_time: float = parameter(
         0.0,
-        'Scheduled and Riccati gains: how long the error of an observed landmark lasts, as its '
-        'correlation time, where it is not new in each observation: that of a calibration, or of '
-        'a tag seen from one side',
+        'Scheduled and Riccati gains: correlation time of the error of an observed landmark, such '
+        'as that of a calibration, or of a tag seen from one side; 0 for errors that are '
+        'independent in each observation',
         unit='s',
         minimum=0.0,
         maximum=60.0,
@@ -189,7 +189,7 @@ class Settings(Immutable):
     )
     velocity_delay_error: float = parameter(
         0.0,
-        'Scheduled and Riccati gains: how much later than its stamp a velocity shows in '
+        'Scheduled and Riccati gains: delay from the stamp of a velocity to its effect in '
         'observations, to be estimated: its standard deviation',
         unit='s',
         minimum=0.0,
@@ -199,7 +199,7 @@ class Settings(Immutable):
         0.0,
         'Scheduled and Riccati gains: how fast scale, bias and delay of the velocity drift, as a '
         'share of the standard deviation of each; above 0, where any of them is estimated, '
-        'Riccati gains do not look back',
+        'Riccati gains do not relinearise',
         unit='1/√s',
         minimum=0.0,
     )
@@ -246,32 +246,32 @@ class Settings(Immutable):
     min_support: int = parameter(
         5,
         'Riccati gains, points without id: how often a landmark must be seen to be in the map; it '
-        'is forgotten if it has been in view four times as long as others take for that',
+        'is deleted if still not after four times as long in view as a typical one needs',
         minimum=1,
     )
     max_hypotheses: int = parameter(
         8,
         'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
-        'have slipped: most states that are followed until it is clear which one is right',
+        'have slipped: most hypotheses that are followed until it is clear which one is right',
         minimum=1,
     )
     hindsight_interval: int = parameter(
         20,
-        'Riccati gains: fewest new observations before looking back; a tenth of all so far if '
+        'Riccati gains: fewest new observations before relinearising; a tenth of all so far if '
         'that is more, but at most 300; 0 for never',
         minimum=0,
     )
     hindsight_turn: float = parameter(
         0.2,
-        'Riccati gains: look back once attitude corrections have come to this as a root sum '
-        'square; after a single one of this size a tenth of the interval will do',
+        'Riccati gains: relinearise once attitude corrections have reached this as a root sum '
+        'square; after a single one of this size a tenth of the interval is enough',
         unit='rad',
         minimum=0.0,
     )
     hindsight_window: int = parameter(
         3000,
-        'Riccati gains: observations after which smoothing starts anew from what is known then; '
-        '0 to smooth all of them, as replay --smooth does unless told otherwise',
+        'Riccati gains: observations after which smoothing restarts from the current estimate; '
+        '0 to smooth all of them, the default of replay --smooth',
         minimum=0,
     )
     localization_mode: str = parameter(
@@ -284,7 +284,7 @@ class Settings(Immutable):
     set_initial_pose: bool = parameter(
         False,
         'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded '
-        'map within 0.5 m and 0.26 rad, instead of looking for its place there',
+        'map within 0.5 m and 0.26 rad, instead of localising there by landmarks',
     )
     initial_position: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -302,7 +302,7 @@ class Settings(Immutable):
     )
     map_noise: float = parameter(
         0.05,
-        'Standard deviation of each coordinate of loaded landmarks whose file tells none',
+        'Standard deviation of each coordinate of loaded landmarks whose file gives none',
         unit='m',
         minimum=0.0,
     )

@@ -27,8 +27,8 @@ ACCURACY_ROWS = {
     'heading_rmse_rad': ('heading error, RMS', 'rad after alignment'),
     'landmark_rmse_m': ('landmark error, RMS', 'm after alignment'),
     'configuration_rmse_m': ('configuration error, RMS', 'm, not aligned'),
-    'anees': ('ANEES of the pose', '(1 is honest)'),
-    'configuration_anees': ('ANEES of the configuration', '(1 is honest)'),
+    'anees': ('ANEES of the pose', '(1 is consistent)'),
+    'configuration_anees': ('ANEES of the configuration', '(1 is consistent)'),
     'smoothed_ate_rmse_m': ('smoothed: position error, RMS', 'm after alignment'),
     'smoothed_landmark_rmse_m': ('smoothed: landmark error, RMS', 'm after alignment'),
 }
