@@ -22,7 +22,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_frame import MapFrame
 from slam_observer_ros.observer import lyapunov
-from slam_observer_ros.parameters import checked, table
+from slam_observer_ros.parameters import changed_names, checked, table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
 from slam_observer_ros.slam.sighting import Outcome
@@ -95,8 +95,8 @@ class Estimator:
         self._on_motion, self._on_jump = on_motion, on_jump
         self._frame = MapFrame(settings)
         self.reset(initial_pose)
-        unused = [name for name in self._slam.gains.ignores if np.any(getattr(settings, name))]
-        if unused:
+        changed = set(changed_names(settings))
+        if unused := [name for name in self._slam.gains.ignores if name in changed]:
             logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
 
     def reset(self, pose: FloatArray | None = None) -> None:

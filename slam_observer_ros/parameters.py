@@ -189,6 +189,13 @@ def checked(settings: SettingsT) -> SettingsT:
     return from_parameters(type(settings), dataclasses.asdict(settings))
 
 
+def changed_names(settings: Dataclass) -> list[str]:
+    """Return the names of the settings that differ from their defaults."""
+    return [
+        row.name for row in table(type(settings)) if getattr(settings, row.name) != row.default
+    ]
+
+
 def suggestion(name: str, names: Collection[str]) -> str:
     """Return the end of a message that asks for the nearest of ``names``; empty if none is near.
 

@@ -272,7 +272,7 @@ class TestPoints:
             events.append(VelocityEvent(step * 10**8, np.zeros(6)))
             events.append(ObservationEvent(step * 10**8, ids, square + shift))
         path = write_events(tmp_path / 'carried.mcap', events)
-        options = ('--landmarks-topic', '/landmarks', '--set', 'two_d_mode=true')
+        options = ('--landmarks-topic', '/landmarks', '--set', 'two_d_mode=True')
         output = slam_observer('replay', path, *options).output
         row = r'slips +│ \d+ × the robot was not where odometry had it'
         if not has_ids:

@@ -631,9 +631,13 @@ def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
         'landmark_velocity_error': 0.1,
         'linear_bias_error': (0.2, 0.0, 0.0),
         'calibration_drift': 0.1,
+        'gain_k': 2.0,
     }
     Estimator(Settings(gains='riccati', **asked))
     assert not caplog.records
+    Estimator(Settings(gains='riccati', gain_l=2.0, step_mode='paper'))
+    assert caplog.messages == ['No effect on riccati gains: gain_l, step_mode.']
+    caplog.clear()
     Estimator(Settings(gains='scheduled', **asked)).reset()
     Estimator(Settings(gains='constant', **asked))
     assert caplog.messages == [

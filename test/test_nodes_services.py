@@ -30,6 +30,7 @@ from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.conversions import header_message
 from slam_observer_ros.nodes.diagnostics import Diagnostics as NodeDiagnostics
+from slam_observer_ros.nodes.diagnostics import MANY_UNUSED
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.transform_publisher import TFMessage
 from slam_observer_ros.simulation import Scenario
@@ -381,7 +382,7 @@ def test_an_input_is_told_by_what_came_since_the_last_time(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr(node_diagnostics.time, 'monotonic', lambda: now_s[0])
     source = SimpleNamespace(
-        topic='/twist', received=0, age_s=None, malformed=0, trouble='',
+        name='twist', topic='/twist', received=0, age_s=None, malformed=0, trouble='',
         backlog=SimpleNamespace(wait_s=0.0),
     )  # fmt: skip
     told, messages, rates = Told(source), [], []
@@ -389,6 +390,7 @@ def test_an_input_is_told_by_what_came_since_the_last_time(monkeypatch):
         source.received, source.malformed, source.age_s = received, malformed, age_s
         now_s[0] += 2.0
         status = told.publish(velocity=1)
+        assert status.level != DiagnosticStatus.ERROR
         messages.append(status.message)
         rates.append(values_of(status)['/twist rate [Hz]'])
     dropped = '2 messages dropped (malformed)'
@@ -397,6 +399,23 @@ def test_an_input_is_told_by_what_came_since_the_last_time(monkeypatch):
     now_s[0] += 2.0
     source.trouble = 'another type'
     assert told.publish(velocity=1).message == 'another type'
+
+
+def test_an_input_of_which_nothing_was_ever_used_is_an_error():
+    """As landmarks in a frame that /tf does not have, beside good odometry."""
+    source = SimpleNamespace(
+        name='landmarks', topic='/tags', received=MANY_UNUSED, age_s=0.1, malformed=0, trouble='',
+        backlog=SimpleNamespace(wait_s=0.0),
+    )  # fmt: skip
+    told = Told(source)
+    told.dropped['no_transform'] += 1
+    status = told.publish(velocity=5)
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.message == (
+        f"none of {MANY_UNUSED} messages on '/tags' was used; 1 message dropped (no_transform)"
+    )
+    status = told.publish(velocity=5, observation=1)
+    assert (status.level, status.message) == (DiagnosticStatus.OK, 'running')
 
 
 def test_messages_that_are_all_dropped_are_an_error_and_some_a_warning():
@@ -408,7 +427,7 @@ def test_messages_that_are_all_dropped_are_an_error_and_some_a_warning():
     status = told.publish(velocity=5)
     assert (status.level, status.message) == (
         DiagnosticStatus.WARN,
-        '1 messages dropped (not_finite)',
+        '1 message dropped (not_finite)',
     )
     told.dropped.update({'not_finite': 2, 'too_late': 1})
     assert told.publish(velocity=5).message == '3 messages dropped (mostly not_finite)'
@@ -494,7 +513,7 @@ def test_diagnostics_tell_why_messages_were_dropped(ros, tmp_path):
         diagnostics.wait(
             lambda d: (
                 robot.send_zeros()
-                or re.search(r'[0-9]+ messages dropped \(no_clock\)', d.status.message)
+                or re.search(r'[0-9]+ messages? dropped \(no_clock\)', d.status.message)
             ),
             'the reason',
         )

@@ -40,3 +40,9 @@ def test_signals_stop_a_node_cleanly(processes, case):
 
     assert code == 0, node.output
     assert 'Traceback' not in node.output
+
+
+def test_a_node_says_how_it_is_used(tmp_path):
+    node = NodeProcess('observer_node', tmp_path / 'log', '--', '--help')
+    assert node.process.wait(timeout=20.0) == 0
+    assert node.output.startswith('usage: ros2 run slam_observer_ros')

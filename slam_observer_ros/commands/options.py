@@ -173,6 +173,8 @@ def _parse_assignment(text: str) -> tuple[str, object]:
 
 def _parse_value(text: str) -> object:
     """Read a number, true, false or a [list]; anything else is a string."""
+    if text in ('True', 'False'):  # as YAML has it, too
+        return text == 'True'
     with suppress(ValueError, RecursionError):  # of what is no JSON, has too many digits or levels
         return json.loads(text)
     with suppress(ValueError):

@@ -15,6 +15,9 @@ from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
+OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
+"""Settings without effect on other designs; ``gain_k`` is in the Lyapunov value of all."""
+
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
@@ -128,7 +131,7 @@ class GainDesign:
     calibration : Calibration
         Scale, bias and delay of the velocity, as far as they are known.
     ignores : tuple of str
-        Settings without effect on the design; a warning names those that are not zero.
+        Settings without effect on the design; a warning names those that were changed.
 
     """
 

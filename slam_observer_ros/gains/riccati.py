@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.base import GainDesign, Residuals
+from slam_observer_ros.gains.base import GainDesign, OF_CONSTANT_GAINS, Residuals
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.robust import observation_weights
@@ -49,6 +49,8 @@ class RiccatiGains(GainDesign):
         What is known of the velocity's calibration, and the covariance P of everything.
 
     """
+
+    ignores = OF_CONSTANT_GAINS
 
     def __init__(
         self, settings: Settings, calibration: Calibration, joint: JointCovariance

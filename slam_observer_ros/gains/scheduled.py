@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.gains.base import GainDesign, Residuals
+from slam_observer_ros.gains.base import GainDesign, OF_CONSTANT_GAINS, Residuals
 from slam_observer_ros.gains.core import Core, regression
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.robust import huber_weights, REWEIGHTINGS
@@ -63,7 +63,7 @@ class ScheduledGains(GainDesign):
 
     """
 
-    ignores = ('landmark_velocity_error',)
+    ignores = (*OF_CONSTANT_GAINS, 'landmark_velocity_error')
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings

@@ -26,6 +26,12 @@ RECENT = 30
 MIN_POINTS = 50
 """Points that it takes to tell how large a share of them is rejected."""
 
+MANY_UNUSED = 20
+"""Messages of an input none of which was used: it is no transient of the start."""
+
+USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
+"""Inputs, and what their messages are counted as when they are used."""
+
 LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id', 'reserved_id')
 """Points not used for something that is wrong; those that a known map lacks may well be there."""
 
@@ -74,7 +80,8 @@ class Diagnostics:
         warnings = self._warnings(dropped, new)
         used = new['velocity'] + new['observation']
         level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
-        if dropped and not used and not self._intake.is_paused:
+        none_is_used = bool(dropped) and not used and not self._intake.is_paused
+        if none_is_used or any(map(self._unused_warning, self._inputs)):
             level = DiagnosticStatus.ERROR
         values = self._input_values() | self._estimator_values()
         status = DiagnosticStatus(
@@ -127,13 +134,15 @@ class Diagnostics:
 
     def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
+        warnings += [self._unused_warning(source) for source in self._inputs]
         warnings += self._intake.clock_troubles()
         if self._intake.is_paused:
             warnings.append('paused')
         elif dropped:
             (reason, _), *others = dropped.most_common()
             reasons = f'mostly {reason}' if others else reason
-            warnings.append(f'{dropped.total()} messages dropped ({reasons})')
+            plural = 's' * (dropped.total() != 1)
+            warnings.append(f'{dropped.total()} message{plural} dropped ({reasons})')
         warnings.append(self._points_warning(new))
         warnings.append(self._rejections_warning(new))
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
@@ -144,6 +153,15 @@ class Diagnostics:
             warnings.append('the place in the loaded map is not known yet: no pose is published')
             warnings.append(self._ids_warning())
         return [warning for warning in warnings if warning]
+
+    def _unused_warning(self, source: Input[Any]) -> str:
+        """Tell that an input's messages come, and that not one of them was used so far."""
+        kind = USED_AS.get(source.name)
+        if kind is None or source.received < MANY_UNUSED or self._intake.is_paused:
+            return ''
+        if self._estimator.counts[kind]:
+            return ''
+        return f"none of {source.received} messages on '{source.topic}' was used"
 
     def _ids_warning(self) -> str:
         """Tell that the place in a map is not found by what is seen: nothing of it has an id."""

@@ -26,6 +26,7 @@ from slam_observer_ros.nodes.maps import Maps
 from slam_observer_ros.nodes.outputs import Outputs, TOPICS
 from slam_observer_ros.nodes.parameters import read_settings
 from slam_observer_ros.nodes.transform_listener import open_transforms
+from slam_observer_ros.parameters import changed_names
 from slam_observer_ros.settings import Settings
 
 OVERVIEW_PERIOD_S = 0.5
@@ -83,9 +84,12 @@ class ObserverCore:
             ),
             post_callback=self._restart_time,
         )
+        changed = len(changed_names(estimator_settings)) + len(changed_names(settings))
         node.get_logger().info(
             f"estimating '{settings.base_frame}' in '{settings.map_frame}' with "
-            f'{estimator_settings.gains} gains'
+            f'{estimator_settings.gains} gains, '
+            f'{"in the plane" if estimator_settings.two_d_mode else "in 3D"}; '
+            f'{changed or "no"} parameters differ from their defaults'
         )
 
     def start(self) -> None:

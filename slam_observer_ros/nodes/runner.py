@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import signal
+import sys
 from types import FrameType
 
 import rclpy
@@ -19,6 +20,14 @@ from slam_observer_ros.threads import use_one_thread
 
 REFUSALS = (SlamObserverError, InvalidParameterValueException, InvalidParameterTypeException)
 """What a node may raise at its start; the last one of what rclpy declares, as use_sim_time."""
+
+USAGE = """\
+usage: ros2 run slam_observer_ros NODE [--ros-args [-p NAME:=VALUE] [--params-file FILE]
+                                                   [-r TOPIC:=/OTHER_TOPIC] ...]
+
+README.md lists the topics and services of observer_node and its main parameters,
+docs/parameters.md all parameters; of a running node `ros2 param list` does.
+"""
 
 STOP_LATENCY_S = 0.1
 """Longest time that an idle node takes to notice a signal."""
@@ -69,7 +78,11 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int
         get_logger('slam_observer_ros').fatal(f'{type(error).__name__}: {reason}')
         return 2
     try:
-        if unknown := [arg for arg in remove_ros_args(args)[1:] if arg not in ('', '--')]:
+        unknown = [arg for arg in remove_ros_args(args)[1:] if arg not in ('', '--')]
+        if {'-h', '--help'} & set(unknown):
+            sys.stdout.write(USAGE)
+            return 0
+        if unknown:
             get_logger('slam_observer_ros').fatal(
                 f'unknown arguments {" ".join(unknown)}: parameters, files of them and remappings '
                 'come after --ros-args'
