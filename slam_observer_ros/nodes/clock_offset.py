@@ -47,7 +47,7 @@ class ClockOffset:
         return f"{to_s(abs(offset_ns)):.3f} s {side} this machine's clock"
 
     def trouble(self, source: str, is_simulated: bool) -> str:
-        """Say how far off the stamps of ``source`` are; empty if they are right.
+        """Say how far off the stamps on the topic ``source`` are; empty if they are right.
 
         ``is_simulated`` says that this machine's clock is /clock.
         """
@@ -56,7 +56,7 @@ class ClockOffset:
         advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
         if is_simulated:
             advice = 'does what publishes it use /clock, and does this machine keep up with it'
-        return f'stamps of {source} are {self}: {advice}, or set correct_clock_offset'
+        return f'stamps on {source} are {self}: {advice}, or set correct_clock_offset'
 
     def add(self, stamp_ns: int, receive_ns: int) -> None:
         """Take the stamp and the time of reception of a message."""

@@ -103,7 +103,8 @@ class Intake:
         if not self._is_usable(source, timed.stamp_ns, receive_ns):
             return
         if timed is not measured:
-            text = f'stamps are zero on {source}: the time of reception is taken instead'
+            topic = self._topic(source)
+            text = f'stamps are zero on {topic}: the time of reception is taken instead'
             self._warn(f'stamps of {source}', text)
         self._use(self._builder.add(timed, time.monotonic_ns()))
 
@@ -137,10 +138,14 @@ class Intake:
         if self._settings.correct_clock_offset:
             return []
         return [
-            clock.trouble(name, self._is_simulated)
+            clock.trouble(self._topic(name), self._is_simulated)
             for name, clock in self.clocks.items()
             if clock.is_off
         ]
+
+    def _topic(self, source: str) -> str:
+        """Return the topic of an input as it is after remapping, in quotes."""
+        return f"'{self._node.resolve_topic_name(source)}'"
 
     @property
     def _is_simulated(self) -> bool:
@@ -183,7 +188,7 @@ class Intake:
             return False
         self._look_at_clock(source, stamp_ns, receive_ns)
         if self._settings.correct_clock_offset and self.clocks[source].offset_ns is None:
-            self._drop('clock_unknown', f'the clock of {source} is not known yet')
+            self._drop('clock_unknown', f'the clock of {self._topic(source)} is not known yet')
             return False
         return True
 
@@ -194,10 +199,11 @@ class Intake:
         clock.add(stamp_ns, receive_ns)
         if not self._settings.correct_clock_offset:
             if clock.is_off:
-                self._warn(source, clock.trouble(source, self._is_simulated))
+                self._warn(source, clock.trouble(self._topic(source), self._is_simulated))
         elif clock.correction_ns != before_ns:
             fate = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
-            self._node.get_logger().info(f'stamps of {source} are {clock}, and {fate}')
+            topic = self._topic(source)
+            self._node.get_logger().info(f'stamps on {topic} are {clock}, and {fate}')
 
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
