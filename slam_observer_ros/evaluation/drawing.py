@@ -22,7 +22,8 @@ PALE_BLUE = '#7FB8DA'
 # The dictionaries are Any: matplotlib's types list the settings of its own version only.
 STYLE: Any = {
     'figure.constrained_layout.use': True,
-    'savefig.dpi': 150,
+    'figure.dpi': 150,  # also before it is saved: where there is room is measured then
+    'savefig.dpi': 'figure',
     'font.size': 10,
     'axes.titlesize': 11,
     'axes.titleweight': 'bold',
@@ -46,6 +47,10 @@ TRUE_PATH: Any = {'color': PALE_BLUE, 'linestyle': '-', 'linewidth': 3.0, 'label
 PATH: Any = {'color': RED, 'linestyle': '-.', 'label': 'estimated path'}
 TRUE_END: Any = {'color': PALE_BLUE, 'marker': 's', 'linestyle': 'none', 'zorder': 4}
 END: Any = {**TRUE_END, 'color': RED, 'markerfacecolor': 'none', 'zorder': 5, 'label': 'end'}
+START: Any = {
+    'color': RED, 'marker': 'D', 'markersize': 3.5, 'linestyle': 'none', 'zorder': 4,
+    'label': 'start',
+}  # fmt: skip
 TRUE_LANDMARKS: Any = {
     'color': BLUE, 'marker': '*', 'markersize': 10, 'linestyle': 'none', 'zorder': 4,
     'label': 'true landmarks',
@@ -55,6 +60,7 @@ LANDMARKS: Any = {
     'color': GREEN, 'marker': 'o', 'markersize': 9, 'markerfacecolor': 'none',
     'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5, 'label': 'estimated landmarks',
 }  # fmt: skip
+LINKS: Any = {'color': '#333333', 'linestyle': '-', 'linewidth': 0.9, 'zorder': 4.5}
 LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
 
 _PLANAR_RATIO = 0.01
