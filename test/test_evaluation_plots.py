@@ -212,7 +212,8 @@ def test_a_title_tells_what_is_in_hindsight(
     plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, in_hindsight=in_hindsight)
     plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, truth, in_hindsight=in_hindsight)
     replay_plots.plot_errors(tmp_path / 'a.png', errors, in_hindsight=in_hindsight)
-    titles = [saved[0].get_suptitle(), saved[1].get_suptitle(), saved[2].axes[0].get_title('left')]
+    titles = [figure.texts[0].get_text() for figure in saved[:2]]
+    titles.append(saved[2].axes[0].get_title('left'))
     assert [('in hindsight' in title) for title in titles] == [in_hindsight] * 3
     assert [('after rigid alignment' in title) for title in titles] == [False, True, True]
 

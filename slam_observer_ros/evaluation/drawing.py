@@ -10,6 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
@@ -73,6 +74,19 @@ def is_flat(points: FloatArray) -> bool:
         return True
     width, depth, height = np.ptp(points, axis=0)
     return bool(height <= _PLANAR_RATIO * max(width, depth))
+
+
+def legend_below(figure: Figure, named: Axes, columns: int) -> None:
+    """Write what is drawn in axes below all axes of a figure, which make room for it.
+
+    Not ``loc='outside lower center'``: matplotlib 3.6, that of Ubuntu 24.04, doesn't know it.
+    """
+    legend = figure.legend(
+        *named.get_legend_handles_labels(), loc='lower center', ncols=columns, borderaxespad=0.0
+    )
+    height = legend.get_window_extent().height / figure.bbox.height
+    layout: Any = figure.get_layout_engine()
+    layout.set(rect=(0.0, height, 1.0, 1.0 - height))
 
 
 def save(figure: Figure, path: Path) -> Path:

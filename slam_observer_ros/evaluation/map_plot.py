@@ -14,6 +14,7 @@ from slam_observer_ros.evaluation.drawing import (
     END,
     is_flat,
     LANDMARKS,
+    legend_below,
     LINKS,
     PATH,
     save,
@@ -124,7 +125,7 @@ def _draw(layers: list[_Layer], flat: bool) -> tuple[Figure, list[Axes]]:
         axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]), aspect='equal')
         axes.set(xlabel=f'{"xyz"[across]} [m]', ylabel=f'{"xyz"[up]} [m]')
     figure.align_ylabels(panels)
-    figure.legend(*panels[-1].get_legend_handles_labels(), loc='outside lower center', ncols=3)
+    legend_below(figure, panels[-1], columns=3)
     return figure, panels
 
 
