@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations, pairwise
 from pathlib import Path
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.truth import LandmarkTruth
+from slam_observer_ros.types import FloatArray
 
 LANDMARKS = np.array([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, -4.0, 0.0]])
 IDS = np.arange(4)
@@ -111,6 +113,111 @@ def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -
     assert np.any(pixels_of(labelled) != pixels_of(bare))
 
 
+@pytest.fixture
+def saved(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Figures of a replay, which are kept here and not written."""
+    figures: list[Figure] = []
+    for module in (map_plot, replay_plots):
+        monkeypatch.setattr(module, 'save', lambda figure, _path: figures.append(figure))
+    return figures
+
+
+def corridor() -> tuple[Trajectory, FloatArray]:
+    """A path along 100 m, and 60 landmarks no more than 2 m beside it."""
+    generator = np.random.default_rng(1)
+    spread = generator.uniform([0.0, -2.0, 0.0], [100.0, 2.0, 0.0], (60, 3))
+    along = SECONDS[:, None] * np.array([0.0, 0.0, 0.0, 100.0 / 30.0, 0.0, 0.0])
+    return Trajectory((SECONDS * 1e9).astype(np.int64), se3.exp(along)), spread
+
+
+@pytest.mark.parametrize('height_m', [0.0, 40.0], ids=['flat', 'space'])
+def test_labels_of_a_map_hit_nothing(tmp_path: Path, saved: list[Figure], height_m: float) -> None:
+    path, points = corridor()
+    poses = path.poses.copy()
+    poses[:, 2, 3] = np.linspace(0.0, height_m, len(poses))
+    estimate = Trajectory(path.stamps_ns, poses)
+    known = LandmarkTruth(np.arange(60) + 100, points + [1.0, 0.3, 0.0])
+    map_plot.plot_map(tmp_path / 'a.png', estimate, known.ids, points, estimate, known)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    boxes = [label.get_window_extent() for label in axes.texts]
+    assert len(boxes) > 15
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    assert all(
+        axes.bbox.containsx(x) and axes.bbox.containsy(y) for a in boxes for x, y in a.corners()
+    )
+    markers = axes.transData.transform(np.concatenate([points, known.world_points])[:, :2])
+    radius = 4.5 * figure.dpi / 72.0
+    for box in boxes:
+        nearest = np.clip(markers, box.min, box.max)
+        assert np.linalg.norm(markers - nearest, axis=1).min() > radius
+
+
+def test_labels_of_a_map_stand_beside_their_landmarks(
+    tmp_path: Path, saved: list[Figure], estimate: Trajectory
+) -> None:
+    map_plot.plot_map(tmp_path / 'a.png', estimate, IDS, LANDMARKS)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    labels = {int(label.get_text()): label for label in figure.axes[0].texts}
+    assert sorted(labels) == IDS.tolist()
+    for number, point in zip(IDS.tolist(), LANDMARKS, strict=True):
+        box = labels[number].get_window_extent()
+        place = figure.axes[0].transData.transform(point[:2])
+        apart = np.linalg.norm(place - np.clip(place, box.min, box.max))
+        assert apart < 10.0 * figure.dpi / 72.0
+
+
+def test_a_line_leads_from_each_landmark_to_its_truth(
+    tmp_path: Path, saved: list[Figure], estimate: Trajectory
+) -> None:
+    ids, points = np.array([7, 3, 5]), LANDMARKS[:3] + 0.2
+    known = LandmarkTruth(np.array([5, 6, 7]), LANDMARKS[[2, 3, 0]])
+    map_plot.plot_map(tmp_path / 'a.png', estimate, ids, points, estimate, known)
+    for axes in saved[0].axes:
+        lines = np.concatenate([np.empty((0, 2)), *(line.get_xydata() for line in axes.lines)])
+        both = [np.r_[a, b] for a, b in pairwise(lines)]
+        columns = ['xyz'.index(label[0]) for label in (axes.get_xlabel(), axes.get_ylabel())]
+        for row, true_row, is_joined in [(0, 0, True), (2, 2, True), (1, 3, False)]:
+            wanted = np.r_[points[row, columns], LANDMARKS[true_row, columns]]
+            assert any(np.allclose(pair, wanted) for pair in both) is is_joined
+
+
+def legend_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_legend_of_a_map_names_what_there_is(
+    tmp_path: Path, saved: list[Figure], estimate: Trajectory, truth: Trajectory
+) -> None:
+    nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    map_plot.plot_map(tmp_path / 'a.png', estimate, *nothing, truth, LandmarkTruth(*nothing))
+    map_plot.plot_map(tmp_path / 'a.png', estimate, IDS, LANDMARKS)
+    path = ['estimated path', 'start', 'end']
+    assert legend_of(saved[0]) == ['true path', *path]
+    assert legend_of(saved[1]) == [*path, 'estimated landmarks']
+
+
+@pytest.mark.parametrize('in_hindsight', [False, True])
+def test_a_title_tells_what_is_in_hindsight(
+    tmp_path: Path,
+    saved: list[Figure],
+    estimate: Trajectory,
+    truth: Trajectory,
+    in_hindsight: bool,
+) -> None:
+    errors = trajectory_errors(estimate, truth)
+    plot: Any = map_plot.plot_map
+    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, in_hindsight=in_hindsight)
+    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, truth, in_hindsight=in_hindsight)
+    replay_plots.plot_errors(tmp_path / 'a.png', errors, in_hindsight=in_hindsight)
+    titles = [figure.texts[0].get_text() for figure in saved[:2]]
+    titles.append(saved[2].axes[0].get_title('left'))
+    assert [('in hindsight' in title) for title in titles] == [in_hindsight] * 3
+    assert [('after rigid alignment' in title) for title in titles] == [False, True, True]
+
+
 def test_map_with_truth(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
     known = LandmarkTruth(IDS, LANDMARKS)
     path = map_plot.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS + 0.2, truth, known)
@@ -147,6 +254,30 @@ def test_errors(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None
     assert {rgb(RED), rgb(GREEN)} <= colours(path)
 
 
+@pytest.mark.parametrize('in_known_map', [False, True])
+def test_a_wide_band_does_not_hide_the_errors(
+    tmp_path: Path,
+    saved: list[Figure],
+    estimate: Trajectory,
+    truth: Trajectory,
+    in_known_map: bool,
+) -> None:
+    errors = trajectory_errors(estimate, truth)
+    covariances = np.tile(100.0 * np.eye(6), (200, 1, 1))
+    name = tmp_path / 'a.png'
+    replay_plots.plot_errors(name, errors, covariances, in_known_map=in_known_map)
+    largest = np.abs(errors.errors).max(axis=0)
+    x, y, *_, heading = saved[0].axes
+    for axes, size in ((x, largest[3]), (y, largest[4]), (heading, np.degrees(largest[2]))):
+        low, high = axes.get_ylim()
+        assert low == -high
+        assert size < high < 3.0 * size
+    legend = x.get_legend()
+    assert legend is not None
+    frame = 'in the frame of the map' if in_known_map else 'relative to the first pose'
+    assert frame in legend.get_texts()[0].get_text()
+
+
 def test_errors_are_not_joined_across_a_time_without_any(
     tmp_path: Path, estimate: Trajectory, truth: Trajectory
 ) -> None:
@@ -176,6 +307,43 @@ def test_residuals(tmp_path: Path, dropped: dict[str, int]) -> None:
     rejected[::50] = True
     replay_plots.plot_residuals(drawn, stamps_ns, residuals, rejected, dropped, 1_000)
     assert rgb(RED) in colours(drawn)
+
+
+@pytest.mark.parametrize('are_there', [False, True])
+def test_bars_of_dropped_events_are_thin(
+    tmp_path: Path, saved: list[Figure], are_there: bool
+) -> None:
+    number = 500 if are_there else 0
+    stamps_ns, rejected = np.arange(number) * 10**8, np.zeros(number, dtype=bool)
+    reasons = {f'reason_{i}': 10 + i for i in range(9)}
+    for dropped in ({'no_transform': 31}, reasons):
+        name = tmp_path / 'a.png'
+        replay_plots.plot_residuals(name, stamps_ns, np.ones((number, 3)), rejected, dropped, 900)
+        figure = saved[-1]
+        figure.draw_without_rendering()
+        assert len(figure.axes) == 1 + are_there
+        bars = figure.axes[-1].patches
+        assert len(bars) == len(dropped)
+        heights_in = [bar.get_window_extent().height / figure.dpi for bar in bars]
+        assert heights_in == pytest.approx([0.15] * len(bars), abs=0.05)
+
+
+def test_legend_of_residuals_is_one_row_beside_the_title(
+    tmp_path: Path, saved: list[Figure]
+) -> None:
+    residuals, rejected = np.ones((500, 3)), np.arange(500) % 10 == 0
+    stamps_ns = np.arange(500) * 10**8
+    replay_plots.plot_residuals(tmp_path / 'a.png', stamps_ns, residuals, rejected, {}, 123_456)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    legend = axes.get_legend()
+    assert legend is not None
+    crosses, median = legend.get_texts()
+    assert crosses.get_text() == '50 rejected by the gate'
+    assert crosses.get_window_extent().y0 == pytest.approx(median.get_window_extent().y0, abs=3.0)
+    title = next(child for child in axes.get_children() if 'none of' in str(child))
+    assert not legend.get_window_extent().overlaps(title.get_window_extent())
 
 
 def test_residuals_of_a_run_without_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

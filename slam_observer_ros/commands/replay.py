@@ -233,9 +233,10 @@ def _draw_figures(outcome: ReplayOutcome, trajectory: Trajectory, directory: Pat
         estimator.world_points if smoothed is None else smoothed.world_points,
         Trajectory(truth.stamps_ns, truth.poses) if errors is not None else None,
         truth.landmarks,
+        in_hindsight=smoothed is not None,
     )
     if outcome.smoothed_errors is not None:
-        plot_errors(directory / 'errors.png', outcome.smoothed_errors)
+        plot_errors(directory / 'errors.png', outcome.smoothed_errors, in_hindsight=True)
     elif errors is not None:
         covariances = result.pose_covariances
         plot_errors(
@@ -243,6 +244,7 @@ def _draw_figures(outcome: ReplayOutcome, trajectory: Trajectory, directory: Pat
             errors,
             None if covariances is None else covariances[errors.covered],
             result.configuration if result.configuration.values_m else None,
+            in_known_map=result.in_known_map,
         )
     plot_residuals(
         directory / 'residuals.png',

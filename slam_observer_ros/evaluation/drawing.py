@@ -10,6 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
@@ -22,7 +23,8 @@ PALE_BLUE = '#7FB8DA'
 # The dictionaries are Any: matplotlib's types list the settings of its own version only.
 STYLE: Any = {
     'figure.constrained_layout.use': True,
-    'savefig.dpi': 150,
+    'figure.dpi': 150,  # also before it is saved: where there is room is measured then
+    'savefig.dpi': 'figure',
     'font.size': 10,
     'axes.titlesize': 11,
     'axes.titleweight': 'bold',
@@ -46,6 +48,10 @@ TRUE_PATH: Any = {'color': PALE_BLUE, 'linestyle': '-', 'linewidth': 3.0, 'label
 PATH: Any = {'color': RED, 'linestyle': '-.', 'label': 'estimated path'}
 TRUE_END: Any = {'color': PALE_BLUE, 'marker': 's', 'linestyle': 'none', 'zorder': 4}
 END: Any = {**TRUE_END, 'color': RED, 'markerfacecolor': 'none', 'zorder': 5, 'label': 'end'}
+START: Any = {
+    'color': RED, 'marker': 'D', 'markersize': 3.5, 'linestyle': 'none', 'zorder': 4,
+    'label': 'start',
+}  # fmt: skip
 TRUE_LANDMARKS: Any = {
     'color': BLUE, 'marker': '*', 'markersize': 10, 'linestyle': 'none', 'zorder': 4,
     'label': 'true landmarks',
@@ -55,6 +61,7 @@ LANDMARKS: Any = {
     'color': GREEN, 'marker': 'o', 'markersize': 9, 'markerfacecolor': 'none',
     'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5, 'label': 'estimated landmarks',
 }  # fmt: skip
+LINKS: Any = {'color': '#333333', 'linestyle': '-', 'linewidth': 0.9, 'zorder': 4.5}
 LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
 
 _PLANAR_RATIO = 0.01
@@ -67,6 +74,19 @@ def is_flat(points: FloatArray) -> bool:
         return True
     width, depth, height = np.ptp(points, axis=0)
     return bool(height <= _PLANAR_RATIO * max(width, depth))
+
+
+def legend_below(figure: Figure, named: Axes, columns: int) -> None:
+    """Write what is drawn in axes below all axes of a figure, which make room for it.
+
+    Not ``loc='outside lower center'``: matplotlib 3.6, that of Ubuntu 24.04, doesn't know it.
+    """
+    legend = figure.legend(
+        *named.get_legend_handles_labels(), loc='lower center', ncols=columns, borderaxespad=0.0
+    )
+    height = legend.get_window_extent().height / figure.bbox.height
+    layout: Any = figure.get_layout_engine()
+    layout.set(rect=(0.0, height, 1.0, 1.0 - height))
 
 
 def save(figure: Figure, path: Path) -> Path:

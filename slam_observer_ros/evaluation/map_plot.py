@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 import numpy as np
 
 from slam_observer_ros.evaluation.drawing import (
     END,
     is_flat,
     LANDMARKS,
+    legend_below,
+    LINKS,
     PATH,
     save,
+    START,
     STYLE,
     TRUE_END,
     TRUE_LANDMARKS,
     TRUE_PATH,
 )
+from slam_observer_ros.evaluation.labels import label_points
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import is_automatic
@@ -29,11 +32,8 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.truth import LandmarkTruth
 from slam_observer_ros.types import FloatArray, IntArray
 
-_MAX_LABELS = 80
-"""Maps with more landmarks than this are drawn without ids, which would cover each other."""
-
-_LABEL_RIGHT_PT, _LABEL_UP_PT = 8.0, 12.0
-"""From the middle of a marker to its label's side, however long that is, and to its middle."""
+_MAX_LABELS = 300
+"""Of more landmarks than this few ids would find room, and it would take long to look for it."""
 
 _PANELS_IN = 6.3
 """Largest width and height of what is drawn, inches."""
@@ -41,8 +41,8 @@ _PANELS_IN = 6.3
 _LABELS_IN, _LEGEND_IN = 0.7, 0.9
 """Room for the labels of an axis, and for the title and two lines of legend."""
 
-_NEAR = 0.03
-"""Markers nearer than this share of the map touch: of several it matters where their middle is."""
+_Layer: TypeAlias = tuple[FloatArray, dict[str, Any]]
+"""Points (k, 3) and how they are drawn."""
 
 
 @mpl.rc_context(STYLE)
@@ -53,10 +53,13 @@ def plot_map(
     world_points: FloatArray,
     truth: Trajectory | None = None,
     landmark_truth: LandmarkTruth | None = None,
+    *,
+    in_hindsight: bool = False,
 ) -> Path:
     """Draw a replay's path and map over the truth, from above and, unless flat, from the side.
 
-    With a true path the estimate is moved by the alignment of :func:`trajectory_errors`.
+    With a true path the estimate is moved by the alignment of :func:`trajectory_errors`. A line
+    leads from each landmark to the true one of the same id. Ids are written where there is room.
 
     Parameters
     ----------
@@ -72,6 +75,8 @@ def plot_map(
         True poses.
     landmark_truth : LandmarkTruth, optional
         True landmarks in the world of ``truth``; drawn only together with it.
+    in_hindsight : bool
+        Whether poses and map are smoothed, which the title says.
 
     Returns
     -------
@@ -91,28 +96,37 @@ def plot_map(
         truth = truth.during(estimate)
     else:
         landmark_truth = None
-    layers = _map_layers(estimate, world_points, truth, landmark_truth)
-    drawn = np.concatenate([points for points, _ in layers])
+    layers = _map_layers(estimate, ids, world_points, truth, landmark_truth)
+    figure, panels = _draw(layers, is_flat((estimate if truth is None else truth).positions))
+    title = 'Trajectory and map in hindsight' if in_hindsight else 'Trajectory and map'
+    if truth is not None:
+        title += ', after rigid alignment' if in_hindsight else ' after rigid alignment'
+    figure.suptitle(title, fontsize=11, fontweight='bold')
+    named = ~is_automatic(ids)
+    if 0 < np.sum(named) <= _MAX_LABELS:
+        figure.draw_without_rendering()  # only then it is known where there is room
+        _write_ids(panels[0], ids[named], world_points[named, :2], layers)
+    return save(figure, path)
+
+
+def _draw(layers: list[_Layer], flat: bool) -> tuple[Figure, list[Axes]]:
+    """Return a figure of layers, and its panels: from above and, unless flat, from the side."""
+    drawn = np.concatenate([np.zeros((0, 3)), *(points for points, _ in layers)])
     drawn = drawn if len(drawn) else np.zeros((1, 3))
-    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    low, high = np.nanmin(drawn, axis=0), np.nanmax(drawn, axis=0)
     margin = 0.06 * float(np.max(high - low)) or 1.0
     low, high = low - margin, high + margin
 
-    views = [(0, 1)] if is_flat(layers[0][0]) else [(0, 1), _side_view(high - low)]
+    views = [(0, 1)] if flat else [(0, 1), _side_view(high - low)]
     figure, panels = _panels(views, high - low)
     for axes, (across, up) in zip(panels, views, strict=True):
         for points, style in layers:
             axes.plot(points[:, across], points[:, up], **style)
         axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]), aspect='equal')
         axes.set(xlabel=f'{"xyz"[across]} [m]', ylabel=f'{"xyz"[up]} [m]')
-    named = ~is_automatic(ids)
-    if np.sum(named) <= _MAX_LABELS:
-        _label_landmarks(panels[0], ids[named], world_points[named], landmark_truth)
-    aligned = '' if truth is None else ' after rigid alignment'
-    figure.suptitle(f'Trajectory and map{aligned}', fontsize=11, fontweight='bold')
     figure.align_ylabels(panels)
-    figure.legend(*panels[-1].get_legend_handles_labels(), loc='outside lower center', ncols=3)
-    return save(figure, path)
+    legend_below(figure, panels[-1], columns=3)
+    return figure, panels
 
 
 def _side_view(spans_m: FloatArray) -> tuple[int, int]:
@@ -142,13 +156,15 @@ def _panels(views: list[tuple[int, int]], spans_m: FloatArray) -> tuple[Figure, 
 
 def _map_layers(
     estimate: Trajectory,
+    ids: IntArray,
     world_points: FloatArray,
     truth: Trajectory | None,
     landmark_truth: LandmarkTruth | None,
-) -> list[tuple[FloatArray, Any]]:
-    """List what a map shows, first what lies lowest: points (k, 3) and how they are drawn."""
-    layers: list[tuple[FloatArray, Any]] = [
+) -> list[_Layer]:
+    """List what a map shows, first what lies lowest, without what there is none of."""
+    layers: list[_Layer] = [
         (estimate.positions, {**PATH, 'linestyle': '-', 'linewidth': 0.9}),
+        (estimate.positions[:1], START),
         (estimate.positions[-1:], END),
         (world_points, LANDMARKS),
     ]
@@ -156,36 +172,18 @@ def _map_layers(
         layers[:0] = [(truth.positions, TRUE_PATH), (truth.positions[-1:], TRUE_END)]
     if landmark_truth is not None:
         layers.append((landmark_truth.world_points, TRUE_LANDMARKS))
-    return layers
+        layers.append((_links(ids, world_points, landmark_truth), LINKS))
+    return [(points, style) for points, style in layers if len(points)]
 
 
-def _label_landmarks(
-    axes: Axes, ids: IntArray, world_points: FloatArray, landmark_truth: LandmarkTruth | None
-) -> None:
-    """Write each id beside its estimate, on the side away from what else is drawn near it."""
-    true_points = [] if landmark_truth is None else [landmark_truth.world_points]
-    markers = np.concatenate([world_points, *true_points])[:, :2]
-    for landmark_id, point in zip(ids.tolist(), world_points, strict=True):
-        right, up = _away(point[:2], markers)
-        side = 'left' if right > 0.0 else 'right'
-        axes.annotate(
-            str(landmark_id),
-            (point[0], point[1]),
-            xytext=(_LABEL_RIGHT_PT * right, _LABEL_UP_PT * up),
-            textcoords='offset points',
-            horizontalalignment=side if abs(right) > abs(up) else 'center',
-            verticalalignment='center',
-            fontsize=8,
-            color='#004D38',
-            zorder=3,  # above paths, below markers, which the halo would erase
-            path_effects=[withStroke(linewidth=2.5, foreground='white')],
-        )
+def _links(ids: IntArray, world_points: FloatArray, truth: LandmarkTruth) -> FloatArray:
+    """Return lines from landmarks to the true ones of the same ids, with a break after each."""
+    _, rows, true_rows = np.intersect1d(ids, truth.ids, return_indices=True)
+    ends = [world_points[rows], truth.world_points[true_rows], np.full((len(rows), 3), np.nan)]
+    return np.stack(ends, axis=1).reshape(-1, 3)
 
 
-def _away(point: FloatArray, markers: FloatArray) -> FloatArray:
-    """Return the direction (2,) that leads away from markers (m, 2), the nearest above all."""
-    apart = point - markers
-    near_m = _NEAR * float(np.ptp(markers, axis=0).max()) or 1.0  # else a single one
-    push = (apart / (np.sum(apart**2, axis=1, keepdims=True) + near_m**2)).sum(axis=0)
-    length = float(np.linalg.norm(push))
-    return push / length if length > 0.0 else np.array([1.0, 0.0])
+def _write_ids(axes: Axes, ids: IntArray, points: FloatArray, layers: list[_Layer]) -> None:
+    """Write ids beside their points (n, 2), where they hit no marker of any layer."""
+    markers = np.concatenate([drawn[:, :2] for drawn, style in layers if 'marker' in style])
+    label_points(axes, [str(landmark_id) for landmark_id in ids.tolist()], points, markers)

@@ -16,6 +16,7 @@ from slam_observer_ros.evaluation.drawing import (
     GREY,
     is_flat,
     LANDMARKS,
+    legend_below,
     PATH,
     save,
     STYLE,
@@ -151,7 +152,7 @@ def plot_configuration(
     else:
         limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
         axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.1)
-    figure.legend(loc='outside lower center', ncols=5)
+    legend_below(figure, axes, columns=5)
     return save(figure, path)
 
 
