@@ -17,6 +17,7 @@ import pytest
 
 from slam_observer_ros.association.assignments import MARGIN
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
+from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     huber_loss,
@@ -25,7 +26,6 @@ from slam_observer_ros.association.joint_compatibility import (
     MAX_PARTIAL,
     Pairs,
 )
-from slam_observer_ros.association.readings import readings
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -485,8 +485,8 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         slam = estimator._slam
-        (reading,) = readings(slam, event, slam.look(event), np.arange(3), np.inf)
-        costs.append(reading.cost)
+        (only,) = interpretations(slam, event, slam.look(event), np.arange(3), np.inf)
+        costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
 

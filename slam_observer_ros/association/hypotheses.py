@@ -1,9 +1,9 @@
-"""What may be: states that take what was seen for different things (:mod:`.readings`).
+"""What may be: states that take what was seen for different things (:mod:`.interpretations`).
 
-Where two readings of an observation put the robot at different places, both are followed, each
-with a state of its own, until later observations have made one much more likely than the other
-(D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the robot
-at one place but take what it sees there for different landmarks, as their maps differ. Where
+Where two interpretations of an observation put the robot at different places, both are followed,
+each with a state of its own, until later observations have made one much more likely than the
+other (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the
+robot at one place but take what it sees there for different landmarks, as their maps differ. Where
 landmarks have ids or are well apart there is nearly always one.
 """
 
@@ -17,8 +17,13 @@ from operator import attrgetter
 
 import numpy as np
 
+from slam_observer_ros.association.interpretations import (
+    Interpretation,
+    interpretations,
+    is_ambiguous,
+    may_relabel,
+)
 from slam_observer_ros.association.joint_compatibility import MARGIN, RESOLUTION
-from slam_observer_ros.association.readings import is_ambiguous, may_name, Reading, readings
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
@@ -39,7 +44,7 @@ class _Followed:
     """A state after an observation, what it took that for, what it made of it, and its cost."""
 
     slam: Slam
-    reading: Reading
+    event: ObservationEvent
     outcome: Outcome
     cost: float
 
@@ -125,20 +130,18 @@ class Hypotheses:
         sightings = [slam.look(event) for slam in self._states]
         if len(self._states) == 1 and not is_unknown.any():
             is_clear = self._limit == 1 or not is_ambiguous(self.best, sightings[0])
-            if is_clear and not may_name(self.best, sightings[0]):
+            if is_clear and not may_relabel(self.best, sightings[0]):
                 return self.best.observe(sightings[0])
         possible = self._possible(event, sightings)
-        uses = Counter(number for number, reading in possible if reading.slipped is None)
+        uses = Counter(number for number, taken in possible if taken.slipped is None)
         followed: list[_Followed] = []
-        for number, reading in possible:
-            slam = reading.slipped
+        for number, taken in possible:
+            slam = taken.slipped
             if slam is None:
                 uses[number] -= 1
                 slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
-            state = self._follow(slam, reading, event)
-            if not any(
-                are_one(slam, reading.event, other.slam, other.reading.event) for other in followed
-            ):
+            state = self._follow(slam, taken, event)
+            if not any(are_one(slam, taken.event, other.slam, other.event) for other in followed):
                 followed.append(state)
             if len(followed) == self._limit:
                 break
@@ -147,21 +150,21 @@ class Hypotheses:
         self._states = [state.slam for state in followed]
         return followed[0].outcome
 
-    def _follow(self, slam: Slam, reading: Reading, event: ObservationEvent) -> _Followed:
-        """Let a state use an observation as one reading has it; return what comes of it."""
-        slam.landmarks.renumber(reading.named_rows, reading.names)
-        outcome = slam.observe(slam.look(reading.event))
-        if reading.disbelieved is not None:
-            slam.disbelieve(reading.disbelieved)
-        cost = reading.cost
+    def _follow(self, slam: Slam, taken: Interpretation, event: ObservationEvent) -> _Followed:
+        """Let a state use an observation as one interpretation has it; return what comes of it."""
+        slam.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
+        outcome = slam.observe(slam.look(taken.event))
+        if taken.disbelieved is not None:
+            slam.disbelieve(taken.disbelieved)
+        cost = taken.cost
         if (event.ids == UNKNOWN_ID).any():
-            cost += slam.note_surroundings(reading.event, self._some_have_ids)
-        slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
-        return _Followed(slam, reading, outcome, cost)
+            cost += slam.note_surroundings(taken.event, self._some_have_ids)
+        slam.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
+        return _Followed(slam, taken.event, outcome, cost)
 
     def _possible(
         self, event: ObservationEvent, sightings: list[Sighting]
-    ) -> list[tuple[int, Reading]]:
+    ) -> list[tuple[int, Interpretation]]:
         """Return what each state may take an observation for, by the number of the state.
 
         The cheapest comes first; the cost is that of the state as well. A point has the same id
@@ -171,15 +174,15 @@ class Hypotheses:
             given = slam.landmarks.ids[is_automatic(slam.landmarks.ids)]  # of a loaded map, too
             self._next_id = max(self._next_id, int(np.max(given, initial=0)) + 1)
         new_ids = self._next_id + np.arange(len(event.ids))
-        possible: list[tuple[int, Reading]] = []
+        possible: list[tuple[int, Interpretation]] = []
         worst = math.inf
         states = zip(self._states, self._costs, sightings, strict=True)
         for number, (slam, cost, sighting) in enumerate(states):
-            for reading in readings(slam, event, sighting, new_ids, worst - cost):
-                possible.append((number, replace(reading, cost=cost + reading.cost)))
-                worst = min(worst, cost + reading.cost + MARGIN)
+            for taken in interpretations(slam, event, sighting, new_ids, worst - cost):
+                possible.append((number, replace(taken, cost=cost + taken.cost)))
+                worst = min(worst, cost + taken.cost + MARGIN)
         possible.sort(key=lambda pair: pair[1].cost)
-        return [(number, reading) for number, reading in possible if reading.cost <= worst]
+        return [(number, taken) for number, taken in possible if taken.cost <= worst]
 
 
 def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:

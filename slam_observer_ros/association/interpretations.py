@@ -1,47 +1,39 @@
 """What an observation may mean: points without an id, and points whose id may be wrong.
 
 After a long blind stretch the gate is wide, and a wrong id passes it. Taken for the landmark that
-it names, such a point would close a loop where there is none and throw the pose. So it is read
-both ways, as what it says and as an outlier, and later observations decide. It may also be the
-landmark that is wrong, if it was placed by such a point itself.
+it names, such a point would close a loop where there is none and throw the pose. So there are two
+interpretations, that it is what its id says and that it is an outlier, and later observations
+decide. It may also be the landmark that is wrong, if it was placed by such a point itself.
 
-So is an observation most of which the gate rejects. It may be garbled, or of landmarks that have
-moved; or the robot is not where odometry has it, since its wheels slipped or someone carried it,
-and would be lost if it went on without what it sees.
+So there are of an observation most of which the gate rejects. It may be garbled, or of landmarks
+that have moved; or the robot is not where odometry has it, since its wheels slipped or someone
+carried it, and would be lost if it went on without what it sees.
 """
 
 from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-import math
 
 import numpy as np
 
 from slam_observer_ros.association.assignments import Assignment, find_assignments
-from slam_observer_ros.association.joint_compatibility import (
-    huber_loss,
-    joint_cost,
-    unpaired_cost,
+from slam_observer_ros.association.costs import (
+    cost_of_staying,
+    outlier_cost,
+    pairing_cost,
+    rejection_cost,
+    SLIP_COST,
 )
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import are_far, far_from_the_others, gated
-from slam_observer_ros.matrices import mahalanobis, with_blocks
+from slam_observer_ros.gains.robust import are_far, far_from_the_others
+from slam_observer_ros.matrices import mahalanobis
 from slam_observer_ros.slam.sighting import is_contradiction, Sighting
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-
-SLIP_COST = 20.0
-"""What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
-
-SAME_CAUSE_COST = 3.0
-"""What it costs to reject another point for the reason for which one was rejected already."""
-
-MAX_OF_ONE_CAUSE = 3
-"""Points that cost this, at most: one garbled message is one, however much it tells."""
 
 
 def _none() -> IntArray:
@@ -49,7 +41,7 @@ def _none() -> IntArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class Interpretation:
     """What an observation is taken for.
 
     Attributes
@@ -57,13 +49,13 @@ class Reading:
     event : ObservationEvent
         The observation with all ids filled in, without points that are taken for outliers.
     cost : float
-        −2 ln of its likelihood, up to what all readings of the observation share.
+        −2 ln of its likelihood, up to what all interpretations of the observation share.
     slipped : Slam or None
         The state if the robot may have moved in any way since the observation before; else None.
     disbelieved : ObservationEvent or None
         Of the points that were left out though the gate lets them pass, those of landmarks that
         were seen so seldom that these may be the outliers; None or empty if there are none.
-    named_rows, names : IntArray
+    relabelled_rows, relabelled_ids : IntArray
         (j,) landmarks that had no id of their own so far, and the ids that they have now.
 
     """
@@ -72,13 +64,13 @@ class Reading:
     cost: float
     slipped: Slam | None = None
     disbelieved: ObservationEvent | None = None
-    named_rows: IntArray = field(default_factory=_none)
-    names: IntArray = field(default_factory=_none)
+    relabelled_rows: IntArray = field(default_factory=_none)
+    relabelled_ids: IntArray = field(default_factory=_none)
 
 
-def readings(
+def interpretations(
     slam: Slam, event: ObservationEvent, sighting: Sighting, new_ids: IntArray, budget: float
-) -> list[Reading]:
+) -> list[Interpretation]:
     """Return what an observation may mean.
 
     Parameters
@@ -92,50 +84,50 @@ def readings(
     new_ids : IntArray
         (m,) ids of points that are taken for landmarks not seen before.
     budget : float
-        Cost beyond which readings need not be returned.
+        Cost beyond which interpretations need not be returned.
 
     Returns
     -------
-    list of Reading
+    list of Interpretation
         As it came and at no cost if the gains know no joint covariance to judge it by.
 
     """
     gains = slam.gains
     if not isinstance(gains, RiccatiGains):
-        return [Reading(event, 0.0)]
+        return [Interpretation(event, 0.0)]
     residuals, m = sighting.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(slam, residuals)
     is_contradicted = not some_are_unknown and is_contradiction(rejected)
     own = _own_distances(slam, residuals)
     suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals, own)]]
-    if not is_contradicted and (some_are_unknown or may_name(slam, sighting)):
-        return _named(slam, gains, event, new_ids, suspects, budget)
+    if not is_contradicted and (some_are_unknown or may_relabel(slam, sighting)):
+        return _by_assignments(slam, gains, event, new_ids, suspects, budget)
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(slam, gains, sighting, event, rejected)
     else:
-        trusting, slipped = Reading(event, _cost(slam, gains, m, residuals)), []
+        trusting, slipped = Interpretation(event, pairing_cost(slam, gains, m, residuals)), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
     without = [_without(ids, slam, gains, sighting, trusting) for ids in doubted]
     return [trusting, *without, *slipped]
 
 
 def _without(
-    ids: IntArray, slam: Slam, gains: RiccatiGains, sighting: Sighting, trusting: Reading
-) -> Reading:
-    """Return the reading that points with some ids are outliers: no cheaper than trusting them.
+    ids: IntArray, slam: Slam, gains: RiccatiGains, sighting: Sighting, trusting: Interpretation
+) -> Interpretation:
+    """Return what it is if points with some ids are outliers: no cheaper than trusting them.
 
     But for what is seen once more at one place, in place of a landmark that was seen so seldom
     that it may itself be the outlier.
     """
     event, residuals = trusting.event, sighting.residuals
     out = np.isin(slam.landmarks.ids[residuals.rows], ids)
-    cost = max(trusting.cost, _cost(slam, gains, len(event.ids), residuals.select(~out)))
+    cost = max(trusting.cost, pairing_cost(slam, gains, len(event.ids), residuals.select(~out)))
     unconfirmed = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
-    again, staying = _cost_of_staying(slam, sighting)
-    saved = float(np.sum(_outlier_cost(slam) - staying[again & unconfirmed]))
+    again, staying = cost_of_staying(slam, sighting)
+    saved = float(np.sum(outlier_cost(slam) - staying[again & unconfirmed]))
     unconfirmed_ids = slam.landmarks.ids[residuals.rows[unconfirmed]]
-    return Reading(
+    return Interpretation(
         event.select(~np.isin(event.ids, ids)),
         cost - saved,
         disbelieved=event.select(np.isin(event.ids, unconfirmed_ids)),
@@ -154,7 +146,7 @@ def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
 
 
-def may_name(slam: Slam, sighting: Sighting) -> bool:
+def may_relabel(slam: Slam, sighting: Sighting) -> bool:
     """Return whether a point's id may be that of a landmark which had none of its own so far."""
     all_are_known = len(sighting.known.ids) == len(sighting.rows) + sighting.left_out
     if all_are_known or not isinstance(slam.gains, RiccatiGains):
@@ -168,68 +160,28 @@ def _rejected_or_slipped(
     sighting: Sighting,
     event: ObservationEvent,
     rejected: BoolArray,
-) -> list[Reading]:
-    """Return the readings of an observation most of whose known landmarks are rejected.
+) -> list[Interpretation]:
+    """Interpret an observation most of whose known landmarks are rejected.
 
     If a single motion would have put all where they are seen, that is as unlikely of a garbled
     message as of a robot that has made this motion.
     """
     residuals, m = sighting.residuals, len(event.ids)
-    cost, is_news = _rejection_cost(slam, sighting, rejected)
-    as_told = _cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
+    cost, is_news = rejection_cost(slam, sighting, rejected)
+    as_told = pairing_cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
     after_slip = _after_slip(slam, sighting, event) if is_news else None
     if after_slip is None:
-        return [Reading(event, as_told + cost)]
+        return [Interpretation(event, as_told + cost)]
     if slam.was_contradicted:
-        return [Reading(event, as_told + cost), after_slip]
-    as_outliers = as_told + float(np.sum(rejected)) * _outlier_cost(slam)
+        return [Interpretation(event, as_told + cost), after_slip]
+    as_outliers = as_told + float(np.sum(rejected)) * outlier_cost(slam)
     # A garbled message explains what happens to be where it should be, too.
     garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
-    return [Reading(event, garbled), after_slip]
+    return [Interpretation(event, garbled), after_slip]
 
 
-def _rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tuple[float, bool]:
-    """Return what it costs to reject landmarks, and whether there is a new cause for it.
-
-    At first one cause is enough: the observation is garbled. The next time it is not, and each
-    landmark has moved for a cause of its own. From then on there is nothing new in it but how
-    well it is seen where it was: landmarks that have moved must not throw the pose, however often
-    they are seen.
-    """
-    again, staying = _cost_of_staying(slam, sighting)
-    again &= rejected
-    is_second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
-    new = int(np.sum(rejected & ~again))
-    causes = new if slam.was_contradicted else min(new, 1)
-    same_cause = min(new - causes, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
-    # One of these may be of a garbled message once more: the one that is surest to have stayed.
-    moved = np.sort(staying[is_second])[1:]
-    causes += len(moved)
-    stayed = float(staying[again].sum() - moved.sum())
-    return causes * _outlier_cost(slam) + same_cause + stayed, causes > 0
-
-
-def _cost_of_staying(slam: Slam, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
-    """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
-
-    Where they were rejected last is known as well as the sensor tells: compared with the first
-    place, one that goes on moving would pay for one and the same shift each time. No landmark
-    costs more than another outlier.
-    """
-    k, known = slam.axes.point, sighting.known
-    noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(known))
-    again, shifts = slam.rejected_before(sighting)
-    costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
-    return again, np.minimum(costs, _outlier_cost(slam))
-
-
-def _outlier_cost(slam: Slam) -> float:
-    """Return what it costs that a point is of no landmark that is known."""
-    return unpaired_cost(slam.settings.rejection_distance)
-
-
-def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> Reading | None:
-    """Return the reading that the robot has slipped; None if that does not explain all of it."""
+def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> Interpretation | None:
+    """Take the robot for slipped; return None if that does not explain all of it."""
     settings = slam.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return None
@@ -238,8 +190,8 @@ def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> Read
     residuals, gains = slipped.look(event).residuals, slipped.gains
     if not isinstance(gains, RiccatiGains) or _are_rejected(slipped, residuals).any():
         return None
-    cost += SLIP_COST + _cost(slipped, gains, len(event.ids), residuals)
-    return Reading(event, cost, slipped)
+    cost += SLIP_COST + pairing_cost(slipped, gains, len(event.ids), residuals)
+    return Interpretation(event, cost, slipped)
 
 
 def _own_distances(slam: Slam, residuals: Residuals) -> FloatArray:
@@ -264,50 +216,44 @@ def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals, own: FloatA
     return far
 
 
-def _named(
+def _by_assignments(
     slam: Slam,
     gains: RiccatiGains,
     event: ObservationEvent,
     new_ids: IntArray,
     suspects: IntArray,
     budget: float,
-) -> list[Reading]:
-    """Return the readings of points that may be of landmarks without an id.
+) -> list[Interpretation]:
+    """Interpret points that may be of landmarks without an id.
 
-    An id is believed here, too, until something contradicts it: without a suspect a reading
-    costs no less than with all of them.
+    An id is believed here, too, until something contradicts it: an interpretation without a
+    suspect costs no less than one with all of them.
     """
     found = find_assignments(slam, gains, event, budget)
     outliers = [np.isin(event.ids, suspects) & (assignment.rows < 0) for assignment in found]
     pairs = list(zip(found, outliers, strict=True))
     trusting = min((assignment.cost for assignment, out in pairs if not out.any()), default=0.0)
-    named = []
+    interpreted = []
     for assignment, out in pairs:
         cost = max(assignment.cost, trusting) if out.any() else assignment.cost
-        reading = _with_ids(slam, event, assignment, new_ids)
-        named.append(replace(reading, event=reading.event.select(~out), cost=cost))
-    return named
+        interpretation = _with_ids(slam, event, assignment, new_ids)
+        interpreted.append(
+            replace(interpretation, event=interpretation.event.select(~out), cost=cost)
+        )
+    return interpreted
 
 
 def _with_ids(
     slam: Slam, event: ObservationEvent, assignment: Assignment, new_ids: IntArray
-) -> Reading:
-    """Return an assignment of m points as a reading, ``new_ids`` (m,) for landmarks not known."""
+) -> Interpretation:
+    """Interpret m points as an assignment has them; ``new_ids`` (m,) are for new landmarks."""
     rows, has_id = assignment.rows, event.ids != UNKNOWN_ID
     known_ids = np.append(slam.landmarks.ids, UNKNOWN_ID)[rows]
     ids = np.where(has_id, event.ids, np.where(rows < 0, new_ids, known_ids))
-    names = has_id & (rows >= 0) & (known_ids != event.ids)
-    return Reading(
+    is_relabelled = has_id & (rows >= 0) & (known_ids != event.ids)
+    return Interpretation(
         replace(event, ids=ids),
         assignment.cost,
-        named_rows=rows[names],
-        names=event.ids[names],
+        relabelled_rows=rows[is_relabelled],
+        relabelled_ids=event.ids[is_relabelled],
     )
-
-
-def _cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:
-    """Return what it costs to take some of m points for the landmarks whose ids they have."""
-    r, noise = residuals.on(slam.axes)
-    passed, own = gated(r, gains.predicted(residuals), noise, slam.settings)
-    paired_cost = joint_cost(r[passed], with_blocks(own, noise[passed]), noise[passed])
-    return paired_cost + (m - int(np.sum(passed))) * _outlier_cost(slam)
