@@ -25,7 +25,7 @@ from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.parameters import checked, table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
-from slam_observer_ros.slam.sighting import Outcome
+from slam_observer_ros.slam.outcome import Outcome
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray

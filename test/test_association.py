@@ -485,7 +485,7 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         slam = estimator._slam
-        (only,) = interpretations(slam, event, slam.look(event), np.arange(3), np.inf)
+        (only,) = interpretations(slam, event, slam.match(event), np.arange(3), np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 

@@ -18,7 +18,7 @@ from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated
 from slam_observer_ros.matrices import mahalanobis, with_blocks
-from slam_observer_ros.slam.sighting import Sighting
+from slam_observer_ros.slam.measurement import MatchedObservation
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray
 
@@ -45,7 +45,9 @@ def pairing_cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) 
     return paired_cost + (m - int(np.sum(passed))) * outlier_cost(slam)
 
 
-def rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tuple[float, bool]:
+def rejection_cost(
+    slam: Slam, matched: MatchedObservation, rejected: BoolArray
+) -> tuple[float, bool]:
     """Return what it costs to reject landmarks, and whether there is a new cause for it.
 
     At first one cause is enough: the observation is garbled. The next time it is not, and each
@@ -53,9 +55,9 @@ def rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tuple
     well it is seen where it was: landmarks that have moved must not throw the pose, however often
     they are seen.
     """
-    again, staying = cost_of_staying(slam, sighting)
+    again, staying = cost_of_staying(slam, matched)
     again &= rejected
-    is_second = again & (slam.landmarks.rejections[sighting.residuals.rows] == 1)
+    is_second = again & (slam.landmarks.rejections[matched.residuals.rows] == 1)
     new = int(np.sum(rejected & ~again))
     causes = new if slam.was_contradicted else min(new, 1)
     same_cause = min(new - causes, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
@@ -66,15 +68,15 @@ def rejection_cost(slam: Slam, sighting: Sighting, rejected: BoolArray) -> tuple
     return causes * outlier_cost(slam) + same_cause + stayed, causes > 0
 
 
-def cost_of_staying(slam: Slam, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
+def cost_of_staying(slam: Slam, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
     """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
 
     Where they were rejected last is known as well as the sensor tells: compared with the first
     place, one that goes on moving would pay for one and the same shift each time. No landmark
     costs more than another outlier.
     """
-    k, known = slam.axes.point, sighting.known
+    k, known = slam.axes.point, matched.known
     noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(known))
-    again, shifts = slam.rejected_before(sighting)
+    again, shifts = slam.rejected_before(matched)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
     return again, np.minimum(costs, outlier_cost(slam))

@@ -34,7 +34,8 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.matrices import mahalanobis
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.sighting import Outcome, Sighting
+from slam_observer_ros.slam.measurement import MatchedObservation
+from slam_observer_ros.slam.outcome import Outcome
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
 
@@ -127,12 +128,12 @@ class Hypotheses:
         """Use an observation made at the states' instant; return what the best one makes of it."""
         is_unknown = event.ids == UNKNOWN_ID
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
-        sightings = [slam.look(event) for slam in self._states]
+        matches = [slam.match(event) for slam in self._states]
         if len(self._states) == 1 and not is_unknown.any():
-            is_clear = self._limit == 1 or not is_ambiguous(self.best, sightings[0])
-            if is_clear and not may_relabel(self.best, sightings[0]):
-                return self.best.observe(sightings[0])
-        possible = self._possible(event, sightings)
+            is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
+            if is_clear and not may_relabel(self.best, matches[0]):
+                return self.best.observe(matches[0])
+        possible = self._possible(event, matches)
         uses = Counter(number for number, taken in possible if taken.slipped is None)
         followed: list[_Followed] = []
         for number, taken in possible:
@@ -153,7 +154,7 @@ class Hypotheses:
     def _follow(self, slam: Slam, taken: Interpretation, event: ObservationEvent) -> _Followed:
         """Let a state use an observation as one interpretation has it; return what comes of it."""
         slam.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
-        outcome = slam.observe(slam.look(taken.event))
+        outcome = slam.observe(slam.match(taken.event))
         if taken.disbelieved is not None:
             slam.disbelieve(taken.disbelieved)
         cost = taken.cost
@@ -163,7 +164,7 @@ class Hypotheses:
         return _Followed(slam, taken.event, outcome, cost)
 
     def _possible(
-        self, event: ObservationEvent, sightings: list[Sighting]
+        self, event: ObservationEvent, matches: list[MatchedObservation]
     ) -> list[tuple[int, Interpretation]]:
         """Return what each state may take an observation for, by the number of the state.
 
@@ -176,9 +177,9 @@ class Hypotheses:
         new_ids = self._next_id + np.arange(len(event.ids))
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf
-        states = zip(self._states, self._costs, sightings, strict=True)
-        for number, (slam, cost, sighting) in enumerate(states):
-            for taken in interpretations(slam, event, sighting, new_ids, worst - cost):
+        states = zip(self._states, self._costs, matches, strict=True)
+        for number, (slam, cost, matched) in enumerate(states):
+            for taken in interpretations(slam, event, matched, new_ids, worst - cost):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + MARGIN)
         possible.sort(key=lambda pair: pair[1].cost)

@@ -31,7 +31,8 @@ from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import are_far, far_from_the_others
 from slam_observer_ros.matrices import mahalanobis
-from slam_observer_ros.slam.sighting import is_contradiction, Sighting
+from slam_observer_ros.slam.measurement import MatchedObservation
+from slam_observer_ros.slam.outcome import is_contradiction
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -69,7 +70,11 @@ class Interpretation:
 
 
 def interpretations(
-    slam: Slam, event: ObservationEvent, sighting: Sighting, new_ids: IntArray, budget: float
+    slam: Slam,
+    event: ObservationEvent,
+    matched: MatchedObservation,
+    new_ids: IntArray,
+    budget: float,
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
@@ -79,8 +84,8 @@ def interpretations(
         The state at the observation's instant.
     event : ObservationEvent
         The observation, of m points.
-    sighting : Sighting
-        What it tells the state.
+    matched : MatchedObservation
+        The same, with the landmarks that it is of by its ids.
     new_ids : IntArray
         (m,) ids of points that are taken for landmarks not seen before.
     budget : float
@@ -95,36 +100,40 @@ def interpretations(
     gains = slam.gains
     if not isinstance(gains, RiccatiGains):
         return [Interpretation(event, 0.0)]
-    residuals, m = sighting.residuals, len(event.ids)
+    residuals, m = matched.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(slam, residuals)
     is_contradicted = not some_are_unknown and is_contradiction(rejected)
     own = _own_distances(slam, residuals)
     suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals, own)]]
-    if not is_contradicted and (some_are_unknown or may_relabel(slam, sighting)):
+    if not is_contradicted and (some_are_unknown or may_relabel(slam, matched)):
         return _by_assignments(slam, gains, event, new_ids, suspects, budget)
     if is_contradicted:
-        trusting, *slipped = _rejected_or_slipped(slam, gains, sighting, event, rejected)
+        trusting, *slipped = _rejected_or_slipped(slam, gains, matched, event, rejected)
     else:
         trusting, slipped = Interpretation(event, pairing_cost(slam, gains, m, residuals)), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
-    without = [_without(ids, slam, gains, sighting, trusting) for ids in doubted]
+    without = [_without(ids, slam, gains, matched, trusting) for ids in doubted]
     return [trusting, *without, *slipped]
 
 
 def _without(
-    ids: IntArray, slam: Slam, gains: RiccatiGains, sighting: Sighting, trusting: Interpretation
+    ids: IntArray,
+    slam: Slam,
+    gains: RiccatiGains,
+    matched: MatchedObservation,
+    trusting: Interpretation,
 ) -> Interpretation:
     """Return what it is if points with some ids are outliers: no cheaper than trusting them.
 
     But for what is seen once more at one place, in place of a landmark that was seen so seldom
     that it may itself be the outlier.
     """
-    event, residuals = trusting.event, sighting.residuals
+    event, residuals = trusting.event, matched.residuals
     out = np.isin(slam.landmarks.ids[residuals.rows], ids)
     cost = max(trusting.cost, pairing_cost(slam, gains, len(event.ids), residuals.select(~out)))
     unconfirmed = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
-    again, staying = cost_of_staying(slam, sighting)
+    again, staying = cost_of_staying(slam, matched)
     saved = float(np.sum(outlier_cost(slam) - staying[again & unconfirmed]))
     unconfirmed_ids = slam.landmarks.ids[residuals.rows[unconfirmed]]
     return Interpretation(
@@ -134,9 +143,9 @@ def _without(
     )
 
 
-def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
+def is_ambiguous(slam: Slam, matched: MatchedObservation) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
-    gains, residuals = slam.gains, sighting.residuals
+    gains, residuals = slam.gains, matched.residuals
     if not isinstance(gains, RiccatiGains):
         return False
     own = _own_distances(slam, residuals)
@@ -146,9 +155,9 @@ def is_ambiguous(slam: Slam, sighting: Sighting) -> bool:
     return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
 
 
-def may_relabel(slam: Slam, sighting: Sighting) -> bool:
+def may_relabel(slam: Slam, matched: MatchedObservation) -> bool:
     """Return whether a point's id may be that of a landmark which had none of its own so far."""
-    all_are_known = len(sighting.known.ids) == len(sighting.rows) + sighting.left_out
+    all_are_known = len(matched.known.ids) == len(matched.rows) + matched.left_out
     if all_are_known or not isinstance(slam.gains, RiccatiGains):
         return False
     return bool(is_automatic(slam.landmarks.ids).any())
@@ -157,7 +166,7 @@ def may_relabel(slam: Slam, sighting: Sighting) -> bool:
 def _rejected_or_slipped(
     slam: Slam,
     gains: RiccatiGains,
-    sighting: Sighting,
+    matched: MatchedObservation,
     event: ObservationEvent,
     rejected: BoolArray,
 ) -> list[Interpretation]:
@@ -166,10 +175,10 @@ def _rejected_or_slipped(
     If a single motion would have put all where they are seen, that is as unlikely of a garbled
     message as of a robot that has made this motion.
     """
-    residuals, m = sighting.residuals, len(event.ids)
-    cost, is_news = rejection_cost(slam, sighting, rejected)
+    residuals, m = matched.residuals, len(event.ids)
+    cost, is_news = rejection_cost(slam, matched, rejected)
     as_told = pairing_cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
-    after_slip = _after_slip(slam, sighting, event) if is_news else None
+    after_slip = _after_slip(slam, matched, event) if is_news else None
     if after_slip is None:
         return [Interpretation(event, as_told + cost)]
     if slam.was_contradicted:
@@ -180,14 +189,16 @@ def _rejected_or_slipped(
     return [Interpretation(event, garbled), after_slip]
 
 
-def _after_slip(slam: Slam, sighting: Sighting, event: ObservationEvent) -> Interpretation | None:
+def _after_slip(
+    slam: Slam, matched: MatchedObservation, event: ObservationEvent
+) -> Interpretation | None:
     """Take the robot for slipped; return None if that does not explain all of it."""
     settings = slam.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return None
     slipped = deepcopy(slam)
-    cost = slip(slipped, sighting)
-    residuals, gains = slipped.look(event).residuals, slipped.gains
+    cost = slip(slipped, matched)
+    residuals, gains = slipped.match(event).residuals, slipped.gains
     if not isinstance(gains, RiccatiGains) or _are_rejected(slipped, residuals).any():
         return None
     cost += SLIP_COST + pairing_cost(slipped, gains, len(event.ids), residuals)

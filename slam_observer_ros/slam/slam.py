@@ -22,7 +22,8 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
 from slam_observer_ros.slam.landmark_index import LandmarkIndex
 from slam_observer_ros.slam.landmark_table import LandmarkTable
-from slam_observer_ros.slam.sighting import is_contradiction, Outcome, Outlook, Sighting
+from slam_observer_ros.slam.measurement import MatchedObservation, MeasurementModel
+from slam_observer_ros.slam.outcome import is_contradiction, Outcome
 from slam_observer_ros.slam.surroundings import Surroundings
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
@@ -53,6 +54,8 @@ class Slam:
         Noise of velocities.
     observation_noise : ObservationNoise
         Noise of observed points.
+    measurement_model : MeasurementModel
+        Where landmarks should be seen.
     index : LandmarkIndex
         For landmarks near a point.
     counts : Counter
@@ -76,7 +79,9 @@ class Slam:
         self.was_contradicted = False
         self.motion_noise = MotionNoise(settings)
         self.observation_noise = ObservationNoise(settings)
-        self._outlook = Outlook(self.observer, self.landmarks, self.observation_noise, settings)
+        self.measurement_model = MeasurementModel(
+            self.observer, self.landmarks, self.observation_noise, settings
+        )
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
@@ -192,7 +197,7 @@ class Slam:
         """
         rows = self.landmarks.rows_of(event.ids)
         self.gains.recall(self.observer, rows)
-        return self._outlook.covariances(event, rows)
+        return self.measurement_model.covariances(event, rows)
 
     @property
     def landmark_velocity_error(self) -> float:
@@ -214,8 +219,8 @@ class Slam:
         velocities[rows >= 0] = self.observer.u[rows[rows >= 0]]
         return se3.rotate(se3.inverse(A), velocities)
 
-    def look(self, event: ObservationEvent) -> Sighting:
-        """Return what an observation made at the state's instant tells, before it is used.
+    def match(self, event: ObservationEvent) -> MatchedObservation:
+        """Match an observation made at the state's instant with landmarks, before it is used.
 
         It moves landmarks whose gains had put that off.
         """
@@ -223,30 +228,30 @@ class Slam:
         if not self.is_mapping:
             event, rows = self._mapped(event)
         self.gains.recall(self.observer, rows)
-        return self._outlook.sighting(event, rows, m - len(event.ids))
+        return self.measurement_model.match(event, rows, m - len(event.ids))
 
     def _mapped(self, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
         """Return the part of an observation that is of known landmarks, and their rows."""
         rows = self.landmarks.rows_of(event.ids)
         return event.select(rows >= 0), rows[rows >= 0]
 
-    def observe(self, sighting: Sighting) -> Outcome:
-        """Use what :meth:`look` has returned for an observation; return what was made of it."""
-        self.counts['unmapped_landmark'] += sighting.left_out
-        event, rows, known = sighting.event, sighting.rows, sighting.known
-        forgotten = self._in_the_way(sighting)
+    def observe(self, matched: MatchedObservation) -> Outcome:
+        """Use what :meth:`match` has returned for an observation; return what was made of it."""
+        self.counts['unmapped_landmark'] += matched.left_out
+        event, rows, known = matched.event, matched.rows, matched.known
+        forgotten = self._in_the_way(matched)
         if len(forgotten):
             # A history without them would lose what they have told of the pose.
             self.gains.restart(self.observer, 'landmarks had to make room (max_landmarks)')
-        rejected = self._correct(known, sighting.residuals)
+        rejected = self._correct(known, matched.residuals)
         if len(known.ids) < len(rows):
             is_new = rows < 0
             self._forget(forgotten, 'forgotten_landmark')
-            self._initialise(event.select(is_new), sighting.covariances[is_new])
+            self._initialise(event.select(is_new), matched.covariances[is_new])
             event, rows = self._mapped(event)
         moved_ids = self._look_back(event, rows)
         self._note_velocities(event, rows)
-        return Outcome(known.ids, sighting.residuals.r, rejected, moved_ids)
+        return Outcome(known.ids, matched.residuals.r, rejected, moved_ids)
 
     def disbelieve(self, event: ObservationEvent) -> None:
         """Count points as rejected although the gate lets them pass.
@@ -254,19 +259,19 @@ class Slam:
         Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
         """
         event, rows = self._mapped(event)  # one may have made room
-        self.landmarks.reject(rows, *self._outlook.places(event))
+        self.landmarks.reject(rows, *self.measurement_model.places(event))
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         if in_doubt.any():
             self.remove(rows[in_doubt])
 
-    def rejected_before(self, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
+    def rejected_before(self, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
         """Return which known landmarks (m,) in it were rejected before where they are seen now.
 
         And how far all of them (m, 3) are from where they were rejected last, metres, reference
         frame.
         """
-        rows = sighting.residuals.rows
-        points, tolerances_m = self._outlook.places(sighting.known)
+        rows = matched.residuals.rows
+        points, tolerances_m = self.measurement_model.places(matched.known)
         again = self.landmarks.are_rejected_again(rows, points, tolerances_m)
         return again, points - self.landmarks.rejected_last[rows]
 
@@ -322,7 +327,7 @@ class Slam:
         self.was_contradicted = is_contradiction(rejected)
         self.landmarks.accept(rows[~rejected], event.stamp_ns)
         if count:
-            places = self._outlook.places(event.select(rejected))
+            places = self.measurement_model.places(event.select(rejected))
             self.landmarks.reject(rows[rejected], *places)
             self.counts['rejected_landmark'] += count
         return rejected
@@ -346,7 +351,8 @@ class Slam:
         in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
         some_are = bool(in_doubt.any())
         if self.gains.looks_back:
-            self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
+            seen = self.measurement_model.frame_observation(event, rows)
+            self.gains.look_back(self.observer, seen, some_are)
         if some_are:
             return self._relocate(event.select(in_doubt), rows[in_doubt])
         return np.empty(0, dtype=np.int64)
@@ -356,7 +362,8 @@ class Slam:
 
         Return the ids of those that were seen often enough to say that they have moved.
         """
-        residuals = self._outlook.residuals(event, rows, self.observation_noise.covariances(event))
+        noise = self.observation_noise.covariances(event)
+        residuals = self.measurement_model.residuals(event, rows, noise)
         far = self.gains.distances(residuals) > self.settings.rejection_distance
         moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
         self.counts['moved_landmark'] += int(np.sum(moved))
@@ -367,17 +374,17 @@ class Slam:
             self.landmarks.restart(rows[far], event.stamp_ns)
         return event.ids[moved]
 
-    def _in_the_way(self, sighting: Sighting) -> IntArray:
-        """Return which landmarks out of view make room for the new ones of ``sighting``.
+    def _in_the_way(self, matched: MatchedObservation) -> IntArray:
+        """Return which landmarks out of view make room for the new ones of ``matched``.
 
         The least often seen go first.
         """
-        limit, new = self.settings.max_landmarks, len(sighting.rows) - len(sighting.residuals.rows)
+        limit, new = self.settings.max_landmarks, len(matched.rows) - len(matched.residuals.rows)
         excess = len(self.landmarks) + new - limit
         if limit == 0 or new == 0 or excess <= 0:
             return np.empty(0, dtype=np.int64)
-        unseen = self.landmarks.unseen_since(sighting.event.stamp_ns)
-        return np.sort(unseen[~np.isin(unseen, sighting.rows)][:excess])
+        unseen = self.landmarks.unseen_since(matched.event.stamp_ns)
+        return np.sort(unseen[~np.isin(unseen, matched.rows)][:excess])
 
     def _initialise(self, event: ObservationEvent, noise: FloatArray) -> None:
         """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
