@@ -29,16 +29,16 @@ MAX_PENDING_VELOCITIES = 128
 
 
 class Timeline:
-    """Velocities of the recent past, and how far the states have been moved along them.
+    """Velocities of the recent past, and how far the hypotheses have been moved along them.
 
     Parameters
     ----------
     frame : MapFrame
-        Has the states, which are of no time yet.
+        Holds the hypotheses; no event has been used yet.
     settings : Settings
         ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
     on_motion : callable, optional
-        Called each time before the states are moved on.
+        Called each time before the hypotheses are moved on.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Timeline:
     stamp_ns : int or None
         Stamp of the last event that was used, nanoseconds; None before the first.
     state_ns : int or None
-        Instant that the states are of: velocities since then wait for an observation.
+        Instant that the hypotheses are of: velocities since then wait for an observation.
 
     """
 
@@ -81,7 +81,7 @@ class Timeline:
         """Add a velocity; return whether it is in force: an angular one waits for a linear one.
 
         If it is late, it leads on from where velocities can still be changed. After many of them
-        the states are moved on without an observation.
+        the hypotheses are moved on without an observation.
 
         Raises
         ------
@@ -116,25 +116,25 @@ class Timeline:
         return to_s((self.stamp_ns or 0) - (self.state_ns or 0))
 
     def catch_up(self) -> None:
-        """Move the states on to the last event that was used."""
+        """Move the hypotheses on to the last event that was used."""
         if self.stamp_ns is not None:
             self._advance(self.stamp_ns)
 
     def _advance(self, stamp_ns: int) -> None:
-        """Move the states, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
+        """Move the hypotheses, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
         self._pending = 0
         start_ns = self.state_ns
         if start_ns is None or stamp_ns <= start_ns:
             return
         if self._on_motion is not None:
             self._on_motion(self.velocities, start_ns, stamp_ns)
-        self._frame.states.advance(self.velocities, start_ns, stamp_ns)
+        self._frame.hypotheses.advance(self.velocities, start_ns, stamp_ns)
         self.velocities.forget_before(stamp_ns - self._kept_ns)
         self.state_ns = stamp_ns
         self._in_force_ns = max(self._in_force_ns, stamp_ns)
 
     def meet(self, event: ObservationEvent) -> ObservationEvent:
-        """Move the states on to an observation, or it to them if it is late; return it.
+        """Move the hypotheses on to an observation, or it to them if it is late; return it.
 
         One without points, as an idle sensor sends, moves nothing: it would make others late.
         """

@@ -193,7 +193,7 @@ def test_a_landmark_that_is_disbelieved_may_have_made_room_for_a_new_one():
         assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         assert estimator.add(ObservationEvent(stamp_ns, ids, points))
     estimator.flush()
-    for slam in estimator._frame.states._states:
+    for slam in estimator._frame.hypotheses._states:
         assert len(slam.landmarks) <= 3
         assert np.all(slam.landmarks.rejections[slam.landmarks.ids == 3] == 0)
 
@@ -225,7 +225,7 @@ def test_what_says_nothing_of_the_pose_leaves_open_which_state_is_right(do_then)
 
 def test_a_landmark_is_forgotten_in_all_states_that_are_followed():
     def forget(estimator):
-        assert len(estimator._frame.states) == 2
+        assert len(estimator._frame.hypotheses) == 2
         assert estimator.forget(1)
 
     _, estimator = drive_on_blindly(Settings(two_d_mode=True), {2: 0}, forget)

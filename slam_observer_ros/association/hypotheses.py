@@ -1,4 +1,4 @@
-"""What may be: states that take what was seen for different things (:mod:`.interpretations`).
+"""Hypotheses: states that take what was seen for different things (:mod:`.interpretations`).
 
 Where two interpretations of an observation put the robot at different places, both are followed,
 each with a state of its own, until later observations have made one much more likely than the
@@ -41,8 +41,8 @@ from slam_observer_ros.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class _Followed:
-    """A state after an observation, what it took that for, what it made of it, and its cost."""
+class _Child:
+    """A hypothesis after an observation, what it took that for, what came of it, and its cost."""
 
     slam: Slam
     event: ObservationEvent
@@ -51,7 +51,7 @@ class _Followed:
 
 
 class Hypotheses:
-    """States that are all possible, the most likely first.
+    """Hypotheses of where everything is, each a state of its own, the most likely first.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Hypotheses:
         self._some_have_ids = False
 
     def __len__(self) -> int:
-        """Return how many states are followed."""
+        """Return how many hypotheses there are."""
         return len(self._states)
 
     @property
@@ -76,8 +76,8 @@ class Hypotheses:
         """The most likely state."""
         return self._states[0]
 
-    def decide(self) -> Slam:
-        """Give up all states but the most likely one, and return that."""
+    def prune_to_best(self) -> Slam:
+        """Give up all hypotheses but the most likely one, and return its state."""
         self._states, self._costs = self._states[:1], [0.0]
         return self.best
 
@@ -86,9 +86,9 @@ class Hypotheses:
     ) -> FloatArray | None:
         """Return the covariance (6, 6) of the most likely pose at ``end_ns``, which may be wrong.
 
-        Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the states, moved on from ``start_ns``,
-        and d_i how far their poses are then from that of the first. Coordinates are those of
-        :meth:`.Slam.pose_after`. None where the gains know none.
+        Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the hypotheses, moved on from
+        ``start_ns``, and d_i how far their poses are then from that of the first. Coordinates are
+        those of :meth:`.Slam.pose_after`. None where the gains know none.
         """
         pose, own = self.best.pose_after(velocities, start_ns, end_ns)
         likelihoods, total = np.exp(-0.5 * np.array(self._costs)), own
@@ -102,17 +102,17 @@ class Hypotheses:
         return total
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
-        """Move all states, which are those of ``start_ns``, on to ``end_ns``."""
+        """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns``."""
         for slam in self._states:
             slam.advance(velocities, start_ns, end_ns)
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other values of the settings that may change, in all states."""
+        """Use other values of the settings that may change, in all hypotheses."""
         for slam in self._states:
             slam.change_settings(settings)
 
     def restart_time(self) -> None:
-        """Let all states go on from where they are at any other time."""
+        """Let all hypotheses go on from where they are at any other time."""
         for slam in self._states:
             slam.restart_time()
 
@@ -125,7 +125,7 @@ class Hypotheses:
         return bool(rows[0][0] >= 0)
 
     def observe(self, event: ObservationEvent) -> Outcome:
-        """Use an observation made at the states' instant; return what the best one makes of it."""
+        """Use an observation made at this instant; return what the best hypothesis makes of it."""
         is_unknown = event.ids == UNKNOWN_ID
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
         matches = [slam.match(event) for slam in self._states]
@@ -133,25 +133,33 @@ class Hypotheses:
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
             if is_clear and not may_relabel(self.best, matches[0]):
                 return self.best.observe(matches[0])
-        possible = self._possible(event, matches)
+        children = self._children(event, self._possible(event, matches))
+        self._costs = [child.cost - children[0].cost for child in children]
+        self._states = [child.slam for child in children]
+        return children[0].outcome
+
+    def _children(
+        self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
+    ) -> list[_Child]:
+        """Let hypotheses use an observation as what it may be; return what they become.
+
+        The most likely comes first. Of those that become one, the first stands for all.
+        """
         uses = Counter(number for number, taken in possible if taken.slipped is None)
-        followed: list[_Followed] = []
+        children: list[_Child] = []
         for number, taken in possible:
             slam = taken.slipped
             if slam is None:
                 uses[number] -= 1
                 slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
-            state = self._follow(slam, taken, event)
-            if not any(are_one(slam, taken.event, other.slam, other.event) for other in followed):
-                followed.append(state)
-            if len(followed) == self._limit:
+            child = self._child(slam, taken, event)
+            if not any(are_one(slam, taken.event, other.slam, other.event) for other in children):
+                children.append(child)
+            if len(children) == self._limit:
                 break
-        followed.sort(key=attrgetter('cost'))
-        self._costs = [state.cost - followed[0].cost for state in followed]
-        self._states = [state.slam for state in followed]
-        return followed[0].outcome
+        return sorted(children, key=attrgetter('cost'))
 
-    def _follow(self, slam: Slam, taken: Interpretation, event: ObservationEvent) -> _Followed:
+    def _child(self, slam: Slam, taken: Interpretation, event: ObservationEvent) -> _Child:
         """Let a state use an observation as one interpretation has it; return what comes of it."""
         slam.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
         outcome = slam.observe(slam.match(taken.event))
@@ -161,15 +169,15 @@ class Hypotheses:
         if (event.ids == UNKNOWN_ID).any():
             cost += slam.note_surroundings(taken.event, self._some_have_ids)
         slam.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
-        return _Followed(slam, taken.event, outcome, cost)
+        return _Child(slam, taken.event, outcome, cost)
 
     def _possible(
         self, event: ObservationEvent, matches: list[MatchedObservation]
     ) -> list[tuple[int, Interpretation]]:
-        """Return what each state may take an observation for, by the number of the state.
+        """Return what each hypothesis may take an observation for, by its number.
 
-        The cheapest comes first; the cost is that of the state as well. A point has the same id
-        in all of them that take it for a new landmark.
+        The cheapest comes first; the cost is that of the hypothesis as well. A point has the same
+        id in all of them that take it for a new landmark.
         """
         for slam in self._states:
             given = slam.landmarks.ids[is_automatic(slam.landmarks.ids)]  # of a loaded map, too
@@ -177,8 +185,8 @@ class Hypotheses:
         new_ids = self._next_id + np.arange(len(event.ids))
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf
-        states = zip(self._states, self._costs, matches, strict=True)
-        for number, (slam, cost, matched) in enumerate(states):
+        before = zip(self._states, self._costs, matches, strict=True)
+        for number, (slam, cost, matched) in enumerate(before):
             for taken in interpretations(slam, event, matched, new_ids, worst - cost):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + MARGIN)
@@ -195,7 +203,7 @@ def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
 def are_one(
     slam: Slam, event: ObservationEvent, other: Slam, other_event: ObservationEvent
 ) -> bool:
-    """Return whether two states, by the points they saw, are at one place with one map there.
+    """Return whether two hypotheses, by the points seen, are at one place with one map there.
 
     That is so if they have the points, and each landmark that either takes one of them for, at
     the same places: which was which this once does not matter then.
