@@ -25,8 +25,8 @@ from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.parameters import checked, table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
-from slam_observer_ros.slam.outcome import Outcome
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import Outcome
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_ns, to_s

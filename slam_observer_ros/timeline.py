@@ -6,18 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-import numpy as np
-
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.maps.map_frame import MapFrame
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.motion.integration import transition, transition_covariance
+from slam_observer_ros.motion.integration import transition
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
+from slam_observer_ros.slam.late_observation import carried_forward
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_ns, to_s
 
@@ -142,7 +138,7 @@ class Timeline:
         if not len(event.ids):
             return replace(event, stamp_ns=state_ns)
         if event.stamp_ns < state_ns:
-            event = self._carried_forward(event, state_ns)
+            event = carried_forward(self._frame.slam, event, self.velocities, state_ns)
         self._advance(event.stamp_ns)
         self._in_force_ns = max(self._in_force_ns, event.stamp_ns)
         return event
@@ -153,27 +149,3 @@ class Timeline:
             return se3.inverse(self.motion(end_ns, start_ns))
         calibration = self._frame.slam.gains.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
-
-    def _carried_forward(self, event: ObservationEvent, state_ns: int) -> ObservationEvent:
-        """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
-
-        Its points are as uncertain as any seen from there, and as that motion makes them. Its
-        error is one and the same for all m, but is given to each as its own: m would average it
-        down. Where velocities are estimated, v may be anything that they may be.
-        """
-        slam, back = self._frame.slam, self.motion(state_ns, event.stamp_ns)
-        velocities = slam.velocities_of(event, slam.observer.A @ back)
-        lag_s = to_s(state_ns - event.stamp_ns)
-        shifts = velocities * lag_s
-        points = event.points + shifts
-        # The sensor with it, so that it was measured from as far.
-        sensor = shifts if event.sensor is None else event.sensor + shifts
-        shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
-        moved = move_observation(shifted, back)
-        Q = transition_covariance(
-            self.velocities, slam.gains.calibration, slam.motion_noise, event.stamp_ns, state_ns
-        )
-        C = back[:3, :3] @ SPATIAL.output_matrix(points)
-        shared = len(points) * C @ Q @ transpose(C)
-        own = (lag_s * slam.landmark_velocity_error) ** 2 * np.eye(3)
-        return replace(moved, covariances=slam.covariances_of(moved) + shared + own)

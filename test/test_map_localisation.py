@@ -28,7 +28,7 @@ from slam_observer_ros.maps.alignment import _contradictions, find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.localisation import CONFIRMING_VOTES, is_lost, PoseTrial
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.outcome import Outcome
+from slam_observer_ros.slam.update import Outcome
 
 POINT_NOISE_M = 0.05
 MAP_NOISE_M = 0.03

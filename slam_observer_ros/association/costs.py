@@ -18,6 +18,7 @@ from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import gated
 from slam_observer_ros.matrices import mahalanobis, with_blocks
+from slam_observer_ros.slam.map_management import rejected_before
 from slam_observer_ros.slam.measurement import MatchedObservation
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import BoolArray, FloatArray
@@ -77,6 +78,6 @@ def cost_of_staying(slam: Slam, matched: MatchedObservation) -> tuple[BoolArray,
     """
     k, known = slam.axes.point, matched.known
     noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(known))
-    again, shifts = slam.rejected_before(matched)
+    again, shifts = rejected_before(slam, matched)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
     return again, np.minimum(costs, outlier_cost(slam))

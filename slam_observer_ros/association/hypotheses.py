@@ -34,9 +34,10 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.matrices import mahalanobis
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.map_management import disbelieve, note_surroundings
 from slam_observer_ros.slam.measurement import MatchedObservation
-from slam_observer_ros.slam.outcome import Outcome
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import Outcome, update
 from slam_observer_ros.types import FloatArray
 
 
@@ -132,7 +133,7 @@ class Hypotheses:
         if len(self._states) == 1 and not is_unknown.any():
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
             if is_clear and not may_relabel(self.best, matches[0]):
-                return self.best.observe(matches[0])
+                return update(self.best, matches[0])
         children = self._children(event, self._possible(event, matches))
         self._costs = [child.cost - children[0].cost for child in children]
         self._states = [child.slam for child in children]
@@ -162,12 +163,12 @@ class Hypotheses:
     def _child(self, slam: Slam, taken: Interpretation, event: ObservationEvent) -> _Child:
         """Let a state use an observation as one interpretation has it; return what comes of it."""
         slam.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
-        outcome = slam.observe(slam.match(taken.event))
+        outcome = update(slam, slam.match(taken.event))
         if taken.disbelieved is not None:
-            slam.disbelieve(taken.disbelieved)
+            disbelieve(slam, taken.disbelieved)
         cost = taken.cost
         if (event.ids == UNKNOWN_ID).any():
-            cost += slam.note_surroundings(taken.event, self._some_have_ids)
+            cost += note_surroundings(slam, taken.event, self._some_have_ids)
         slam.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
         return _Child(slam, taken.event, outcome, cost)
 

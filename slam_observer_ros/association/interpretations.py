@@ -32,8 +32,8 @@ from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.gains.robust import are_far, far_from_the_others
 from slam_observer_ros.matrices import mahalanobis
 from slam_observer_ros.slam.measurement import MatchedObservation
-from slam_observer_ros.slam.outcome import is_contradiction
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import is_contradiction
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 

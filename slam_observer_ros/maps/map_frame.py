@@ -21,8 +21,8 @@ from slam_observer_ros.maps.localisation import (
 )
 from slam_observer_ros.matrices import with_variances_above
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.outcome import Outcome
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import Outcome
 from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
