@@ -26,6 +26,13 @@ of an exact filter, and not published.
 
 An observation costs O(m) for the m landmarks seen. The n known ones follow when they are seen
 again (:mod:`slam_observer_ros.gains.leaves`), which makes it O(m log n) in the mean.
+
+To update a part of the state alone, and to compose what the rest has to follow later, is the idea
+of the compressed EKF (J. Guivant and E. Nebot, *Optimization of the simultaneous localization and
+map-building algorithm for real-time implementation*, 2001) and of postponement (J. Knight, A.
+Davison and I. Reid, *Towards constant time SLAM using postponement*, 2001). Both keep the
+covariance of everything, O(n²), and lose nothing; here landmarks have nothing in common but the
+core, so that each follows by itself.
 """
 
 from __future__ import annotations
