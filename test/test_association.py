@@ -15,7 +15,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-from slam_observer_ros.association.assignments import MARGIN
+from slam_observer_ros.association.assignments import PRUNING_COST
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
 from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
@@ -518,7 +518,7 @@ def test_many_points_seen_after_a_blind_stretch_are_told_apart_together(seed):
     S = joint @ joint.T + np.kron(np.eye(len(at)), own)
     pairs = Pairs(at, rows, points[at] - landmarks[rows], S, np.tile(own, (len(at), 1, 1)))
     certain, unpaired_costs = np.zeros(len(at), dtype=bool), np.full(len(at), huber_loss(6.0))
-    found = JointSearch(pairs, certain, unpaired_costs, MARGIN).pairings()
+    found = JointSearch(pairs, certain, unpaired_costs, PRUNING_COST).pairings()
     assert len(found[0].chosen) == 16
     assert_array_equal(at[found[0].chosen], rows[found[0].chosen])
 

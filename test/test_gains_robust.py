@@ -36,8 +36,11 @@ def body_shift(world, event, world_shift):
 @given(generators(), st.floats(0.5, 4.0))
 def test_huber_weights_are_one_within_the_threshold_and_fall_off_beyond(rng, threshold):
     r, _, noise = random_problem(rng, m=20)
-    pull = np.linalg.solve(noise, r[:, :, None])[:, :, 0]
-    distances, weights = mahalanobis(r, noise), huber_weights(pull, noise, np.ones(20), threshold)
+    S_inv_r = np.linalg.solve(noise, r[:, :, None])[:, :, 0]
+    distances, weights = (
+        mahalanobis(r, noise),
+        huber_weights(S_inv_r, noise, np.ones(20), threshold),
+    )
     within = distances <= threshold
     np.testing.assert_array_equal(weights[within], 1.0)
     np.testing.assert_allclose(weights[~within] * distances[~within], threshold)
@@ -59,8 +62,8 @@ def test_reweighted_least_squares_settles_on_hubers_estimate(rng):
     settings = Settings(huber_threshold=1.345, rejection_distance=1e9)
     weights = observation_weights(r, 1e-3 * predicted, noise, settings)
     R = block_diagonal(noise / weights[:, None, None])
-    pull = np.linalg.solve(1e-3 * predicted + R, r.ravel()).reshape(r.shape)
-    np.testing.assert_allclose(weights, huber_weights(pull, noise, weights, 1.345), rtol=0.05)
+    S_inv_r = np.linalg.solve(1e-3 * predicted + R, r.ravel()).reshape(r.shape)
+    np.testing.assert_allclose(weights, huber_weights(S_inv_r, noise, weights, 1.345), rtol=0.05)
 
 
 @given(generators(), st.integers(0, 3), st.sampled_from([2, 3]))

@@ -202,9 +202,9 @@ def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten
     relative = prior.relative(axes).without(axes, rows)
     at_it = absolute.pose, absolute.calibration, absolute.points
     expected, _ = absolute.normal_equations(axes, np.linalg.inv(absolute.covariance), *at_it)
-    found, pull = relative.normal_equations(axes, np.linalg.inv(relative.covariance), *at_it)
+    found, gradient = relative.normal_equations(axes, np.linalg.inv(relative.covariance), *at_it)
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
-    np.testing.assert_allclose(pull, 0.0, atol=1e-6)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])

@@ -41,8 +41,8 @@ def outlier_cost(slam: Slam) -> float:
 def pairing_cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:
     """Return what it costs to take some of m points for the landmarks whose ids they have."""
     r, noise = residuals.on(slam.axes)
-    passed, own = gated(r, gains.predicted(residuals), noise, slam.settings)
-    paired_cost = joint_cost(r[passed], with_blocks(own, noise[passed]), noise[passed])
+    passed, predicted = gated(r, gains.predicted(residuals), noise, slam.settings)
+    paired_cost = joint_cost(r[passed], with_blocks(predicted, noise[passed]), noise[passed])
     return paired_cost + (m - int(np.sum(passed))) * outlier_cost(slam)
 
 

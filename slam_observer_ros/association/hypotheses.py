@@ -23,7 +23,7 @@ from slam_observer_ros.association.interpretations import (
     is_ambiguous,
     may_relabel,
 )
-from slam_observer_ros.association.joint_compatibility import MARGIN, RESOLUTION
+from slam_observer_ros.association.joint_compatibility import PRUNING_COST, RESOLUTION
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
@@ -190,7 +190,7 @@ class Hypotheses:
         for number, (slam, cost, matched) in enumerate(before):
             for taken in interpretations(slam, event, matched, new_ids, worst - cost):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
-                worst = min(worst, cost + taken.cost + MARGIN)
+                worst = min(worst, cost + taken.cost + PRUNING_COST)
         possible.sort(key=lambda pair: pair[1].cost)
         return [(number, taken) for number, taken in possible if taken.cost <= worst]
 

@@ -104,8 +104,9 @@ def interpretations(
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(slam, residuals)
     is_contradicted = not some_are_unknown and is_contradiction(rejected)
-    own = _own_distances(slam, residuals)
-    suspects = slam.landmarks.ids[residuals.rows[_suspects(slam, gains, residuals, own)]]
+    sensor_distances = _sensor_distances(slam, residuals)
+    is_suspect = _suspects(slam, gains, residuals, sensor_distances)
+    suspects = slam.landmarks.ids[residuals.rows[is_suspect]]
     if not is_contradicted and (some_are_unknown or may_relabel(slam, matched)):
         return _by_assignments(slam, gains, event, new_ids, suspects, budget)
     if is_contradicted:
@@ -148,10 +149,10 @@ def is_ambiguous(slam: Slam, matched: MatchedObservation) -> bool:
     gains, residuals = slam.gains, matched.residuals
     if not isinstance(gains, RiccatiGains):
         return False
-    own = _own_distances(slam, residuals)
-    if (own <= slam.settings.rejection_distance).all():  # by all of S they are no further off
-        return False
-    some_are_suspect = bool(_suspects(slam, gains, residuals, own).any())
+    sensor_distances = _sensor_distances(slam, residuals)
+    if (sensor_distances <= slam.settings.rejection_distance).all():
+        return False  # by all of S they are no further off
+    some_are_suspect = bool(_suspects(slam, gains, residuals, sensor_distances).any())
     return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
 
 
@@ -205,7 +206,7 @@ def _after_slip(
     return Interpretation(event, cost, slipped)
 
 
-def _own_distances(slam: Slam, residuals: Residuals) -> FloatArray:
+def _sensor_distances(slam: Slam, residuals: Residuals) -> FloatArray:
     """Return how far off points are by the sensor's noise alone (m,): this is quickly told."""
     return mahalanobis(*residuals.on(slam.axes))
 
@@ -215,12 +216,14 @@ def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:
     return np.asarray(slam.gains.distances(residuals) > slam.settings.rejection_distance)
 
 
-def _suspects(slam: Slam, gains: RiccatiGains, residuals: Residuals, own: FloatArray) -> BoolArray:
+def _suspects(
+    slam: Slam, gains: RiccatiGains, residuals: Residuals, sensor_distances: FloatArray
+) -> BoolArray:
     """Return which points (m,) only pass the gate since the state is so uncertain.
 
-    ``own`` (m,) are their :func:`_own_distances`.
+    ``sensor_distances`` (m,) are their :func:`_sensor_distances`.
     """
-    far = are_far(own, slam.settings)
+    far = are_far(sensor_distances, slam.settings)
     if far.any():
         r, noise = residuals.on(slam.axes)
         far &= far_from_the_others(r, gains.predicted(residuals), noise, slam.settings)

@@ -82,8 +82,8 @@ class Core:
 
     def step(self, H: FloatArray, gain_k: FloatArray, r: FloatArray) -> FloatArray:
         """Return −P⁺ Σ H_iᵀ k_i r_i (q, 1), for H (m, k, q), k_i (m, k, k) and r (m, k, 1)."""
-        pull = transpose(H) @ gain_k
-        information, gradient = np.sum(pull @ H, axis=0), np.sum(pull @ r, axis=0)
+        HtK = transpose(H) @ gain_k
+        information, gradient = np.sum(HtK @ H, axis=0), np.sum(HtK @ r, axis=0)
         eye = np.eye(len(self.P))
         x: FloatArray = -np.linalg.solve(eye + self.P @ information, self.P @ gradient)
         return x
