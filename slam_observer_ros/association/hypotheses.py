@@ -126,7 +126,7 @@ class Hypotheses:
         return bool(rows[0][0] >= 0)
 
     def observe(self, event: ObservationEvent) -> Outcome:
-        """Use an observation made at this instant; return what the best hypothesis makes of it."""
+        """Use an observation made at their instant; return what comes of it for the best one."""
         is_unknown = event.ids == UNKNOWN_ID
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
         matches = [slam.match(event) for slam in self._states]

@@ -184,7 +184,7 @@ class MapFrame:
             self._start(pose, covariance)
 
     def observe(self, event: ObservationEvent) -> Outcome:
-        """Use an observation made at this instant; return what the best hypothesis makes of it.
+        """Use an observation made at the hypotheses' instant; return what the best makes of it.
 
         The place in a loaded map is then looked for if it is not known, or not any more.
         """
