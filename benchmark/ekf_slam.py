@@ -11,9 +11,9 @@ those of the observer.
 
 from __future__ import annotations
 
+from baseline_noise import BaselineNoise
 import numpy as np
 from odometry import Event, Odometry
-from sightings import SightingNoise
 
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.gains.robust import observation_weights
@@ -39,7 +39,7 @@ class EkfSlam:
     def __init__(self, settings: Settings, initial_pose: FloatArray | None = None) -> None:
         self._settings = settings
         self._odometry = Odometry(settings)
-        self._noise = SightingNoise(settings)
+        self._noise = BaselineNoise(settings)
         axes = PLANAR if settings.two_d_mode else SPATIAL
         self._pose_axes, self._d, self._k = axes.pose, axes.p, axes.point
         self._pose = np.eye(4) if initial_pose is None else initial_pose

@@ -13,10 +13,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from baseline_noise import BaselineNoise
 import gtsam
 import numpy as np
 from odometry import Event, Odometry
-from sightings import SightingNoise
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.settings import Settings
@@ -45,7 +45,9 @@ class Factors(Protocol):
     def between(self, key: int, motion: FloatArray, covariance: FloatArray) -> Any:
         """Return the odometry from pose ``key`` − 1 to pose ``key``."""
 
-    def sighting(self, key: int, landmark: int, point: FloatArray, covariance: FloatArray) -> Any:
+    def observation(
+        self, key: int, landmark: int, point: FloatArray, covariance: FloatArray
+    ) -> Any:
         """Return the factor of a landmark seen at ``point`` (3,) from pose ``key``."""
 
     def guess(self, pose: Any, point: FloatArray) -> FloatArray:
@@ -84,7 +86,7 @@ class PlanarFactors:
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance[axes])
         return gtsam.BetweenFactorPose2(key - 1, key, self.pose(motion), noise)
 
-    def sighting(
+    def observation(
         self, key: int, landmark: int, point: FloatArray, covariance: FloatArray
     ) -> gtsam.BearingRangeFactor2D:
         """Link pose ``key`` to a landmark."""
@@ -135,7 +137,7 @@ class SpatialFactors:
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         return gtsam.BetweenFactorPose3(key - 1, key, self.pose(motion), noise)
 
-    def sighting(
+    def observation(
         self, key: int, landmark: int, point: FloatArray, covariance: FloatArray
     ) -> gtsam.BearingRangeFactor3D:
         """Link pose ``key`` to a landmark."""
@@ -198,7 +200,7 @@ class FrameBuilder:
         kind = PlanarFactors if settings.two_d_mode else SpatialFactors
         self.kind: Factors = kind(settings.huber_threshold)
         self._odometry = Odometry(settings)
-        self._noise = SightingNoise(settings)
+        self._noise = BaselineNoise(settings)
         self._count = 0
 
     def move(self, event: VelocityEvent) -> None:
@@ -221,7 +223,7 @@ class FrameBuilder:
         own, larger = self._noise.add(event)
         covariances = own * larger[:, None, None]
         for landmark, point, noise in zip(landmarks, event.points, covariances, strict=True):
-            factors.add(self.kind.sighting(key, landmark, point, noise))
+            factors.add(self.kind.observation(key, landmark, point, noise))
         return Frame(key, self.kind.pose(motion), factors, landmarks)
 
 

@@ -25,8 +25,8 @@ from slam_observer_ros.observer import lyapunov
 from slam_observer_ros.parameters import changed_names, checked, table
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
-from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import Outcome
 from slam_observer_ros.timeline import OnMotion, Timeline
 from slam_observer_ros.types import FloatArray, IntArray
 from slam_observer_ros.units import to_ns, to_s
@@ -270,7 +270,7 @@ class Estimator:
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""
-        return self._frame.states.forget(landmark_id)
+        return self._frame.hypotheses.forget(landmark_id)
 
     @property
     def counts(self) -> Counter[str]:
@@ -336,8 +336,8 @@ class Estimator:
         """
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        states = self._frame.states
-        return states.pose_covariance_after(timeline.velocities, start_ns, end_ns)
+        hypotheses = self._frame.hypotheses
+        return hypotheses.pose_covariance_after(timeline.velocities, start_ns, end_ns)
 
     @property
     def body_velocity(self) -> FloatArray:

@@ -122,7 +122,7 @@ class ObservationEvent:
     receive_ns: int | None = None
 
     @property
-    def sights(self) -> FloatArray:
+    def lines_of_sight(self) -> FloatArray:
         """(m, 3) from the sensor to the points, metres, axes of the base frame."""
         return self.points if self.sensor is None else self.points - self.sensor
 
@@ -158,10 +158,10 @@ def is_automatic(ids: IntArray) -> BoolArray:
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:
-    """Return the observation without what leaves the plane z = 0; the sights stay as they are."""
+    """Return the observation without what leaves the plane z = 0; lines of sight stay."""
     points = event.points * _PLANAR_POINT
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
-    sensor = points - event.sights if event.points[:, 2].any() else event.sensor
+    sensor = points - event.lines_of_sight if event.points[:, 2].any() else event.sensor
     return replace(event, points=points, velocities=velocities, sensor=sensor)
 
 

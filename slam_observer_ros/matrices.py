@@ -37,10 +37,10 @@ def solve(S: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(solution, dtype=np.float64)
 
 
-def condition(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
-    """Make P, in place, what an observation C x of covariance S leaves of it; return K = P Cᵀ S⁻¹.
+def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
+    """Kalman update of P, in place, in Joseph's form; return the gain K = P Cᵀ S⁻¹.
 
-    In Joseph's form, (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, it stays positive.
+    That is (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, with S = C P Cᵀ + R: P stays positive.
     """
     K: FloatArray = solve(S, CP).T
     half = K @ (0.5 * S @ K.T - CP)

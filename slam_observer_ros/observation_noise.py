@@ -50,16 +50,18 @@ class ObservationNoise(Immutable):
         self._settings = settings
         self.error_time_s = settings.observation_error_time
 
-    def covariances(self, event: ObservationEvent, sights: FloatArray | None = None) -> FloatArray:
+    def covariances(
+        self, event: ObservationEvent, lines_of_sight: FloatArray | None = None
+    ) -> FloatArray:
         """Return what an observation's points may be off by: (m, 3, 3), body frame, m².
 
         All of them can be inverted, even if a message or a point at the sensor itself says that
-        some direction is known exactly. ``sights`` (m, 3) lead from the sensor to where points of
-        unknown covariance should be; default where they were measured.
+        some direction is known exactly. ``lines_of_sight`` (m, 3) lead from the sensor to where
+        points of unknown covariance should be; default where they were measured.
         """
-        sights = event.sights if sights is None else sights
+        lines_of_sight = event.lines_of_sight if lines_of_sight is None else lines_of_sight
         if event.covariances is None:
-            return self.at(sights)
+            return self.at(lines_of_sight)
         # Else far points that are said to be exact are lost beside an uncertain heading.
         squared_m2 = np.einsum('ij,ij->i', event.points, event.points)
         least = RELATIVE_RESOLUTION**2 * squared_m2
@@ -67,19 +69,19 @@ class ObservationNoise(Immutable):
         covariances = _invertible(stated + least[:, None, None] * _IDENTITY)
         unknown = ~event.covariances.any(axis=(1, 2))
         if unknown.any():
-            covariances[unknown] = self.at(sights[unknown])
+            covariances[unknown] = self.at(lines_of_sight[unknown])
         return covariances
 
-    def at(self, sights: FloatArray) -> FloatArray:
+    def at(self, lines_of_sight: FloatArray) -> FloatArray:
         """Return what the settings say of points that a message has no covariances for.
 
-        ``sights`` (m, 3) lead to them from the sensor, metres, body frame.
+        ``lines_of_sight`` (m, 3) lead to them from the sensor, metres, body frame.
         """
         s = self._settings
         if s.observation_model == 'cartesian':
-            each = np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(sights), 3, 3))
+            each = np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(lines_of_sight), 3, 3))
             return _invertible(each)
-        range_squared = np.einsum('ij,ij->i', sights, sights)
+        range_squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)
         if s.observation_model == 'stereo':
             parallax = s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
             along = (range_squared * parallax) ** 2
@@ -87,7 +89,7 @@ class ObservationNoise(Immutable):
         else:
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2
-        return _invertible(_along_and_across(sights, range_squared, along, across))
+        return _invertible(_along_and_across(lines_of_sight, range_squared, along, across))
 
 
 def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
@@ -120,7 +122,7 @@ def _invertible(covariances: FloatArray) -> FloatArray:
 
 
 def _along_and_across(
-    sights: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
+    lines_of_sight: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
 ) -> FloatArray:
     """Return covariances (m, 3, 3) with given variances along and across the line of sight.
 
@@ -128,6 +130,6 @@ def _along_and_across(
     """
     across = np.where(range_squared > 0.0, across, along)
     excess = (along - across) / np.maximum(range_squared, _TINY)
-    outer = sights[:, :, None] * sights[:, None, :]
+    outer = lines_of_sight[:, :, None] * lines_of_sight[:, None, :]
     spread: FloatArray = excess[:, None, None] * outer
     return spread + across[:, None, None] * _IDENTITY

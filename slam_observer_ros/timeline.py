@@ -6,18 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-import numpy as np
-
 from slam_observer_ros.errors import InvalidEventError
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import move_observation
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.maps.map_frame import MapFrame
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.motion.integration import transition, transition_covariance
+from slam_observer_ros.motion.integration import transition
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import MAX_DELAY_S, Settings
+from slam_observer_ros.slam.late_observation import carried_forward
 from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_ns, to_s
 
@@ -29,16 +25,16 @@ MAX_PENDING_VELOCITIES = 128
 
 
 class Timeline:
-    """Velocities of the recent past, and how far the states have been moved along them.
+    """Velocities of the recent past, and how far the hypotheses have been moved along them.
 
     Parameters
     ----------
     frame : MapFrame
-        Has the states, which are of no time yet.
+        Holds the hypotheses; no event has been used yet.
     settings : Settings
         ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
     on_motion : callable, optional
-        Called each time before the states are moved on.
+        Called each time before the hypotheses are moved on.
 
     Attributes
     ----------
@@ -47,7 +43,7 @@ class Timeline:
     stamp_ns : int or None
         Stamp of the last event that was used, nanoseconds; None before the first.
     state_ns : int or None
-        Instant that the states are of: velocities since then wait for an observation.
+        Instant that the hypotheses are of: velocities since then wait for an observation.
 
     """
 
@@ -81,7 +77,7 @@ class Timeline:
         """Add a velocity; return whether it is in force: an angular one waits for a linear one.
 
         If it is late, it leads on from where velocities can still be changed. After many of them
-        the states are moved on without an observation.
+        the hypotheses are moved on without an observation.
 
         Raises
         ------
@@ -116,25 +112,25 @@ class Timeline:
         return to_s((self.stamp_ns or 0) - (self.state_ns or 0))
 
     def catch_up(self) -> None:
-        """Move the states on to the last event that was used."""
+        """Move the hypotheses on to the last event that was used."""
         if self.stamp_ns is not None:
             self._advance(self.stamp_ns)
 
     def _advance(self, stamp_ns: int) -> None:
-        """Move the states, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
+        """Move the hypotheses, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
         self._pending = 0
         start_ns = self.state_ns
         if start_ns is None or stamp_ns <= start_ns:
             return
         if self._on_motion is not None:
             self._on_motion(self.velocities, start_ns, stamp_ns)
-        self._frame.states.advance(self.velocities, start_ns, stamp_ns)
+        self._frame.hypotheses.advance(self.velocities, start_ns, stamp_ns)
         self.velocities.forget_before(stamp_ns - self._kept_ns)
         self.state_ns = stamp_ns
         self._in_force_ns = max(self._in_force_ns, stamp_ns)
 
     def meet(self, event: ObservationEvent) -> ObservationEvent:
-        """Move the states on to an observation, or it to them if it is late; return it.
+        """Move the hypotheses on to an observation, or it to them if it is late; return it.
 
         One without points, as an idle sensor sends, moves nothing: it would make others late.
         """
@@ -142,7 +138,7 @@ class Timeline:
         if not len(event.ids):
             return replace(event, stamp_ns=state_ns)
         if event.stamp_ns < state_ns:
-            event = self._carried_forward(event, state_ns)
+            event = carried_forward(self._frame.slam, event, self.velocities, state_ns)
         self._advance(event.stamp_ns)
         self._in_force_ns = max(self._in_force_ns, event.stamp_ns)
         return event
@@ -153,27 +149,3 @@ class Timeline:
             return se3.inverse(self.motion(end_ns, start_ns))
         calibration = self._frame.slam.gains.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)
-
-    def _carried_forward(self, event: ObservationEvent, state_ns: int) -> ObservationEvent:
-        """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
-
-        Its points are as uncertain as any seen from there, and as that motion makes them. Its
-        error is one and the same for all m, but is given to each as its own: m would average it
-        down. Where velocities are estimated, v may be anything that they may be.
-        """
-        slam, back = self._frame.slam, self.motion(state_ns, event.stamp_ns)
-        velocities = slam.velocities_of(event, slam.observer.A @ back)
-        lag_s = to_s(state_ns - event.stamp_ns)
-        shifts = velocities * lag_s
-        points = event.points + shifts
-        # The sensor with it, so that it was measured from as far.
-        sensor = shifts if event.sensor is None else event.sensor + shifts
-        shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
-        moved = move_observation(shifted, back)
-        Q = transition_covariance(
-            self.velocities, slam.gains.calibration, slam.motion_noise, event.stamp_ns, state_ns
-        )
-        C = back[:3, :3] @ SPATIAL.output_matrix(points)
-        shared = len(points) * C @ Q @ transpose(C)
-        own = (lag_s * slam.landmark_velocity_error) ** 2 * np.eye(3)
-        return replace(moved, covariances=slam.covariances_of(moved) + shared + own)

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-from slam_observer_ros.association.assignments import MARGIN
+from slam_observer_ros.association.assignments import PRUNING_COST
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
+from slam_observer_ros.association.interpretations import interpretations
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     huber_loss,
@@ -25,7 +26,6 @@ from slam_observer_ros.association.joint_compatibility import (
     MAX_PARTIAL,
     Pairs,
 )
-from slam_observer_ros.association.readings import readings
 from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -227,12 +227,12 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     seen = se3.transform(se3.inverse(turned), posts)
     for step in range(100, 105):
         observe(estimator, 0.1 * step, seen[1:2])
-    followed = len(estimator._frame.states)
+    followed = len(estimator._frame.hypotheses)
     error_rad = np.linalg.norm(so3.log(estimator.pose[:3, :3].T @ turned[:3, :3]))
     in_doubt_rad = np.sqrt(estimator.pose_covariance[2, 2])
     assert error_rad < 4.0 * in_doubt_rad
     observe(estimator, 10.45, np.empty((0, 3)))  # tells nothing, and so decides nothing
-    assert len(estimator._frame.states) == followed
+    assert len(estimator._frame.hypotheses) == followed
     for step in range(105, 110):
         observe(estimator, 0.1 * step, seen[1:])
     assert followed > 1
@@ -284,7 +284,7 @@ def test_one_hypothesis_at_most_if_no_more_are_wanted():
     estimator = Estimator(replace(PLANAR, max_hypotheses=1))
     for event in world.events:
         estimator.add(event)
-        assert len(estimator._frame.states) == 1
+        assert len(estimator._frame.hypotheses) == 1
 
 
 @pytest.mark.parametrize('gains', ['constant', 'scheduled'])
@@ -485,8 +485,8 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         slam = estimator._slam
-        (reading,) = readings(slam, event, slam.look(event), np.arange(3), np.inf)
-        costs.append(reading.cost)
+        (only,) = interpretations(slam, event, slam.match(event), np.arange(3), np.inf)
+        costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
 
@@ -518,7 +518,7 @@ def test_many_points_seen_after_a_blind_stretch_are_told_apart_together(seed):
     S = joint @ joint.T + np.kron(np.eye(len(at)), own)
     pairs = Pairs(at, rows, points[at] - landmarks[rows], S, np.tile(own, (len(at), 1, 1)))
     certain, unpaired_costs = np.zeros(len(at), dtype=bool), np.full(len(at), huber_loss(6.0))
-    found = JointSearch(pairs, certain, unpaired_costs, MARGIN).pairings()
+    found = JointSearch(pairs, certain, unpaired_costs, PRUNING_COST).pairings()
     assert len(found[0].chosen) == 16
     assert_array_equal(at[found[0].chosen], rows[found[0].chosen])
 
@@ -658,7 +658,7 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
             stand(estimator, time_s)
             seen = points if step < 20 else points[:1]
             observe(estimator, time_s, seen + rng.normal(scale=0.02, size=seen.shape) * [1, 1, 0])
-        assert len(estimator._frame.states) > 1
+        assert len(estimator._frame.hypotheses) > 1
         first = estimator.pose_covariance if is_asked else None
         for step in range(1, 201):
             stand(estimator, time_s + 0.01 * step, (0, 0, 0.5, 1, 0, 0))
@@ -671,24 +671,27 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
 
 def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved_on():
     """The further the robot goes, the further apart are states that differ in their heading."""
-    states = Hypotheses(Slam(PLANAR, np.eye(4)))
-    states._states, states._costs = [states.best, deepcopy(states.best)], [0.0, 1.0]
-    for slam, yaw_rad in zip(states._states, [0.0, 0.4], strict=True):
+    hypotheses = Hypotheses(Slam(PLANAR, np.eye(4)))
+    hypotheses._states, hypotheses._costs = (
+        [hypotheses.best, deepcopy(hypotheses.best)],
+        [0.0, 1.0],
+    )
+    for slam, yaw_rad in zip(hypotheses._states, [0.0, 0.4], strict=True):
         slam.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
     velocities, end_ns = VelocityHistory(10**10), 6 * 10**9
     velocities.append(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
-    told = states.pose_covariance_after(velocities, 0, end_ns)
-    states.advance(velocities, 0, end_ns)
-    assert_allclose(told, states.pose_covariance_after(velocities, end_ns, end_ns), atol=1e-9)
+    told = hypotheses.pose_covariance_after(velocities, 0, end_ns)
+    hypotheses.advance(velocities, 0, end_ns)
+    assert_allclose(told, hypotheses.pose_covariance_after(velocities, end_ns, end_ns), atol=1e-9)
     assert np.sqrt(told[4, 4]) > 1.0
 
 
 def test_settings_and_jumps_of_the_clock_are_of_all_states_that_are_followed():
-    states = Hypotheses(Slam(Settings(), np.eye(4)))
-    states._states = [Mock(), Mock()]
-    states.change_settings(PLANAR)
-    states.restart_time()
-    for slam in states._states:
+    hypotheses = Hypotheses(Slam(Settings(), np.eye(4)))
+    hypotheses._states = [Mock(), Mock()]
+    hypotheses.change_settings(PLANAR)
+    hypotheses.restart_time()
+    for slam in hypotheses._states:
         slam.change_settings.assert_called_once_with(PLANAR)
         slam.restart_time.assert_called_once_with()
 
@@ -699,10 +702,10 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     poses = se3.exp(rng.normal(scale=[0.3] * 3 + [2.0] * 3, size=(3, 6)))
     roots = 0.1 * rng.normal(size=(3, 6, 6))
     covariances, costs = roots @ roots.swapaxes(1, 2), np.array([0.0, 1.0, 3.0])
-    states = Hypotheses(Slam(settings, np.eye(4)))
-    states._states = [deepcopy(states.best) for _ in poses]
-    states._costs = costs.tolist()
-    for slam, pose, covariance in zip(states._states, poses, covariances, strict=True):
+    hypotheses = Hypotheses(Slam(settings, np.eye(4)))
+    hypotheses._states = [deepcopy(hypotheses.best) for _ in poses]
+    hypotheses._costs = costs.tolist()
+    for slam, pose, covariance in zip(hypotheses._states, poses, covariances, strict=True):
         slam.set_pose(pose, covariance)
     weights = np.exp(-costs / 2.0) / np.exp(-costs / 2.0).sum()
     turns = so3.log(poses[:, :3, :3] @ poses[0, :3, :3].T)
@@ -710,6 +713,6 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     each = covariances + d[:, :, None] * d[:, None, :]
     expected = np.einsum('i,ijk->jk', weights, each)
     velocities = VelocityHistory(10**9)
-    assert_allclose(states.pose_covariance_after(velocities, 0, 0), expected, atol=1e-9)
-    states.decide()
-    assert_allclose(states.pose_covariance_after(velocities, 0, 0), covariances[0], atol=1e-9)
+    assert_allclose(hypotheses.pose_covariance_after(velocities, 0, 0), expected, atol=1e-9)
+    hypotheses.prune_to_best()
+    assert_allclose(hypotheses.pose_covariance_after(velocities, 0, 0), covariances[0], atol=1e-9)

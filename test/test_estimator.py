@@ -31,8 +31,10 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.map_frame import MapFrame
+from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.observation_noise import ObservationNoise
 from slam_observer_ros.settings import Settings
+from slam_observer_ros.slam.late_observation import carried_forward
 from slam_observer_ros.timeline import MAX_PENDING_VELOCITIES, Timeline
 from slam_observer_ros.truth import PoseTruth
 from slam_observer_ros.validation import MAX_MEASURED
@@ -988,7 +990,9 @@ def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
     event = observation(0.0, [0, 1])
     frame.observe(event)
     frame.slam.gains.recall = Mock()
-    frame.slam.covariances_of(event)
+    velocities = VelocityHistory(timeout_ns=10**9)
+    velocities.append(velocity(0.0, np.zeros(6)))
+    carried_forward(frame.slam, event, velocities, event.stamp_ns + 10**8)
     np.testing.assert_array_equal(frame.slam.gains.recall.call_args.args[1], [0, 1])
 
 

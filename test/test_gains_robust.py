@@ -36,8 +36,11 @@ def body_shift(world, event, world_shift):
 @given(generators(), st.floats(0.5, 4.0))
 def test_huber_weights_are_one_within_the_threshold_and_fall_off_beyond(rng, threshold):
     r, _, noise = random_problem(rng, m=20)
-    pull = np.linalg.solve(noise, r[:, :, None])[:, :, 0]
-    distances, weights = mahalanobis(r, noise), huber_weights(pull, noise, np.ones(20), threshold)
+    S_inv_r = np.linalg.solve(noise, r[:, :, None])[:, :, 0]
+    distances, weights = (
+        mahalanobis(r, noise),
+        huber_weights(S_inv_r, noise, np.ones(20), threshold),
+    )
     within = distances <= threshold
     np.testing.assert_array_equal(weights[within], 1.0)
     np.testing.assert_allclose(weights[~within] * distances[~within], threshold)
@@ -59,8 +62,8 @@ def test_reweighted_least_squares_settles_on_hubers_estimate(rng):
     settings = Settings(huber_threshold=1.345, rejection_distance=1e9)
     weights = observation_weights(r, 1e-3 * predicted, noise, settings)
     R = block_diagonal(noise / weights[:, None, None])
-    pull = np.linalg.solve(1e-3 * predicted + R, r.ravel()).reshape(r.shape)
-    np.testing.assert_allclose(weights, huber_weights(pull, noise, weights, 1.345), rtol=0.05)
+    S_inv_r = np.linalg.solve(1e-3 * predicted + R, r.ravel()).reshape(r.shape)
+    np.testing.assert_allclose(weights, huber_weights(S_inv_r, noise, weights, 1.345), rtol=0.05)
 
 
 @given(generators(), st.integers(0, 3), st.sampled_from([2, 3]))
@@ -193,7 +196,7 @@ def test_a_landmark_that_is_disbelieved_may_have_made_room_for_a_new_one():
         assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         assert estimator.add(ObservationEvent(stamp_ns, ids, points))
     estimator.flush()
-    for slam in estimator._frame.states._states:
+    for slam in estimator._frame.hypotheses._states:
         assert len(slam.landmarks) <= 3
         assert np.all(slam.landmarks.rejections[slam.landmarks.ids == 3] == 0)
 
@@ -225,7 +228,7 @@ def test_what_says_nothing_of_the_pose_leaves_open_which_state_is_right(do_then)
 
 def test_a_landmark_is_forgotten_in_all_states_that_are_followed():
     def forget(estimator):
-        assert len(estimator._frame.states) == 2
+        assert len(estimator._frame.hypotheses) == 2
         assert estimator.forget(1)
 
     _, estimator = drive_on_blindly(Settings(two_d_mode=True), {2: 0}, forget)

@@ -28,7 +28,7 @@ from slam_observer_ros.maps.alignment import _contradictions, find_transform
 from slam_observer_ros.maps.landmark_map import LandmarkMap
 from slam_observer_ros.maps.localisation import CONFIRMING_VOTES, is_lost, PoseTrial
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.sighting import Outcome
+from slam_observer_ros.slam.update import Outcome
 
 POINT_NOISE_M = 0.05
 MAP_NOISE_M = 0.03
@@ -471,14 +471,17 @@ def test_a_pose_that_is_set_wrong_by_mistake_does_the_map_no_harm(gains, mode):
 def test_once_the_robot_is_placed_no_other_state_is_followed(is_told):
     world = World(3)
     estimator = add(Estimator(world.settings()), [world.see(0.0, world.near(0.0, 8))])
-    states = estimator._frame.states
-    states._states, states._costs = [states.best, deepcopy(states.best)], [0.0, 1.0]
+    hypotheses = estimator._frame.hypotheses
+    hypotheses._states, hypotheses._costs = (
+        [hypotheses.best, deepcopy(hypotheses.best)],
+        [0.0, 1.0],
+    )
     if is_told:
         estimator.set_pose(world.start)
     else:
         estimator.load_map(world.map())
         assert estimator.is_localised
-    assert len(estimator._frame.states) == 1
+    assert len(estimator._frame.hypotheses) == 1
 
 
 def test_a_robot_set_down_elsewhere_finds_back_once_its_pose_is_set():

@@ -363,7 +363,7 @@ def test_what_counts_is_the_way_from_the_sensor_wherever_that_sits(model, rng):
         noise.covariances(moved), R @ noise.covariances(event) @ R.T, atol=1e-9
     )
     back = move_observation(moved, se3.inverse(sensor))
-    np.testing.assert_allclose(back.sights, event.points, atol=1e-9)
+    np.testing.assert_allclose(back.lines_of_sight, event.points, atol=1e-9)
 
 
 def test_in_a_plane_a_landmark_overhead_is_as_far_away_as_it_is():
@@ -422,7 +422,7 @@ def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor(ga
         event = move_observation(ObservationEvent(step * 10**8, np.arange(3), sights), sensor)
         estimator.add(event)
     expected = observed(sights, **noise)
-    np.testing.assert_allclose(estimator._slam.look(event).covariances, expected, rtol=0.01)
+    np.testing.assert_allclose(estimator._slam.match(event).covariances, expected, rtol=0.01)
 
 
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
@@ -434,7 +434,7 @@ def test_the_range_that_counts_is_expected_and_the_direction_measured(gains):
     estimator.add(VelocityEvent(0, np.zeros(6)))
     estimator.add(ObservationEvent(0, np.arange(3), points))
     turned = points @ so3.exp(np.array([0.0, 0.0, 0.2]))
-    found = estimator._slam.look(ObservationEvent(10**8, np.arange(3), 1.25 * turned)).covariances
+    found = estimator._slam.match(ObservationEvent(10**8, np.arange(3), 1.25 * turned)).covariances
     np.testing.assert_allclose(found, observed(turned, **noise), rtol=1e-6, atol=1e-9)
 
 
@@ -449,9 +449,9 @@ def test_of_a_landmark_in_doubt_what_counts_is_where_it_was_measured(gains):
         estimator.add(ObservationEvent(step * 10**8, np.arange(3), points))
     slam, further = estimator._slam, ObservationEvent(5 * 10**8, np.arange(3), 2.0 * points)
     expected, measured = observed(points, **noise), observed(2.0 * points, **noise)
-    np.testing.assert_allclose(slam.look(further).covariances, expected, rtol=0.01)
+    np.testing.assert_allclose(slam.match(further).covariances, expected, rtol=0.01)
     slam.landmarks.rejections[1] = slam.settings.max_rejections
-    found = slam.look(further).covariances
+    found = slam.match(further).covariances
     np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]], rtol=0.01)
     np.testing.assert_allclose(found[1], measured[1], rtol=0.01)
 

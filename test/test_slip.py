@@ -73,7 +73,7 @@ def test_after_a_slip_the_pose_is_as_uncertain_as_the_slip_was_large_up_to_a_lim
             estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
             estimator.add(ObservationEvent(step * 10**8, ids, point))
         slam, seen = estimator._slam, point + [[shift_m, 0.0, 0.0]]
-        slip(slam, slam.look(ObservationEvent(4 * 10**8, ids, seen)))
+        slip(slam, slam.match(ObservationEvent(4 * 10**8, ids, seen)))
         return np.trace(slam.gains.pose_error_covariance[3:, 3:])
 
     assert 2.0 * variance_m2(0.3) < variance_m2(0.6) < 0.5 * variance_m2(2.0)

@@ -24,7 +24,7 @@ from slam_observer_ros.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.gains.base import Seen
+from slam_observer_ros.gains.base import FrameObservation
 from slam_observer_ros.gains.hindsight import Hindsight
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.joint_covariance import JointCovariance
@@ -202,9 +202,9 @@ def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten
     relative = prior.relative(axes).without(axes, rows)
     at_it = absolute.pose, absolute.calibration, absolute.points
     expected, _ = absolute.normal_equations(axes, np.linalg.inv(absolute.covariance), *at_it)
-    found, pull = relative.normal_equations(axes, np.linalg.inv(relative.covariance), *at_it)
+    found, gradient = relative.normal_equations(axes, np.linalg.inv(relative.covariance), *at_it)
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
-    np.testing.assert_allclose(pull, 0.0, atol=1e-6)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
@@ -248,7 +248,7 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
             )
             P = initial_covariance(axes, calibration)
             history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
-        nothing = Seen(
+        nothing = FrameObservation(
             0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
         )
         history.see(nothing, path[-1])
@@ -279,8 +279,8 @@ def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     for part in range(3):
         history.move(path[part : part + 2], noises[part], sensitivities[part], np.zeros(c))
     nothing = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
-    history.see(Seen(0, *nothing), path[-1])
-    history.see(Seen(1, *nothing), path[-1])  # nothing has moved since
+    history.see(FrameObservation(0, *nothing), path[-1])
+    history.see(FrameObservation(1, *nothing), path[-1])  # nothing has moved since
     frames = history.frames()
     to_body = se3.adjoint(se3.inverse(path[-1]))[axes.pose, axes.pose]
     np.testing.assert_allclose(
@@ -336,7 +336,7 @@ def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkey
         estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
         estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))
     there = ObservationNoise(settings).covariances(ObservationEvent(0, np.arange(3), turned))
-    taken = ObservationNoise(settings).at(noted[-1].sights)
+    taken = ObservationNoise(settings).at(noted[-1].lines_of_sight)
     np.testing.assert_allclose(taken, there, atol=0.1 * np.max(there))
 
 
@@ -442,7 +442,9 @@ def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad
     calibration = Calibration(settings, SPATIAL)
     joint = JointCovariance(SPATIAL, calibration, 0.0)
     hindsight, observer = Hindsight(SPATIAL, settings, calibration, joint), Observer(np.eye(4))
-    nothing = Seen(0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0))
+    nothing = FrameObservation(
+        0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+    )
     looked_back_at = []
     for turn_rad in turns_rad:
         hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))

@@ -18,8 +18,8 @@ import numpy as np
 from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     JointSearch,
-    MARGIN,
     Pairs,
+    PRUNING_COST,
     RESOLUTION,
     unpaired_cost,
 )
@@ -88,7 +88,7 @@ def find_assignments(
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), gate_cost)
     # Beyond what is searched; a point of no landmark costs the same whatever it might have been.
     fixed_cost = m * gate_cost - float(unpaired_costs[np.unique(at)].sum())
-    margin = 0.0 if certain.all() else MARGIN
+    margin = 0.0 if certain.all() else PRUNING_COST
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
     scale = np.linalg.inv(np.linalg.cholesky(seen.noise[:, : axes.point, : axes.point]))
     J = scale @ axes.output_matrix(seen.points)  # how a pose error moves the points, in σ

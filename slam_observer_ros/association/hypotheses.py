@@ -1,9 +1,9 @@
-"""What may be: states that take what was seen for different things (:mod:`.readings`).
+"""Hypotheses: states that take what was seen for different things (:mod:`.interpretations`).
 
-Where two readings of an observation put the robot at different places, both are followed, each
-with a state of its own, until later observations have made one much more likely than the other
-(D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the robot
-at one place but take what it sees there for different landmarks, as their maps differ. Where
+Where two interpretations of an observation put the robot at different places, both are followed,
+each with a state of its own, until later observations have made one much more likely than the
+other (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the
+robot at one place but take what it sees there for different landmarks, as their maps differ. Where
 landmarks have ids or are well apart there is nearly always one.
 """
 
@@ -17,8 +17,13 @@ from operator import attrgetter
 
 import numpy as np
 
-from slam_observer_ros.association.joint_compatibility import MARGIN, RESOLUTION
-from slam_observer_ros.association.readings import is_ambiguous, may_name, Reading, readings
+from slam_observer_ros.association.interpretations import (
+    Interpretation,
+    interpretations,
+    is_ambiguous,
+    may_relabel,
+)
+from slam_observer_ros.association.joint_compatibility import PRUNING_COST, RESOLUTION
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
@@ -29,23 +34,25 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.matrices import mahalanobis
 from slam_observer_ros.motion.velocity_history import VelocityHistory
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.sighting import Outcome, Sighting
+from slam_observer_ros.slam.map_management import disbelieve, note_surroundings
+from slam_observer_ros.slam.measurement import MatchedObservation
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import Outcome, update
 from slam_observer_ros.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class _Followed:
-    """A state after an observation, what it took that for, what it made of it, and its cost."""
+class _Child:
+    """A hypothesis after an observation, what it took that for, what came of it, and its cost."""
 
     slam: Slam
-    reading: Reading
+    event: ObservationEvent
     outcome: Outcome
     cost: float
 
 
 class Hypotheses:
-    """States that are all possible, the most likely first.
+    """Hypotheses of where everything is, each a state of its own, the most likely first.
 
     Parameters
     ----------
@@ -62,7 +69,7 @@ class Hypotheses:
         self._some_have_ids = False
 
     def __len__(self) -> int:
-        """Return how many states are followed."""
+        """Return how many hypotheses there are."""
         return len(self._states)
 
     @property
@@ -70,8 +77,8 @@ class Hypotheses:
         """The most likely state."""
         return self._states[0]
 
-    def decide(self) -> Slam:
-        """Give up all states but the most likely one, and return that."""
+    def prune_to_best(self) -> Slam:
+        """Give up all hypotheses but the most likely one, and return its state."""
         self._states, self._costs = self._states[:1], [0.0]
         return self.best
 
@@ -80,9 +87,9 @@ class Hypotheses:
     ) -> FloatArray | None:
         """Return the covariance (6, 6) of the most likely pose at ``end_ns``, which may be wrong.
 
-        Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the states, moved on from ``start_ns``,
-        and d_i how far their poses are then from that of the first. Coordinates are those of
-        :meth:`.Slam.pose_after`. None where the gains know none.
+        Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the hypotheses, moved on from
+        ``start_ns``, and d_i how far their poses are then from that of the first. Coordinates are
+        those of :meth:`.Slam.pose_after`. None where the gains know none.
         """
         pose, own = self.best.pose_after(velocities, start_ns, end_ns)
         likelihoods, total = np.exp(-0.5 * np.array(self._costs)), own
@@ -96,17 +103,17 @@ class Hypotheses:
         return total
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
-        """Move all states, which are those of ``start_ns``, on to ``end_ns``."""
+        """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns``."""
         for slam in self._states:
             slam.advance(velocities, start_ns, end_ns)
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other values of the settings that may change, in all states."""
+        """Use other values of the settings that may change, in all hypotheses."""
         for slam in self._states:
             slam.change_settings(settings)
 
     def restart_time(self) -> None:
-        """Let all states go on from where they are at any other time."""
+        """Let all hypotheses go on from where they are at any other time."""
         for slam in self._states:
             slam.restart_time()
 
@@ -119,67 +126,73 @@ class Hypotheses:
         return bool(rows[0][0] >= 0)
 
     def observe(self, event: ObservationEvent) -> Outcome:
-        """Use an observation made at the states' instant; return what the best one makes of it."""
+        """Use an observation made at their instant; return what comes of it for the best one."""
         is_unknown = event.ids == UNKNOWN_ID
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
-        sightings = [slam.look(event) for slam in self._states]
+        matches = [slam.match(event) for slam in self._states]
         if len(self._states) == 1 and not is_unknown.any():
-            is_clear = self._limit == 1 or not is_ambiguous(self.best, sightings[0])
-            if is_clear and not may_name(self.best, sightings[0]):
-                return self.best.observe(sightings[0])
-        possible = self._possible(event, sightings)
-        uses = Counter(number for number, reading in possible if reading.slipped is None)
-        followed: list[_Followed] = []
-        for number, reading in possible:
-            slam = reading.slipped
+            is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
+            if is_clear and not may_relabel(self.best, matches[0]):
+                return update(self.best, matches[0])
+        children = self._children(event, self._possible(event, matches))
+        self._costs = [child.cost - children[0].cost for child in children]
+        self._states = [child.slam for child in children]
+        return children[0].outcome
+
+    def _children(
+        self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
+    ) -> list[_Child]:
+        """Let hypotheses use an observation as what it may be; return what they become.
+
+        The most likely comes first. Of those that become one, the first stands for all.
+        """
+        uses = Counter(number for number, taken in possible if taken.slipped is None)
+        children: list[_Child] = []
+        for number, taken in possible:
+            slam = taken.slipped
             if slam is None:
                 uses[number] -= 1
                 slam = deepcopy(self._states[number]) if uses[number] else self._states[number]
-            state = self._follow(slam, reading, event)
-            if not any(
-                are_one(slam, reading.event, other.slam, other.reading.event) for other in followed
-            ):
-                followed.append(state)
-            if len(followed) == self._limit:
+            child = self._child(slam, taken, event)
+            if not any(are_one(slam, taken.event, other.slam, other.event) for other in children):
+                children.append(child)
+            if len(children) == self._limit:
                 break
-        followed.sort(key=attrgetter('cost'))
-        self._costs = [state.cost - followed[0].cost for state in followed]
-        self._states = [state.slam for state in followed]
-        return followed[0].outcome
+        return sorted(children, key=attrgetter('cost'))
 
-    def _follow(self, slam: Slam, reading: Reading, event: ObservationEvent) -> _Followed:
-        """Let a state use an observation as one reading has it; return what comes of it."""
-        slam.landmarks.renumber(reading.named_rows, reading.names)
-        outcome = slam.observe(slam.look(reading.event))
-        if reading.disbelieved is not None:
-            slam.disbelieve(reading.disbelieved)
-        cost = reading.cost
+    def _child(self, slam: Slam, taken: Interpretation, event: ObservationEvent) -> _Child:
+        """Let a state use an observation as one interpretation has it; return what comes of it."""
+        slam.landmarks.renumber(taken.relabelled_rows, taken.relabelled_ids)
+        outcome = update(slam, slam.match(taken.event))
+        if taken.disbelieved is not None:
+            disbelieve(slam, taken.disbelieved)
+        cost = taken.cost
         if (event.ids == UNKNOWN_ID).any():
-            cost += slam.note_surroundings(reading.event, self._some_have_ids)
-        slam.counts['rejected_landmark'] += len(event.ids) - len(reading.event.ids)
-        return _Followed(slam, reading, outcome, cost)
+            cost += note_surroundings(slam, taken.event, self._some_have_ids)
+        slam.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
+        return _Child(slam, taken.event, outcome, cost)
 
     def _possible(
-        self, event: ObservationEvent, sightings: list[Sighting]
-    ) -> list[tuple[int, Reading]]:
-        """Return what each state may take an observation for, by the number of the state.
+        self, event: ObservationEvent, matches: list[MatchedObservation]
+    ) -> list[tuple[int, Interpretation]]:
+        """Return what each hypothesis may take an observation for, by its number.
 
-        The cheapest comes first; the cost is that of the state as well. A point has the same id
-        in all of them that take it for a new landmark.
+        The cheapest comes first; the cost is that of the hypothesis as well. A point has the same
+        id in all of them that take it for a new landmark.
         """
         for slam in self._states:
             given = slam.landmarks.ids[is_automatic(slam.landmarks.ids)]  # of a loaded map, too
             self._next_id = max(self._next_id, int(np.max(given, initial=0)) + 1)
         new_ids = self._next_id + np.arange(len(event.ids))
-        possible: list[tuple[int, Reading]] = []
+        possible: list[tuple[int, Interpretation]] = []
         worst = math.inf
-        states = zip(self._states, self._costs, sightings, strict=True)
-        for number, (slam, cost, sighting) in enumerate(states):
-            for reading in readings(slam, event, sighting, new_ids, worst - cost):
-                possible.append((number, replace(reading, cost=cost + reading.cost)))
-                worst = min(worst, cost + reading.cost + MARGIN)
+        before = zip(self._states, self._costs, matches, strict=True)
+        for number, (slam, cost, matched) in enumerate(before):
+            for taken in interpretations(slam, event, matched, new_ids, worst - cost):
+                possible.append((number, replace(taken, cost=cost + taken.cost)))
+                worst = min(worst, cost + taken.cost + PRUNING_COST)
         possible.sort(key=lambda pair: pair[1].cost)
-        return [(number, reading) for number, reading in possible if reading.cost <= worst]
+        return [(number, taken) for number, taken in possible if taken.cost <= worst]
 
 
 def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
@@ -191,7 +204,7 @@ def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
 def are_one(
     slam: Slam, event: ObservationEvent, other: Slam, other_event: ObservationEvent
 ) -> bool:
-    """Return whether two states, by the points they saw, are at one place with one map there.
+    """Return whether two hypotheses, by the points seen, are at one place with one map there.
 
     That is so if they have the points, and each landmark that either takes one of them for, at
     the same places: which was which this once does not matter then.

@@ -31,7 +31,7 @@ MAX_PARTIAL = 16
 A search in depth would spend its time below the first pair, and never see that it is wrong.
 """
 
-MARGIN = 35.0
+PRUNING_COST = 35.0
 """How much more than the cheapest something may cost: at odds of e^17.5 it is given up."""
 
 RESOLUTION = 2.0

@@ -12,7 +12,7 @@ from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.matrices import transpose
 from slam_observer_ros.motion.held_velocities import HeldVelocities
 from slam_observer_ros.motion.motion import Motion
-from slam_observer_ros.slam.sighting import Sighting
+from slam_observer_ros.slam.measurement import MatchedObservation
 from slam_observer_ros.slam.slam import Slam
 from slam_observer_ros.types import FloatArray
 
@@ -29,18 +29,18 @@ MIN_VARIANCE = 1e-6
 """Least variance of where a robot without odometry gets and sees what it does, rad² or m²."""
 
 
-def slip(slam: Slam, sighting: Sighting) -> float:
+def slip(slam: Slam, matched: MatchedObservation) -> float:
     """Let the robot have slipped in a way that explains what it sees.
 
     It is then known as badly as if odometry had told nothing for as long as that takes, and what
     it sees is yet to be used. Return what it costs that it went where it was put.
     """
     observer, start = slam.observer, slam.observer.A
-    needed_s = min(_duration_s(slam, sighting), MAX_DURATION_S)
+    needed_s = min(_duration_s(slam, matched), MAX_DURATION_S)
     stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
     noise = slam.motion_noise.covariances(stray)
     variances = np.maximum(np.diagonal(noise[1])[slam.axes.pose], MIN_VARIANCE)
-    observer.propagate(np.array([start, _pose_after(slam, sighting, variances)]))
+    observer.propagate(np.array([start, _pose_after(slam, matched, variances)]))
     moved = Motion(
         path=np.array([start, observer.A, observer.A]),
         measured_velocities=stray.body_velocities,
@@ -55,34 +55,34 @@ def slip(slam: Slam, sighting: Sighting) -> float:
     return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
 
 
-def _duration_s(slam: Slam, sighting: Sighting) -> float:
+def _duration_s(slam: Slam, matched: MatchedObservation) -> float:
     """Return after how long without odometry a robot might see what it does, seconds."""
-    settings, k, residuals = slam.settings, slam.axes.point, sighting.residuals
-    points = sighting.known.points
+    settings, k, residuals = slam.settings, slam.axes.point, matched.residuals
+    points = matched.known.points
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
     needed_s = np.sum(residuals.r**2, axis=1) / np.maximum(after_1_s_m2, MIN_VARIANCE)
     return float(np.mean(needed_s))
 
 
-def _pose_after(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatArray:
+def _pose_after(slam: Slam, matched: MatchedObservation, variances: FloatArray) -> FloatArray:
     """Return the likeliest Â (4, 4) after a motion of ``variances`` (p,), if it is far from here.
 
     If it is not, the correction that follows, which is linear, finds it as well.
     """
-    A, found = slam.observer.A, _likeliest_pose(slam, sighting, variances)
+    A, found = slam.observer.A, _likeliest_pose(slam, matched, variances)
     turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
     shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
     reach_m = slam.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)
     return found if turn_rad > LARGE_TURN_RAD or shift_m > reach_m else A
 
 
-def _likeliest_pose(slam: Slam, sighting: Sighting, variances: FloatArray) -> FloatArray:
+def _likeliest_pose(slam: Slam, matched: MatchedObservation, variances: FloatArray) -> FloatArray:
     """Return Â (4, 4) by Gauss-Newton steps, as if landmarks and start were known exactly."""
     A, axes = slam.observer.A, slam.axes
-    landmarks = slam.observer.points[sighting.residuals.rows]
-    points = sighting.known.points
-    W = np.linalg.inv(sighting.covariances[sighting.rows >= 0][:, : axes.point, : axes.point])
+    landmarks = slam.observer.points[matched.residuals.rows]
+    points = matched.known.points
+    W = np.linalg.inv(matched.covariances[matched.rows >= 0][:, : axes.point, : axes.point])
     found = A
     if len(points) >= axes.point:
         weights = np.trace(W, axis1=1, axis2=2)

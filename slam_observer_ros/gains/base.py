@@ -68,7 +68,7 @@ class Residuals:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class FrameObservation:
     """All m landmarks of one observation, after the correction and with the new ones.
 
     Attributes
@@ -79,7 +79,7 @@ class Seen:
         (m,) which landmarks were seen.
     points : FloatArray
         (m, 3) where, metres, body frame.
-    sights : FloatArray
+    lines_of_sight : FloatArray
         (m, 3) from the sensor to where they should have been, or, where that is not sure, to where
         they were seen, metres, body frame.
     covariances : FloatArray or None
@@ -92,7 +92,7 @@ class Seen:
     stamp_ns: int
     rows: IntArray
     points: FloatArray
-    sights: FloatArray
+    lines_of_sight: FloatArray
     covariances: FloatArray | None
     dt_s: FloatArray
 
@@ -215,7 +215,7 @@ class GainDesign:
         """Whether the design looks back at what was seen."""
         return False
 
-    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
+    def look_back(self, observer: Observer, seen: FrameObservation, in_doubt: bool) -> None:
         """Note what was seen, and look back if it is time; only for those that do at all.
 
         The observer's reference is moved then. ``in_doubt`` asks for it now, as a landmark seems

@@ -16,7 +16,7 @@ import numpy as np
 from slam_observer_ros.gains.leaves import Leaves
 from slam_observer_ros.gains.prediction import initial_covariance, predict
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.matrices import condition, symmetric, transpose
+from slam_observer_ros.matrices import kalman_update, symmetric, transpose
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.types import FloatArray, IntArray
@@ -82,18 +82,18 @@ class Core:
 
     def step(self, H: FloatArray, gain_k: FloatArray, r: FloatArray) -> FloatArray:
         """Return −P⁺ Σ H_iᵀ k_i r_i (q, 1), for H (m, k, q), k_i (m, k, k) and r (m, k, 1)."""
-        pull = transpose(H) @ gain_k
-        information, gradient = np.sum(pull @ H, axis=0), np.sum(pull @ r, axis=0)
+        HtK = transpose(H) @ gain_k
+        information, gradient = np.sum(HtK @ H, axis=0), np.sum(HtK @ r, axis=0)
         eye = np.eye(len(self.P))
         x: FloatArray = -np.linalg.solve(eye + self.P @ information, self.P @ gradient)
         return x
 
-    def shrink(self, H: FloatArray, gain_k: FloatArray) -> None:
-        """Make P what m observations leave of it; in Joseph's form it stays positive."""
+    def measurement_update(self, H: FloatArray, gain_k: FloatArray) -> None:
+        """Update P by m observations with H (m, k, q) and k_i (m, k, k)."""
         root = transpose(np.linalg.cholesky(gain_k).astype(np.float64)) @ H
         W = np.asarray(np.linalg.qr(root.reshape(-1, len(self.P)), mode='r'))  # WᵀW = Σ Hᵀ k H
         WP = W @ self.P
-        condition(self.P, WP, WP @ W.T + np.eye(len(W)))
+        kalman_update(self.P, WP, WP @ W.T + np.eye(len(W)))
 
     def turn(self, x: FloatArray) -> None:
         """Let a motion of everything remain one where the step x (q,) has put landmarks."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.gains.base import InHindsight, Residuals, Seen
+from slam_observer_ros.gains.base import FrameObservation, InHindsight, Residuals
 from slam_observer_ros.gains.fixed_map import FixedMapGains
 from slam_observer_ros.gains.gauge import anchor
 from slam_observer_ros.gains.hindsight import Hindsight
@@ -164,7 +164,7 @@ class FullMapGains(RiccatiGains):
         is_constant = not (self._is_moving or self.calibration.drifts)
         return self._settings.hindsight_interval > 0 and is_constant
 
-    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
+    def look_back(self, observer: Observer, seen: FrameObservation, in_doubt: bool) -> None:
         """Note what was seen, and every so often linearise it anew."""
         # An empty frame tells nothing: the motions before and after it add up.
         if len(seen.rows):

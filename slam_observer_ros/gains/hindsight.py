@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.errors import SmoothingError
-from slam_observer_ros.gains.base import Seen
+from slam_observer_ros.gains.base import FrameObservation
 from slam_observer_ros.gains.history import History
 from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.geometry import se3
@@ -128,7 +128,7 @@ class Hindsight:
         self._turn_squared += turn_squared
         self._largest_turn = max(self._largest_turn, math.sqrt(turn_squared))
 
-    def look_back(self, observer: Observer, seen: Seen, in_doubt: bool) -> None:
+    def look_back(self, observer: Observer, seen: FrameObservation, in_doubt: bool) -> None:
         """Add a frame to the history; if it is time, or asked for, linearise the latest ones anew.
 
         The smoother's marginal becomes the filter's covariance, and its solution the observer's

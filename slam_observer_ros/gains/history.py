@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam_observer_ros.gains.base import Seen
+from slam_observer_ros.gains.base import FrameObservation
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.matrices import transpose
@@ -28,7 +28,7 @@ class _Frame:
         (4, 4) poses before and after the motion.
     noise, sensitivity, calibration : FloatArray
         As :meth:`History.move` is given them, of the whole motion.
-    seen : Seen
+    seen : FrameObservation
         The observation.
 
     """
@@ -38,7 +38,7 @@ class _Frame:
     noise: FloatArray
     sensitivity: FloatArray
     calibration: FloatArray
-    seen: Seen
+    seen: FrameObservation
 
 
 class History:
@@ -118,7 +118,7 @@ class History:
         self._sensitivity = self._sensitivity + sensitivity
         self._calibration = calibration
 
-    def see(self, seen: Seen, pose: FloatArray) -> None:
+    def see(self, seen: FrameObservation, pose: FloatArray) -> None:
         """Close a frame: the observation ``seen``, made at ``pose`` (4, 4)."""
         self.stamps_ns.append(seen.stamp_ns)
         self.poses.append(pose)
@@ -208,9 +208,11 @@ class History:
             shares=1.0 / repetition_factors(dt_s, self._observation_noise.error_time_s),
         )
 
-    def _covariances(self, seen: list[Seen]) -> FloatArray:
+    def _covariances(self, seen: list[FrameObservation]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""
-        covariances = self._observation_noise.at(np.concatenate([part.sights for part in seen]))
+        covariances = self._observation_noise.at(
+            np.concatenate([part.lines_of_sight for part in seen])
+        )
         stated = [part.covariances for part in seen if part.covariances is not None]
         if stated:
             is_stated = [part.covariances is not None for part in seen]

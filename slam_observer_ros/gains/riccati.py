@@ -29,7 +29,7 @@ from slam_observer_ros.gains.joint_covariance import JointCovariance
 from slam_observer_ros.gains.prediction import predict
 from slam_observer_ros.gains.robust import observation_weights
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.matrices import condition, mahalanobis, with_blocks
+from slam_observer_ros.matrices import kalman_update, mahalanobis, with_blocks
 from slam_observer_ros.motion.calibration import Calibration
 from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observation_noise import repetition_factors
@@ -109,7 +109,7 @@ class RiccatiGains(GainDesign):
             used.dt_s, self._settings.observation_error_time
         )
         S = with_blocks(CPC, noise / share[:, None, None])
-        K = condition(self._joint.P, CP, S)
+        K = kalman_update(self._joint.P, CP, S)
         return self._as_correction(K @ -r.ravel()), weights  # for (30) and (31)
 
     def distances(self, residuals: Residuals) -> FloatArray:

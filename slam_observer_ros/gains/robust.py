@@ -43,29 +43,31 @@ def observation_weights(
 
     """
     gate, weights = settings.rejection_distance, np.ones(len(r))
-    pull = _pull(r, predicted, noise)
+    S_inv_r = _solve_residuals(r, predicted, noise)
     # No residual is further out than all of them together are.
-    if np.vdot(r, pull) > gate**2:
-        passed, own = gated(r, predicted, noise, settings)
+    if np.vdot(r, S_inv_r) > gate**2:
+        passed, predicted_passed = gated(r, predicted, noise, settings)
         if not passed.all():
             weights[~passed] = 0.0
-            weights[passed] = observation_weights(r[passed], own, noise[passed], settings)
+            weights[passed] = observation_weights(
+                r[passed], predicted_passed, noise[passed], settings
+            )
             return weights
-    weights = huber_weights(pull, noise, weights, settings.huber_threshold)
+    weights = huber_weights(S_inv_r, noise, weights, settings.huber_threshold)
     for _ in range(REWEIGHTINGS - 1):
         if weights.min(initial=1.0) == 1.0:
             break
-        pull = _pull(r, predicted, noise / weights[:, None, None])
-        weights = huber_weights(pull, noise, weights, settings.huber_threshold)
+        S_inv_r = _solve_residuals(r, predicted, noise / weights[:, None, None])
+        weights = huber_weights(S_inv_r, noise, weights, settings.huber_threshold)
     return weights
 
 
-def are_far(own: FloatArray, settings: Settings) -> BoolArray:
+def are_far(sensor_distances: FloatArray, settings: Settings) -> BoolArray:
     """Return which residuals are too large for a state that was known; see SUSPICION.
 
-    ``own`` (m,) are their distances by the sensor's noise alone.
+    ``sensor_distances`` (m,) are theirs by the sensor's noise alone.
     """
-    return own > SUSPICION * settings.rejection_distance
+    return sensor_distances > SUSPICION * settings.rejection_distance
 
 
 def far_from_the_others(
@@ -75,11 +77,12 @@ def far_from_the_others(
 
     These leave ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i of the residual r_i. Parameters as above.
     """
-    passed, own = gated(r, predicted, noise, settings)
-    information: FloatArray = np.linalg.inv(with_blocks(own, noise[passed])).astype(np.float64)
-    pull = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
+    passed, predicted_passed = gated(r, predicted, noise, settings)
+    S = with_blocks(predicted_passed, noise[passed])
+    information: FloatArray = np.linalg.inv(S).astype(np.float64)
+    S_inv_r = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
     blocks = diagonal_blocks(information, r.shape[1])
-    left = np.asarray(np.linalg.solve(blocks, pull)[:, :, 0])
+    left = np.asarray(np.linalg.solve(blocks, S_inv_r)[:, :, 0])
     passed[passed] = are_far(mahalanobis(left, noise[passed]), settings)
     return passed
 
@@ -102,15 +105,15 @@ def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatA
 
 
 def huber_weights(
-    pull: FloatArray, noise: FloatArray, weights: FloatArray, threshold: float
+    S_inv_r: FloatArray, noise: FloatArray, weights: FloatArray, threshold: float
 ) -> FloatArray:
     """Return Huber's weights (m,) of what is left of residuals after a correction.
 
     Parameters
     ----------
-    pull : FloatArray
+    S_inv_r : FloatArray
         (m, k) S⁻¹ r, with R = Σ/w in S. What is left is R S⁻¹ r, by the sensor's own Σ at the
-        distance √(pullᵀ Σ pull)/w from zero.
+        distance √((S⁻¹ r)ᵀ Σ S⁻¹ r)/w from zero.
     noise : FloatArray
         (m, k, k) covariances Σ of the observations, m².
     weights : FloatArray
@@ -120,11 +123,11 @@ def huber_weights(
 
     """
     if threshold == 0.0:
-        return np.ones(len(pull))
-    left = np.sqrt(np.einsum('ij,ijk,ik->i', pull, noise, pull)) / weights
+        return np.ones(len(S_inv_r))
+    left = np.sqrt(np.einsum('ij,ijk,ik->i', S_inv_r, noise, S_inv_r)) / weights
     return np.asarray(threshold / np.maximum(left, threshold))
 
 
-def _pull(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
+def _solve_residuals(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
     """Return S⁻¹ r (m, k)."""
     return solve(with_blocks(predicted, noise), r.ravel()).reshape(r.shape)

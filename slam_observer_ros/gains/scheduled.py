@@ -26,9 +26,18 @@ of an exact filter, and not published.
 
 An observation costs O(m) for the m landmarks seen. The n known ones follow when they are seen
 again (:mod:`slam_observer_ros.gains.leaves`), which makes it O(m log n) in the mean.
+
+To update a part of the state alone, and to compose what the rest has to follow later, is the idea
+of the compressed EKF (J. Guivant and E. Nebot, *Optimization of the simultaneous localization and
+map-building algorithm for real-time implementation*, 2001) and of postponement (J. Knight, A.
+Davison and I. Reid, *Towards constant time SLAM using postponement*, 2001). Both keep the
+covariance of everything, O(n²), and lose nothing; here landmarks have nothing in common but the
+core, so that each follows by itself.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -50,7 +59,33 @@ from slam_observer_ros.motion.motion import Motion
 from slam_observer_ros.observation_noise import repetition_factors
 from slam_observer_ros.observer import Correction, Observer
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """What m points ask for, a of which have passed the gate; see the module's text.
+
+    Attributes
+    ----------
+    Delta : FloatArray
+        (q, 1) step Δ of the core.
+    gain_k : FloatArray
+        (m, k, k) gains k_i, zero where the gate rejects a point.
+    k_left : FloatArray
+        (m, k, 1) k_i (r_i + H_i Δ), with what the step leaves of the residual.
+    noise : FloatArray
+        (a, k, k) R_i, over the weight and for errors that last.
+    weights : FloatArray
+        (m,) Huber's weights, zero where the gate rejects a point.
+
+    """
+
+    Delta: FloatArray
+    gain_k: FloatArray
+    k_left: FloatArray
+    noise: FloatArray
+    weights: FloatArray
 
 
 class ScheduledGains(GainDesign):
@@ -176,34 +211,45 @@ class ScheduledGains(GainDesign):
 
     def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
         """Return the correction and the weight that each point was given."""
-        rows, r = residuals.rows, residuals.r[:, : self._axes.point, None]
+        rows = residuals.rows
         F, N, _ = self._leaves.now(rows)
-        R, threshold = self._noise(residuals.covariances), self._settings.huber_threshold
-        passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
         H = self._output_matrix(residuals.e + residuals.a - residuals.r) - F
+        passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
+        step = self._reweighted_step(residuals, H, N, passed)
+        Delta, gain_k = step.Delta, step.gain_k
+        delta = self._axes.full_points((F @ Delta + N @ step.k_left).ravel())
+        F = F + N @ gain_k @ H
+        F[:, :, : self._axes.p] += self._axes.turn_matrix(delta)
+        N[passed] = symmetric(N[passed] @ gain_k[passed] @ step.noise)  # N − N k N, but positive
+        self._core.measurement_update(H[passed], gain_k[passed])
+        self._leaves.shift(Delta[:, 0])
+        self._leaves.update(rows, F, N)
+        self._core.turn(Delta[:, 0])
+        self._core.admit(rows[passed])
+        return self._as_correction(rows, Delta[:, 0], delta, residuals.a), step.weights
+
+    def _reweighted_step(
+        self, residuals: Residuals, H: FloatArray, N: FloatArray, passed: BoolArray
+    ) -> _Step:
+        """Return the step Δ that the points which passed the gate ask for, by Huber's weights."""
+        r, R = residuals.r[:, : self._axes.point, None], self._noise(residuals.covariances)
+        repeated = repetition_factors(
+            residuals.dt_s[passed], self._settings.observation_error_time
+        )
         weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
-        error_time_s = self._settings.observation_error_time
-        repeated = repetition_factors(residuals.dt_s[passed], error_time_s)
         for remaining in reversed(range(1 + REWEIGHTINGS)):
             shares = weights[passed] / repeated
             noise = R[passed] / shares[:, None, None]
             gain_k[passed] = np.linalg.inv(N[passed] + noise)
-            x = self._core.step(H, gain_k, r)
-            pull = gain_k @ (r + H @ x)
-            found = huber_weights(pull[passed, :, 0], R[passed], shares, threshold)
+            Delta = self._core.step(H, gain_k, r)
+            k_left = gain_k @ (r + H @ Delta)
+            found = huber_weights(
+                k_left[passed, :, 0], R[passed], shares, self._settings.huber_threshold
+            )
             if not remaining or (found == weights[passed]).all():
                 break
             weights[passed] = found
-        Delta, delta = x[:, 0], self._axes.full_points((F @ x + N @ pull).ravel())
-        F = F + N @ gain_k @ H
-        F[:, :, : self._axes.p] += self._axes.turn_matrix(delta)
-        N[passed] = symmetric(N[passed] @ gain_k[passed] @ noise)  # = N − N k N, but positive
-        self._core.shrink(H[passed], gain_k[passed])
-        self._leaves.shift(Delta)
-        self._leaves.update(rows, F, N)
-        self._core.turn(Delta)
-        self._core.admit(rows[passed])
-        return self._as_correction(rows, Delta, delta, residuals.a), weights
+        return _Step(Delta, gain_k, k_left, noise, weights)
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""

@@ -22,8 +22,8 @@ from slam_observer_ros.matrices import (
     transpose,
     with_variances_above,
 )
-from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import Outcome
 from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 ROUNDING = 1e-14

@@ -1,4 +1,4 @@
-"""The states, in a frame of their own or in that of a map that was loaded."""
+"""The hypotheses, in a frame of their own or in that of a map that was loaded."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from slam_observer_ros.maps.localisation import (
 )
 from slam_observer_ros.matrices import with_variances_above
 from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.sighting import Outcome
 from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import Outcome
 from slam_observer_ros.types import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ MOVING_SPEED = 0.1
 
 
 class MapFrame:
-    """States, and where they are in a loaded map, as far as that is known.
+    """Hypotheses, and where they are in a loaded map, as far as that is known.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ class MapFrame:
     ----------
     settings : Settings
         The settings in force.
-    states : Hypotheses
-        The states.
+    hypotheses : Hypotheses
+        The hypotheses.
     loaded : LandmarkMap or None
         The map that was loaded.
     is_localised : bool
-        Whether the states are in their final frame: always, unless a map was loaded.
+        Whether the hypotheses are in their final frame: always, unless a map was loaded.
 
     """
 
@@ -59,7 +59,7 @@ class MapFrame:
         self.settings = settings
         self.loaded: LandmarkMap | None = None
         self.is_localised = True
-        self.states = Hypotheses(Slam(settings, np.eye(4)))
+        self.hypotheses = Hypotheses(Slam(settings, np.eye(4)))
         self._counts: Counter[str] = Counter()
         self._trial: PoseTrial | None = None
         self._start_pose: FloatArray | None = None
@@ -75,7 +75,7 @@ class MapFrame:
     @property
     def slam(self) -> Slam:
         """The most likely state."""
-        return self.states.best
+        return self.hypotheses.best
 
     @property
     def counts(self) -> Counter[str]:
@@ -103,7 +103,7 @@ class MapFrame:
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change, from now on."""
         self.settings = settings
-        self.states.change_settings(settings)
+        self.hypotheses.change_settings(settings)
 
     def start_run(self, pose: FloatArray | None) -> None:
         """Start a run at ``pose`` (4, 4), exactly; by default where the settings have it start."""
@@ -120,7 +120,7 @@ class MapFrame:
 
     def restart_time(self) -> None:
         """Go on from here at any other time."""
-        self.states.restart_time()
+        self.hypotheses.restart_time()
         self._is_placed = True
 
     def _start_where_settings_say(self) -> None:
@@ -141,7 +141,7 @@ class MapFrame:
         """
         self._counts += self.slam.counts
         slam = Slam(self.settings, np.eye(4) if pose is None else self._allowed(pose))
-        self.states = Hypotheses(slam)
+        self.hypotheses = Hypotheses(slam)
         self._search = PlaceSearch()
         self.is_localised = self.loaded is None or pose is not None
         self._trial = None
@@ -183,17 +183,17 @@ class MapFrame:
         """Move the robot; if the place in a loaded map was not known, it is now."""
         self._is_placed = True
         if self.is_localised:
-            self.states.decide().set_pose(self._allowed(pose), covariance)
+            self.hypotheses.prune_to_best().set_pose(self._allowed(pose), covariance)
             self._trial = None if self.loaded is None else PoseTrial(self.loaded)
         else:
             self._start(pose, covariance)
 
     def observe(self, event: ObservationEvent) -> Outcome:
-        """Use an observation made at the states' instant; return what the best one makes of it.
+        """Use an observation made at the hypotheses' instant; return what the best makes of it.
 
         The place in a loaded map is then looked for if it is not known, or not any more.
         """
-        outcome = self.states.observe(event)
+        outcome = self.hypotheses.observe(event)
         self._find_place(outcome)
         return outcome
 
@@ -217,9 +217,9 @@ class MapFrame:
         self._start(None)
 
     def _enter(self) -> None:
-        """Move the states into the frame of the loaded map, if the landmarks seen suffice."""
+        """Move the best hypothesis into the frame of the loaded map, if the landmarks suffice."""
         if self.loaded is not None and enter_map(self.slam, self.loaded):
-            self.states.decide()
+            self.hypotheses.prune_to_best()
             self.is_localised = True
             logger.info('Found the place in the map of %d landmarks.', len(self.loaded.ids))
 

@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from slam_observer_ros.types import BoolArray, FloatArray
 
-MARGIN = 0.01
+HULL_MARGIN = 0.01
 """How far outside, as a share of what it measures across, a point may be and still be inside.
 
 Points are noisy, and without it each exact one at the sensor's full range would be a corner.
@@ -57,7 +57,7 @@ class FieldOfView:
             self.corners = np.concatenate([np.zeros((1, k)), corners[1:][-2 * k :]])
             return
         self.corners, self._faces = corners[hull.vertices], hull.equations
-        self._margin_m = MARGIN * float(np.ptp(self.corners, axis=0).max())
+        self._margin_m = HULL_MARGIN * float(np.ptp(self.corners, axis=0).max())
 
     def contains(self, points: FloatArray) -> BoolArray:
         """Return which points (m, 3) lie where the sensor sees, metres, body frame."""

@@ -9,7 +9,6 @@ import numpy as np
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.gains import make_gains
-from slam_observer_ros.gains.base import Residuals
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.motion.integration import integrate
@@ -22,13 +21,15 @@ from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam import covariances
 from slam_observer_ros.slam.landmark_index import LandmarkIndex
 from slam_observer_ros.slam.landmark_table import LandmarkTable
-from slam_observer_ros.slam.sighting import is_contradiction, Outcome, Outlook, Sighting
+from slam_observer_ros.slam.measurement import MatchedObservation, MeasurementModel
 from slam_observer_ros.slam.surroundings import Surroundings
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.types import FloatArray, IntArray
 
 
 class Slam:
-    """Pose and map as of one instant, with the life cycle of the landmarks.
+    """Pose and map as of one instant.
+
+    What an observation makes of it is in :mod:`slam_observer_ros.slam.update`.
 
     Parameters
     ----------
@@ -53,8 +54,12 @@ class Slam:
         Noise of velocities.
     observation_noise : ObservationNoise
         Noise of observed points.
+    measurement_model : MeasurementModel
+        Where landmarks should be seen.
     index : LandmarkIndex
         For landmarks near a point.
+    surroundings : Surroundings
+        What is in view of a sensor that gives no ids.
     counts : Counter
         How many landmarks were rejected, have moved, were forgotten and so on.
     rejected_in_a_row : int
@@ -76,11 +81,13 @@ class Slam:
         self.was_contradicted = False
         self.motion_noise = MotionNoise(settings)
         self.observation_noise = ObservationNoise(settings)
-        self._outlook = Outlook(self.observer, self.landmarks, self.observation_noise, settings)
+        self.measurement_model = MeasurementModel(
+            self.observer, self.landmarks, self.observation_noise, settings
+        )
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
         self.index = LandmarkIndex()
-        self._surroundings = Surroundings(self.observer, self.landmarks, self.axes.point)
+        self.surroundings = Surroundings(self.observer, self.landmarks, self.axes.point)
 
     @property
     def is_fixed(self) -> bool:
@@ -185,90 +192,27 @@ class Slam:
             self._end_velocity,
         )
 
-    def covariances_of(self, event: ObservationEvent) -> FloatArray:
-        """Return what its points would be taken to be off by: (m, 3, 3), body frame, m².
-
-        It moves landmarks whose gains had put that off.
-        """
-        rows = self.landmarks.rows_of(event.ids)
-        self.gains.recall(self.observer, rows)
-        return self._outlook.covariances(event, rows)
-
     @property
     def landmark_velocity_error(self) -> float:
         """How fast landmarks may move, m/s, where it is estimated; else 0, as sensors tell it."""
         is_ignored = 'landmark_velocity_error' in self.gains.ignores
         return 0.0 if self.is_fixed or is_ignored else self.settings.landmark_velocity_error
 
-    def velocities_of(self, event: ObservationEvent, A: FloatArray) -> FloatArray:
-        """Return how its landmarks (m, 3) move, m/s, along the axes of the body at Â = ``A``.
-
-        As estimated, or else as the observation says, which is made there; zero if neither is.
-        """
-        velocities = np.zeros_like(event.points)
-        if self.is_fixed:
-            return velocities
-        if not self.landmark_velocity_error:
-            return velocities if event.velocities is None else event.velocities
-        rows = self.landmarks.rows_of(event.ids)
-        velocities[rows >= 0] = self.observer.u[rows[rows >= 0]]
-        return se3.rotate(se3.inverse(A), velocities)
-
-    def look(self, event: ObservationEvent) -> Sighting:
-        """Return what an observation made at the state's instant tells, before it is used.
+    def match(self, event: ObservationEvent) -> MatchedObservation:
+        """Match an observation made at the state's instant with landmarks, before it is used.
 
         It moves landmarks whose gains had put that off.
         """
         m, rows = len(event.ids), self.landmarks.rows_of(event.ids)
         if not self.is_mapping:
-            event, rows = self._mapped(event)
+            event, rows = self.mapped(event)
         self.gains.recall(self.observer, rows)
-        return self._outlook.sighting(event, rows, m - len(event.ids))
+        return self.measurement_model.match(event, rows, m - len(event.ids))
 
-    def _mapped(self, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
+    def mapped(self, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
         """Return the part of an observation that is of known landmarks, and their rows."""
         rows = self.landmarks.rows_of(event.ids)
         return event.select(rows >= 0), rows[rows >= 0]
-
-    def observe(self, sighting: Sighting) -> Outcome:
-        """Use what :meth:`look` has returned for an observation; return what was made of it."""
-        self.counts['unmapped_landmark'] += sighting.left_out
-        event, rows, known = sighting.event, sighting.rows, sighting.known
-        forgotten = self._in_the_way(sighting)
-        if len(forgotten):
-            # A history without them would lose what they have told of the pose.
-            self.gains.restart(self.observer, 'landmarks had to make room (max_landmarks)')
-        rejected = self._correct(known, sighting.residuals)
-        if len(known.ids) < len(rows):
-            is_new = rows < 0
-            self._forget(forgotten, 'forgotten_landmark')
-            self._initialise(event.select(is_new), sighting.covariances[is_new])
-            event, rows = self._mapped(event)
-        moved_ids = self._look_back(event, rows)
-        self._note_velocities(event, rows)
-        return Outcome(known.ids, sighting.residuals.r, rejected, moved_ids)
-
-    def disbelieve(self, event: ObservationEvent) -> None:
-        """Count points as rejected although the gate lets them pass.
-
-        Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
-        """
-        event, rows = self._mapped(event)  # one may have made room
-        self.landmarks.reject(rows, *self._outlook.places(event))
-        in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
-        if in_doubt.any():
-            self.remove(rows[in_doubt])
-
-    def rejected_before(self, sighting: Sighting) -> tuple[BoolArray, FloatArray]:
-        """Return which known landmarks (m,) in it were rejected before where they are seen now.
-
-        And how far all of them (m, 3) are from where they were rejected last, metres, reference
-        frame.
-        """
-        rows = sighting.residuals.rows
-        points, tolerances_m = self._outlook.places(sighting.known)
-        again = self.landmarks.are_rejected_again(rows, points, tolerances_m)
-        return again, points - self.landmarks.rejected_last[rows]
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; see :meth:`.GainDesign.smooth`."""
@@ -287,106 +231,3 @@ class Slam:
         self.observer.remove_landmarks(rows)
         self.gains.remove_landmarks(rows)
         self.landmarks.remove(rows)
-
-    def note_surroundings(self, event: ObservationEvent, some_have_ids: bool) -> float:
-        """Count what was in view of an observation of landmarks without an id.
-
-        Return −2 ln of the probability that what was not seen of it was not.
-
-        Those that were seen too seldom while they were in view are forgotten; out of view none
-        is: it may be the only tie to what was mapped before. Parameters are those of
-        :meth:`.Surroundings.note`.
-        """
-        cost, is_strange = self._surroundings.note(event, some_have_ids)
-        self.counts['strange_place'] += is_strange
-        unsupported = self.landmarks.unsupported(self.settings.min_support)
-        self._forget(unsupported, 'unsupported_landmark')
-        return cost
-
-    def _forget(self, rows: IntArray, why: str) -> None:
-        if len(rows):
-            self.remove(rows)
-            self.counts[why] += len(rows)
-
-    def _correct(self, event: ObservationEvent, residuals: Residuals) -> BoolArray:
-        """Correct the state by the landmarks of ``event``; return which (m,) were rejected."""
-        rows = residuals.rows
-        if not len(rows):
-            return np.empty(0, dtype=np.bool_)
-        correction, weights = self.gains.correct(residuals)
-        self.observer.correct(correction)
-        self.gains.settle(self.observer)
-        rejected: BoolArray = weights == 0.0
-        count = int(np.count_nonzero(rejected))
-        self.rejected_in_a_row = self.rejected_in_a_row + 1 if count == len(rows) else 0
-        self.was_contradicted = is_contradiction(rejected)
-        self.landmarks.accept(rows[~rejected], event.stamp_ns)
-        if count:
-            places = self._outlook.places(event.select(rejected))
-            self.landmarks.reject(rows[rejected], *places)
-            self.counts['rejected_landmark'] += count
-        return rejected
-
-    def _note_velocities(self, event: ObservationEvent, rows: IntArray) -> None:
-        """Let landmarks move as the sensor says; by one that says nothing they are static."""
-        velocities = event.velocities
-        if velocities is None and self.observer.have_moved:
-            velocities = np.zeros((len(rows), 3))
-        if velocities is None or self.landmark_velocity_error or self.is_fixed:
-            return
-        used = self.landmarks.rejections[rows] == 0
-        self.observer.set_landmark_velocities(rows[used], velocities[used])
-
-    def _look_back(self, event: ObservationEvent, rows: IntArray) -> IntArray:
-        """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
-
-        Now that the state is corrected, it is known better than before from where they were seen.
-        Return the ids of those that have moved.
-        """
-        in_doubt = self.landmarks.in_doubt(rows, self.settings.max_rejections) & self.is_mapping
-        some_are = bool(in_doubt.any())
-        if self.gains.looks_back:
-            self.gains.look_back(self.observer, self._outlook.seen(event, rows), some_are)
-        if some_are:
-            return self._relocate(event.select(in_doubt), rows[in_doubt])
-        return np.empty(0, dtype=np.int64)
-
-    def _relocate(self, event: ObservationEvent, rows: IntArray) -> IntArray:
-        """Start landmarks in doubt anew that are still far from where they were expected.
-
-        Return the ids of those that were seen often enough to say that they have moved.
-        """
-        residuals = self._outlook.residuals(event, rows, self.observation_noise.covariances(event))
-        far = self.gains.distances(residuals) > self.settings.rejection_distance
-        moved = far & (self.landmarks.counts[rows] >= self.settings.confirmations)
-        self.counts['moved_landmark'] += int(np.sum(moved))
-        if far.any():
-            self.observer.relocate_landmarks(rows[far], event.points[far])
-            y_ref = self.observer.y_ref[rows[far]]
-            self.gains.relocate_landmarks(rows[far], y_ref, residuals.covariances[far])
-            self.landmarks.restart(rows[far], event.stamp_ns)
-        return event.ids[moved]
-
-    def _in_the_way(self, sighting: Sighting) -> IntArray:
-        """Return which landmarks out of view make room for the new ones of ``sighting``.
-
-        The least often seen go first.
-        """
-        limit, new = self.settings.max_landmarks, len(sighting.rows) - len(sighting.residuals.rows)
-        excess = len(self.landmarks) + new - limit
-        if limit == 0 or new == 0 or excess <= 0:
-            return np.empty(0, dtype=np.int64)
-        unseen = self.landmarks.unseen_since(sighting.event.stamp_ns)
-        return np.sort(unseen[~np.isin(unseen, sighting.rows)][:excess])
-
-    def _initialise(self, event: ObservationEvent, noise: FloatArray) -> None:
-        """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
-        limit, new = self.settings.max_landmarks, len(event.ids)
-        m = min(new, max(limit - len(self.landmarks), 0)) if limit else new
-        self.counts['unmapped_landmark'] += new - m
-        if not m:
-            return
-        event = event.select(np.arange(new) < m)
-        self.observer.add_landmarks(event.points)
-        self.gains.add_landmarks(self.observer.y_ref[-m:], self.observer.turned(noise[:m]))
-        self.landmarks.add(event.ids, event.stamp_ns)

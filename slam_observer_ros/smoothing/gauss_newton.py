@@ -193,12 +193,12 @@ class Smoother:
     def _linearise(self, solution: Solution) -> Equations:
         c, k, frames = len(solution.calibration), self._axes.point, self._frames
         S, d, b = len(solution.poses), self._axes.p, c + k * len(solution.points)
-        H, pull = self._observations(solution)
+        H, gradient = self._observations(solution)
         poses, landmarks, n = frames.frames + 1, frames.landmarks, len(solution.points)
         columns = landmark_columns(np.arange(n), c, k)
         corner, border_gradient = np.zeros((b, b)), np.zeros(b)
         corner[columns[:, :, None], columns[:, None]] = sum_by(landmarks, n, H[:, d:, d:])
-        border_gradient[columns] = sum_by(landmarks, n, pull[:, d:])
+        border_gradient[columns] = sum_by(landmarks, n, gradient[:, d:])
         equations = Equations(
             diagonal=sum_by(poses, S, H[:, :d, :d]),
             above=np.zeros((S - 1, d, d)),
@@ -208,7 +208,7 @@ class Smoother:
             seen=H[:, :d, d:],
             first=np.zeros((d, b)),
             corner=corner,
-            gradient=sum_by(poses, S, pull[:, :d]),
+            gradient=sum_by(poses, S, gradient[:, :d]),
             border_gradient=border_gradient,
         )
         self._add_prior(equations, solution)
@@ -216,7 +216,7 @@ class Smoother:
         return equations
 
     def _add_prior(self, equations: Equations, solution: Solution) -> None:
-        information, pull = self._prior.normal_equations(
+        information, gradient = self._prior.normal_equations(
             self._axes,
             self._prior_information,
             solution.poses[0],
@@ -224,12 +224,12 @@ class Smoother:
             solution.points,
         )
         d = self._axes.p
-        known = len(pull) - d
+        known = len(gradient) - d
         equations.diagonal[0] += information[:d, :d]
         equations.first[:, :known] += information[:d, d:]
         equations.corner[:known, :known] += information[d:, d:]
-        equations.gradient[0] += pull[:d]
-        equations.border_gradient[:known] += pull[d:]
+        equations.gradient[0] += gradient[:d]
+        equations.border_gradient[:known] += gradient[d:]
 
     def _add_motions(self, equations: Equations, solution: Solution) -> None:
         """Add e_s = log((M_s exp(F_s (c − c_s)))⁻¹ Â_{s−1}⁻¹ Â_s) of each motion M_s."""
@@ -248,16 +248,16 @@ class Smoother:
             J_off = -J_to @ self._estimated(se3.adjoint(back @ motions) @ se3.left_jacobian(-eta))
             F = J_off @ F
         J = np.concatenate([J_from, J_to, F], axis=2)
-        H, pull = _normal(J, self._motion_information, error[:, pose])
+        H, gradient = _normal(J, self._motion_information, error[:, pose])
         equations.diagonal[:-1] += H[:, :d, :d]
         equations.diagonal[1:] += H[:, d : 2 * d, d : 2 * d]
         equations.above[:] += H[:, :d, d : 2 * d]
         equations.shared[:-1] += H[:, :d, 2 * d :]
         equations.shared[1:] += H[:, d : 2 * d, 2 * d :]
         equations.corner[:c, :c] += np.sum(H[:, 2 * d :, 2 * d :], axis=0)
-        equations.gradient[:-1] += pull[:, :d]
-        equations.gradient[1:] += pull[:, d : 2 * d]
-        equations.border_gradient[:c] += np.sum(pull[:, 2 * d :], axis=0)
+        equations.gradient[:-1] += gradient[:, :d]
+        equations.gradient[1:] += gradient[:, d : 2 * d]
+        equations.border_gradient[:c] += np.sum(gradient[:, 2 * d :], axis=0)
 
     def _estimated(self, matrices: FloatArray) -> FloatArray:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""

@@ -1,4 +1,4 @@
-"""What an observation tells a state: residuals of known landmarks, and how far to believe them."""
+"""Matching of an observation with a state: residuals of known landmarks, and their noise."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.gains.base import Residuals, Seen
+from slam_observer_ros.gains.base import FrameObservation, Residuals
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observation_noise import ObservationNoise, RESOLUTION_M
 from slam_observer_ros.observer import Observer
 from slam_observer_ros.settings import Settings
 from slam_observer_ros.slam.landmark_table import LandmarkTable
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.types import FloatArray, IntArray
 
 SAME_PLACE = 4.0
 """Rejections within this many standard deviations of each other are at one place."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """What an observation tells a state.
+class MatchedObservation:
+    """An observation, with the landmarks of a state that its points are of.
 
     Attributes
     ----------
@@ -48,36 +48,8 @@ class Sighting:
     left_out: int
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What a state made of an observation.
-
-    Attributes
-    ----------
-    ids : IntArray
-        (m,) ids of the landmarks seen that were known before.
-    residuals : FloatArray
-        (m, 3) their residuals before the correction, metres, reference frame.
-    rejected : BoolArray
-        (m,) which of them were too far off to be used.
-    moved_ids : IntArray
-        Landmarks that it showed to have moved.
-
-    """
-
-    ids: IntArray
-    residuals: FloatArray
-    rejected: BoolArray
-    moved_ids: IntArray
-
-
-def is_contradiction(rejected: BoolArray) -> bool:
-    """Return whether most of the known landmarks (m,) seen are rejected: the pose may be wrong."""
-    return bool(2 * np.count_nonzero(rejected) > len(rejected))
-
-
-class Outlook:
-    """Where a state expects its landmarks, and what comes of comparing that with what is seen.
+class MeasurementModel:
+    """Predicts where landmarks should be seen, and forms the residuals.
 
     Rows are those of the landmarks, −1 where one is new.
 
@@ -102,12 +74,12 @@ class Outlook:
         self._observer, self._landmarks, self._noise = observer, landmarks, noise
         self._settings = settings
 
-    def sighting(self, event: ObservationEvent, rows: IntArray, left_out: int) -> Sighting:
-        """Return what the points of ``event`` tell, of landmarks ``rows`` (m,)."""
+    def match(self, event: ObservationEvent, rows: IntArray, left_out: int) -> MatchedObservation:
+        """Compare the points of ``event`` with where landmarks ``rows`` (m,) should be seen."""
         is_known, covariances = rows >= 0, self.covariances(event, rows)
         known = event.select(is_known)
         residuals = self.residuals(known, rows[is_known], covariances[is_known])
-        return Sighting(event, rows, covariances, known, residuals, left_out)
+        return MatchedObservation(event, rows, covariances, known, residuals, left_out)
 
     def residuals(
         self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
@@ -124,12 +96,13 @@ class Outlook:
             dt_s=self._landmarks.unseen_s(rows, event.stamp_ns),
         )
 
-    def seen(self, event: ObservationEvent, rows: IntArray) -> Seen:
+    def frame_observation(self, event: ObservationEvent, rows: IntArray) -> FrameObservation:
         """Return what there is to look back at later, after the correction."""
-        sights = self._sights(event, rows)
-        stated = None if event.covariances is None else self._noise.covariances(event, sights)
+        lines_of_sight = self._lines_of_sight(event, rows)
+        is_stated = event.covariances is not None
+        stated = self._noise.covariances(event, lines_of_sight) if is_stated else None
         dt_s = self._landmarks.unseen_s(rows, event.stamp_ns)
-        return Seen(event.stamp_ns, rows, event.points, sights, stated, dt_s)
+        return FrameObservation(event.stamp_ns, rows, event.points, lines_of_sight, stated, dt_s)
 
     def places(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
         """Return where points seem to be (m, 3), and within what they are at one place, metres.
@@ -148,12 +121,12 @@ class Outlook:
         drawn towards the robot. In which direction, the sensor knows better than a state does
         whose heading is yet to be corrected.
         """
-        measured, expected = event.sights, self._sights(event, rows)
+        measured, expected = event.lines_of_sight, self._lines_of_sight(event, rows)
         measured_m = np.maximum(np.linalg.norm(measured, axis=1), RESOLUTION_M)
         shares = np.linalg.norm(expected, axis=1) / measured_m
         return self._noise.covariances(event, shares[:, None] * measured)
 
-    def _sights(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    def _lines_of_sight(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
         """Return where points should be (m, 3), from the sensor, metres, body frame.
 
         Of a landmark that is new, that is in doubt, or that was seen so seldom that it may itself
@@ -161,7 +134,7 @@ class Outlook:
         """
         landmarks = self._landmarks
         if not len(landmarks):
-            return event.sights
+            return event.lines_of_sight
         is_confirmed = landmarks.counts[rows] >= self._settings.confirmations
         in_doubt = landmarks.in_doubt(rows, self._settings.max_rejections)
         is_sure = (rows >= 0) & is_confirmed & ~in_doubt

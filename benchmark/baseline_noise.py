@@ -11,7 +11,7 @@ from slam_observer_ros.types import FloatArray
 from slam_observer_ros.units import to_s
 
 
-class SightingNoise:
+class BaselineNoise:
     """The observer's noise of points, and by how much less those tell whose errors last.
 
     Parameters

@@ -1,0 +1,83 @@
+"""What it costs to reject what is seen, to believe it, or to take the robot for slipped.
+
+All costs are −2 ln of a likelihood, as in :mod:`.joint_compatibility`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from slam_observer_ros.association.joint_compatibility import (
+    huber_loss,
+    joint_cost,
+    unpaired_cost,
+)
+from slam_observer_ros.gains.base import Residuals
+from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.robust import gated
+from slam_observer_ros.matrices import mahalanobis, with_blocks
+from slam_observer_ros.slam.map_management import rejected_before
+from slam_observer_ros.slam.measurement import MatchedObservation
+from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.types import BoolArray, FloatArray
+
+SLIP_COST = 20.0
+"""What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
+
+SAME_CAUSE_COST = 3.0
+"""What it costs to reject another point for the reason for which one was rejected already."""
+
+MAX_OF_ONE_CAUSE = 3
+"""Points that cost this, at most: one garbled message is one, however much it tells."""
+
+
+def outlier_cost(slam: Slam) -> float:
+    """Return what it costs that a point is of no landmark that is known."""
+    return unpaired_cost(slam.settings.rejection_distance)
+
+
+def pairing_cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:
+    """Return what it costs to take some of m points for the landmarks whose ids they have."""
+    r, noise = residuals.on(slam.axes)
+    passed, predicted = gated(r, gains.predicted(residuals), noise, slam.settings)
+    paired_cost = joint_cost(r[passed], with_blocks(predicted, noise[passed]), noise[passed])
+    return paired_cost + (m - int(np.sum(passed))) * outlier_cost(slam)
+
+
+def rejection_cost(
+    slam: Slam, matched: MatchedObservation, rejected: BoolArray
+) -> tuple[float, bool]:
+    """Return what it costs to reject landmarks, and whether there is a new cause for it.
+
+    At first one cause is enough: the observation is garbled. The next time it is not, and each
+    landmark has moved for a cause of its own. From then on there is nothing new in it but how
+    well it is seen where it was: landmarks that have moved must not throw the pose, however often
+    they are seen.
+    """
+    again, staying = cost_of_staying(slam, matched)
+    again &= rejected
+    is_second = again & (slam.landmarks.rejections[matched.residuals.rows] == 1)
+    new = int(np.sum(rejected & ~again))
+    causes = new if slam.was_contradicted else min(new, 1)
+    same_cause = min(new - causes, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
+    # One of these may be of a garbled message once more: the one that is surest to have stayed.
+    moved = np.sort(staying[is_second])[1:]
+    causes += len(moved)
+    stayed = float(staying[again].sum() - moved.sum())
+    return causes * outlier_cost(slam) + same_cause + stayed, causes > 0
+
+
+def cost_of_staying(slam: Slam, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
+    """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
+
+    Where they were rejected last is known as well as the sensor tells: compared with the first
+    place, one that goes on moving would pay for one and the same shift each time. No landmark
+    costs more than another outlier.
+    """
+    k, known = slam.axes.point, matched.known
+    noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(known))
+    again, shifts = rejected_before(slam, matched)
+    costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
+    return again, np.minimum(costs, outlier_cost(slam))

@@ -1,0 +1,273 @@
+"""What an observation may mean: points without an id, and points whose id may be wrong.
+
+After a long blind stretch the gate is wide, and a wrong id passes it. Taken for the landmark that
+it names, such a point would close a loop where there is none and throw the pose. So there are two
+interpretations, that it is what its id says and that it is an outlier, and later observations
+decide. It may also be the landmark that is wrong, if it was placed by such a point itself.
+
+So there are of an observation most of which the gate rejects. It may be garbled, or of landmarks
+that have moved; or the robot is not where odometry has it, since its wheels slipped or someone
+carried it, and would be lost if it went on without what it sees.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from slam_observer_ros.association.assignments import Assignment, find_assignments
+from slam_observer_ros.association.costs import (
+    cost_of_staying,
+    outlier_cost,
+    pairing_cost,
+    rejection_cost,
+    SLIP_COST,
+)
+from slam_observer_ros.association.slip import slip
+from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.gains.base import Residuals
+from slam_observer_ros.gains.riccati import RiccatiGains
+from slam_observer_ros.gains.robust import are_far, far_from_the_others
+from slam_observer_ros.matrices import mahalanobis
+from slam_observer_ros.slam.measurement import MatchedObservation
+from slam_observer_ros.slam.slam import Slam
+from slam_observer_ros.slam.update import is_contradiction
+from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+
+
+def _none() -> IntArray:
+    return np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Interpretation:
+    """What an observation is taken for.
+
+    Attributes
+    ----------
+    event : ObservationEvent
+        The observation with all ids filled in, without points that are taken for outliers.
+    cost : float
+        −2 ln of its likelihood, up to what all interpretations of the observation share.
+    slipped : Slam or None
+        The state if the robot may have moved in any way since the observation before; else None.
+    disbelieved : ObservationEvent or None
+        Of the points that were left out though the gate lets them pass, those of landmarks that
+        were seen so seldom that these may be the outliers; None or empty if there are none.
+    relabelled_rows, relabelled_ids : IntArray
+        (j,) landmarks that had no id of their own so far, and the ids that they have now.
+
+    """
+
+    event: ObservationEvent
+    cost: float
+    slipped: Slam | None = None
+    disbelieved: ObservationEvent | None = None
+    relabelled_rows: IntArray = field(default_factory=_none)
+    relabelled_ids: IntArray = field(default_factory=_none)
+
+
+def interpretations(
+    slam: Slam,
+    event: ObservationEvent,
+    matched: MatchedObservation,
+    new_ids: IntArray,
+    budget: float,
+) -> list[Interpretation]:
+    """Return what an observation may mean.
+
+    Parameters
+    ----------
+    slam : Slam
+        The state at the observation's instant.
+    event : ObservationEvent
+        The observation, of m points.
+    matched : MatchedObservation
+        The same, with the landmarks that it is of by its ids.
+    new_ids : IntArray
+        (m,) ids of points that are taken for landmarks not seen before.
+    budget : float
+        Cost beyond which interpretations need not be returned.
+
+    Returns
+    -------
+    list of Interpretation
+        As it came and at no cost if the gains know no joint covariance to judge it by.
+
+    """
+    gains = slam.gains
+    if not isinstance(gains, RiccatiGains):
+        return [Interpretation(event, 0.0)]
+    residuals, m = matched.residuals, len(event.ids)
+    some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
+    rejected = _are_rejected(slam, residuals)
+    is_contradicted = not some_are_unknown and is_contradiction(rejected)
+    sensor_distances = _sensor_distances(slam, residuals)
+    is_suspect = _suspects(slam, gains, residuals, sensor_distances)
+    suspects = slam.landmarks.ids[residuals.rows[is_suspect]]
+    if not is_contradicted and (some_are_unknown or may_relabel(slam, matched)):
+        return _by_assignments(slam, gains, event, new_ids, suspects, budget)
+    if is_contradicted:
+        trusting, *slipped = _rejected_or_slipped(slam, gains, matched, event, rejected)
+    else:
+        trusting, slipped = Interpretation(event, pairing_cost(slam, gains, m, residuals)), []
+    doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
+    without = [_without(ids, slam, gains, matched, trusting) for ids in doubted]
+    return [trusting, *without, *slipped]
+
+
+def _without(
+    ids: IntArray,
+    slam: Slam,
+    gains: RiccatiGains,
+    matched: MatchedObservation,
+    trusting: Interpretation,
+) -> Interpretation:
+    """Return what it is if points with some ids are outliers: no cheaper than trusting them.
+
+    But for what is seen once more at one place, in place of a landmark that was seen so seldom
+    that it may itself be the outlier.
+    """
+    event, residuals = trusting.event, matched.residuals
+    out = np.isin(slam.landmarks.ids[residuals.rows], ids)
+    cost = max(trusting.cost, pairing_cost(slam, gains, len(event.ids), residuals.select(~out)))
+    unconfirmed = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
+    again, staying = cost_of_staying(slam, matched)
+    saved = float(np.sum(outlier_cost(slam) - staying[again & unconfirmed]))
+    unconfirmed_ids = slam.landmarks.ids[residuals.rows[unconfirmed]]
+    return Interpretation(
+        event.select(~np.isin(event.ids, ids)),
+        cost - saved,
+        disbelieved=event.select(np.isin(event.ids, unconfirmed_ids)),
+    )
+
+
+def is_ambiguous(slam: Slam, matched: MatchedObservation) -> bool:
+    """Return whether an observation, all of whose points have ids, may mean different things."""
+    gains, residuals = slam.gains, matched.residuals
+    if not isinstance(gains, RiccatiGains):
+        return False
+    sensor_distances = _sensor_distances(slam, residuals)
+    if (sensor_distances <= slam.settings.rejection_distance).all():
+        return False  # by all of S they are no further off
+    some_are_suspect = bool(_suspects(slam, gains, residuals, sensor_distances).any())
+    return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
+
+
+def may_relabel(slam: Slam, matched: MatchedObservation) -> bool:
+    """Return whether a point's id may be that of a landmark which had none of its own so far."""
+    all_are_known = len(matched.known.ids) == len(matched.rows) + matched.left_out
+    if all_are_known or not isinstance(slam.gains, RiccatiGains):
+        return False
+    return bool(is_automatic(slam.landmarks.ids).any())
+
+
+def _rejected_or_slipped(
+    slam: Slam,
+    gains: RiccatiGains,
+    matched: MatchedObservation,
+    event: ObservationEvent,
+    rejected: BoolArray,
+) -> list[Interpretation]:
+    """Interpret an observation most of whose known landmarks are rejected.
+
+    If a single motion would have put all where they are seen, that is as unlikely of a garbled
+    message as of a robot that has made this motion.
+    """
+    residuals, m = matched.residuals, len(event.ids)
+    cost, is_news = rejection_cost(slam, matched, rejected)
+    as_told = pairing_cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
+    after_slip = _after_slip(slam, matched, event) if is_news else None
+    if after_slip is None:
+        return [Interpretation(event, as_told + cost)]
+    if slam.was_contradicted:
+        return [Interpretation(event, as_told + cost), after_slip]
+    as_outliers = as_told + float(np.sum(rejected)) * outlier_cost(slam)
+    # A garbled message explains what happens to be where it should be, too.
+    garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
+    return [Interpretation(event, garbled), after_slip]
+
+
+def _after_slip(
+    slam: Slam, matched: MatchedObservation, event: ObservationEvent
+) -> Interpretation | None:
+    """Take the robot for slipped; return None if that does not explain all of it."""
+    settings = slam.settings
+    if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
+        return None
+    slipped = deepcopy(slam)
+    cost = slip(slipped, matched)
+    residuals, gains = slipped.match(event).residuals, slipped.gains
+    if not isinstance(gains, RiccatiGains) or _are_rejected(slipped, residuals).any():
+        return None
+    cost += SLIP_COST + pairing_cost(slipped, gains, len(event.ids), residuals)
+    return Interpretation(event, cost, slipped)
+
+
+def _sensor_distances(slam: Slam, residuals: Residuals) -> FloatArray:
+    """Return how far off points are by the sensor's noise alone (m,): this is quickly told."""
+    return mahalanobis(*residuals.on(slam.axes))
+
+
+def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:
+    """Return which points (m,) the gate rejects."""
+    return np.asarray(slam.gains.distances(residuals) > slam.settings.rejection_distance)
+
+
+def _suspects(
+    slam: Slam, gains: RiccatiGains, residuals: Residuals, sensor_distances: FloatArray
+) -> BoolArray:
+    """Return which points (m,) only pass the gate since the state is so uncertain.
+
+    ``sensor_distances`` (m,) are their :func:`_sensor_distances`.
+    """
+    far = are_far(sensor_distances, slam.settings)
+    if far.any():
+        r, noise = residuals.on(slam.axes)
+        far &= far_from_the_others(r, gains.predicted(residuals), noise, slam.settings)
+    return far
+
+
+def _by_assignments(
+    slam: Slam,
+    gains: RiccatiGains,
+    event: ObservationEvent,
+    new_ids: IntArray,
+    suspects: IntArray,
+    budget: float,
+) -> list[Interpretation]:
+    """Interpret points that may be of landmarks without an id.
+
+    An id is believed here, too, until something contradicts it: an interpretation without a
+    suspect costs no less than one with all of them.
+    """
+    found = find_assignments(slam, gains, event, budget)
+    outliers = [np.isin(event.ids, suspects) & (assignment.rows < 0) for assignment in found]
+    pairs = list(zip(found, outliers, strict=True))
+    trusting = min((assignment.cost for assignment, out in pairs if not out.any()), default=0.0)
+    interpreted = []
+    for assignment, out in pairs:
+        cost = max(assignment.cost, trusting) if out.any() else assignment.cost
+        interpretation = _with_ids(slam, event, assignment, new_ids)
+        interpreted.append(
+            replace(interpretation, event=interpretation.event.select(~out), cost=cost)
+        )
+    return interpreted
+
+
+def _with_ids(
+    slam: Slam, event: ObservationEvent, assignment: Assignment, new_ids: IntArray
+) -> Interpretation:
+    """Interpret m points as an assignment has them; ``new_ids`` (m,) are for new landmarks."""
+    rows, has_id = assignment.rows, event.ids != UNKNOWN_ID
+    known_ids = np.append(slam.landmarks.ids, UNKNOWN_ID)[rows]
+    ids = np.where(has_id, event.ids, np.where(rows < 0, new_ids, known_ids))
+    is_relabelled = has_id & (rows >= 0) & (known_ids != event.ids)
+    return Interpretation(
+        replace(event, ids=ids),
+        assignment.cost,
+        relabelled_rows=rows[is_relabelled],
+        relabelled_ids=event.ids[is_relabelled],
+    )
