@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 from slam_observer_ros import __version__
 from slam_observer_ros.commands.console import MessageHandler, PROGRAM, show_message
 from slam_observer_ros.errors import SlamObserverError
+from slam_observer_ros.parameters import suggestion
 from slam_observer_ros.threads import use_one_thread
 
 EXIT_ERROR = 2
@@ -44,7 +45,8 @@ class Parser(argparse.ArgumentParser):
         """Refuse what is not known here, where the command whose help tells more is known."""
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+            meant = suggestion(unknown[0].partition('=')[0], self._option_string_actions)
+            self.error(f'unrecognized arguments: {" ".join(unknown)}{meant}')
         return namespace, unknown
 
     def error(self, message: str) -> NoReturn:
