@@ -366,8 +366,8 @@ class Estimator:
     @property
     def world_points(self) -> FloatArray:
         """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
-        points = self._slam.world_points[self._slam.confirmed]
-        return points + self._timeline.lead_s * self.landmark_velocities
+        points, lead_s = self._slam.world_points[self._slam.confirmed], self._timeline.lead_s
+        return points + lead_s * self.landmark_velocities if lead_s else points
 
     @property
     def landmark_covariances(self) -> FloatArray | None:
