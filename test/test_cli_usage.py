@@ -51,7 +51,7 @@ def test_help_has_examples(slam_observer):
         ('replay', "required: RECORDING; see 'slam-observer replay --help'"),
         ('replay nothing.mcap', 'nothing.mcap: no such file or directory'),
         ('replay . --json', 'no rosbag2 directory'),
-        ('replay nothing.mcap --jsn', "--jsn; did you mean '--json'?; see 'slam-observer replay --help'"),
+        ('replay nothing.mcap --jsn', "'--json'?; see 'slam-observer replay --help'"),
         ('replay nothing.mcap --gain constant', "--gain constant; did you mean '--gains'?"),
         ('replay nothing.mcap --gains best', "--gains: invalid choice: 'best'"),
         ('replay nothing.mcap --config nowhere', 'come with the package: observer, stereo_'),
