@@ -101,13 +101,13 @@ class EventQueue:
                 raise _refusal(ahead_ns)
             self._insert(event)
             self._note_reception(event)
-            self._goes_on(event)
+            self._note_kind(event)
             self._strays.clear()
             self._believe(max(self.newest_ns, stamp_ns))
             return False
         too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
         if too_late or too_early:
-            is_no_jump = too_late and (self._goes_on(event) or self._is_held_up(event))
+            is_no_jump = too_late and (self._note_kind(event) or self._is_held_up(event))
             if not is_no_jump and self._count_stray(stamp_ns):
                 return True
             raise _refusal(ahead_ns)
@@ -169,13 +169,16 @@ class EventQueue:
             self._usual_ns = min(max(self._near_ns, 2 * step_ns), self._max_jump_ns)
         self.newest_ns = self._lead_ns = newest_ns
 
-    def _goes_on(self, event: Event) -> bool:
-        """Return whether stamps of an event's kind have not gone back; the first has not."""
+    def _note_kind(self, event: Event) -> bool:
+        """Note the newest stamp of each kind of event; return whether this one is, as the first.
+
+        Else those of its kind have gone back.
+        """
         kind = type(event)
-        goes_on = event.stamp_ns > self._newest_of_kind_ns.get(kind, event.stamp_ns - 1)
-        if goes_on:
+        is_newest = event.stamp_ns > self._newest_of_kind_ns.get(kind, event.stamp_ns - 1)
+        if is_newest:
             self._newest_of_kind_ns[kind] = event.stamp_ns
-        return goes_on
+        return is_newest
 
     def _is_held_up(self, event: Event) -> bool:
         """Return whether an event was received right after one that was in time."""

@@ -91,15 +91,15 @@ def plot_errors(
     rows = len(panels) + (configuration is not None)
     figure = Figure(figsize=(7.5, 0.6 + 1.7 * rows))
     stack = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    limits = None if covariances is None else 3.0 * _deviations(covariances, errors.alignment)
     for axes, (name, (column, unit)) in zip(stack, panels.items(), strict=False):
         _draw_errors(axes, times_s, unit * errors.errors[:, column])
         axes.set_ylabel(name)
+        if limits is not None:
+            _draw_band(axes, times_s, unit * limits[:, column], in_known_map)
     if configuration is not None:
         _draw_configuration(stack[-1], start_ns, configuration)
-    if covariances is not None:
-        limits = 3.0 * _deviations(covariances, errors.alignment)
-        for axes, (column, unit) in zip(stack, panels.values(), strict=False):
-            _draw_band(axes, times_s, unit * limits[:, column], in_known_map)
+    if limits is not None:
         stack[0].legend(**LEGEND_ABOVE)
     hindsight = ' in hindsight,' if in_hindsight else ''
     stack[0].set_title(f'Errors{hindsight} after rigid alignment')

@@ -23,7 +23,10 @@ NAMES = (
 )
 """Names of six scales, six biases and the delay τ."""
 
-SCALES, DELAY = range(6), NAMES.index('velocity_delay')
+DELAY = NAMES.index('velocity_delay')
+
+NOMINAL = np.repeat([1.0, 0.0], [6, 7])
+"""(13,) what they are where the velocity is right; scales as factors 1 + s."""
 
 MIN_DELAY_S = -0.2
 """An odometry's velocity, averaged over the time before its stamp, shows in observations before
@@ -66,9 +69,9 @@ class Calibration:
         pose = np.arange(6)[axes.pose]
         possible = np.concatenate([pose, 6 + pose, [DELAY]])
         self._estimated: IntArray = possible[errors[possible] > 0.0]
-        self._scales = int(np.sum(self._estimated < len(SCALES)))
+        self._scales = int(np.sum(self._estimated < 6))
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
-        self._all: FloatArray = np.repeat([1.0, 0.0], [6, 7])
+        self._all: FloatArray = NOMINAL.copy()
         self.count = len(self._estimated)
         self.delay_error_ns = to_ns(settings.velocity_delay_error)
         self.initial_variances = errors[self._estimated] ** 2
@@ -90,7 +93,7 @@ class Calibration:
                 float(self._all[i]),
                 float(np.sqrt(variance)),
                 UNITS[i],
-                nominal=float(i in SCALES),
+                nominal=float(NOMINAL[i]),
                 stated=float(error),
             )
             for i, variance, error in zip(self._estimated, variances, stated, strict=True)

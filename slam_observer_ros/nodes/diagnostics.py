@@ -77,11 +77,12 @@ class Diagnostics:
     def publish(self) -> None:
         """Publish one status; call it about once a second."""
         dropped, new = self._progress()
-        warnings = self._warnings(dropped, new)
+        unused = [text for source in self._inputs if (text := self._unused_warning(source))]
+        warnings = unused + self._warnings(dropped, new)
         used = new['velocity'] + new['observation']
         level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
         none_is_used = bool(dropped) and not used and not self._intake.is_paused
-        if none_is_used or any(map(self._unused_warning, self._inputs)):
+        if none_is_used or unused:
             level = DiagnosticStatus.ERROR
         values = self._input_values() | self._estimator_values()
         status = DiagnosticStatus(
@@ -134,7 +135,6 @@ class Diagnostics:
 
     def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
-        warnings += [self._unused_warning(source) for source in self._inputs]
         warnings += self._intake.clock_troubles()
         if self._intake.is_paused:
             warnings.append('paused')
@@ -159,7 +159,7 @@ class Diagnostics:
         kind = USED_AS.get(source.name)
         if kind is None or source.received < MANY_UNUSED or self._intake.is_paused:
             return ''
-        if self._estimator.counts[kind]:
+        if self._last_counts[kind]:
             return ''
         return f"none of {source.received} messages on '{source.topic}' was used"
 

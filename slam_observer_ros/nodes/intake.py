@@ -94,6 +94,8 @@ class Intake:
         self.clocks = {
             name: ClockOffset(to_ns(settings.max_clock_offset)) for name in SOURCES.values()
         }
+        # As they are after remapping, for the log.
+        self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
         self.is_active = False
         self.is_paused = False
 
@@ -103,9 +105,8 @@ class Intake:
         if not self._is_usable(source, timed.stamp_ns, receive_ns):
             return
         if timed is not measured:
-            topic = self._topic(source)
-            text = f'stamps are zero on {topic}: the time of reception is taken instead'
-            self._warn(f'stamps of {source}', text)
+            told = f'stamps are zero on {self._topics[source]}'
+            self._warn(told, f'{told}: the time of reception is taken instead')
         self._use(self._builder.add(timed, time.monotonic_ns()))
 
     def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
@@ -138,14 +139,10 @@ class Intake:
         if self._settings.correct_clock_offset:
             return []
         return [
-            clock.trouble(self._topic(name), self._is_simulated)
+            clock.trouble(self._topics[name], self._is_simulated)
             for name, clock in self.clocks.items()
             if clock.is_off
         ]
-
-    def _topic(self, source: str) -> str:
-        """Return the topic of an input as it is after remapping, in quotes."""
-        return f"'{self._node.resolve_topic_name(source)}'"
 
     @property
     def _is_simulated(self) -> bool:
@@ -188,7 +185,7 @@ class Intake:
             return False
         self._look_at_clock(source, stamp_ns, receive_ns)
         if self._settings.correct_clock_offset and self.clocks[source].offset_ns is None:
-            self._drop('clock_unknown', f'the clock of {self._topic(source)} is not known yet')
+            self._drop('clock_unknown', f'the clock of {self._topics[source]} is not known yet')
             return False
         return True
 
@@ -199,10 +196,10 @@ class Intake:
         clock.add(stamp_ns, receive_ns)
         if not self._settings.correct_clock_offset:
             if clock.is_off:
-                self._warn(source, clock.trouble(self._topic(source), self._is_simulated))
+                self._warn(source, clock.trouble(self._topics[source], self._is_simulated))
         elif clock.correction_ns != before_ns:
             fate = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
-            topic = self._topic(source)
+            topic = self._topics[source]
             self._node.get_logger().info(f'stamps on {topic} are {clock}, and {fate}')
 
     def _drop(self, reason: str, text: str) -> None:
