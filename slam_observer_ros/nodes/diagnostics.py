@@ -77,7 +77,9 @@ class Diagnostics:
     def publish(self) -> None:
         """Publish one status; call it about once a second."""
         dropped, new = self._progress()
-        unused = [text for source in self._inputs if (text := self._unused_warning(source))]
+        # What came while the node was paused or inactive was not to be used.
+        unused = [self._unused_warning(source) for source in self._inputs] if dropped else []
+        unused = [warning for warning in unused if warning]
         warnings = unused + self._warnings(dropped, new)
         used = new['velocity'] + new['observation']
         level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK

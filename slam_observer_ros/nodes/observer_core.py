@@ -89,7 +89,7 @@ class ObserverCore:
             f"estimating '{settings.base_frame}' in '{settings.map_frame}' with "
             f'{estimator_settings.gains} gains, '
             f'{"in the plane" if estimator_settings.two_d_mode else "in 3D"}; '
-            f'{changed or "no"} parameters differ from their defaults'
+            f'parameters that differ from their defaults: {changed}'
         )
 
     def start(self) -> None:
