@@ -23,7 +23,7 @@ help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
 
 demo: $(READY)  ## run simulator and observer until they converge; pictures in demo_output/
-	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo
+	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.demo
 
 test: lint pytest colcon  ## everything that a change must pass
 

@@ -73,11 +73,11 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'slam-observer = {PACKAGE}.cli:main',
+            f'slam-observer = {PACKAGE}.cli.main:main',
             f'observer_node = {PACKAGE}.nodes.observer_node:main',
             f'lifecycle_observer_node = {PACKAGE}.nodes.lifecycle_observer_node:main',
             f'simulator_node = {PACKAGE}.nodes.simulator_node:main',
-            f'demo = {PACKAGE}.nodes.demo:main',
+            f'demo = {PACKAGE}.nodes.demo.demo:main',
         ],
     },
 )

@@ -26,7 +26,7 @@ from rich.progress import track
 import variants
 import worlds
 
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.common.types import FloatArray
 
 DOCS = worlds.CHECKOUT / 'docs'
 QUICK_S = 60.0

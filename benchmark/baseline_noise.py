@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observation_noise import ObservationNoise, repetition_factors
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import to_s
+from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
+from slam_observer_ros.settings.estimator_settings import Settings
 
 
 class BaselineNoise:

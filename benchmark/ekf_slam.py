@@ -15,13 +15,13 @@ from baseline_noise import BaselineNoise
 import numpy as np
 from odometry import Event, Odometry
 
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.gains.robust import observation_weights
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.matrices import block_diagonal
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.geometry.matrices import block_diagonal
+from slam_observer_ros.observer.robust import observation_weights
+from slam_observer_ros.settings.estimator_settings import Settings
 
 
 class EkfSlam:

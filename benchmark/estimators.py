@@ -13,12 +13,12 @@ import numpy as np
 from odometry import Event, Odometry
 from worlds import without_calibration
 
-from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.gains import DESIGNS
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.settings.estimator_settings import Settings
 
 DEAD_RECKONING = 'dead reckoning'
 UNCALIBRATED = 'riccati, no calibration'

@@ -18,9 +18,9 @@ import gtsam
 import numpy as np
 from odometry import Event, Odometry
 
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.settings.estimator_settings import Settings
 
 FIRST_POSE_DEVIATION = 1e-4
 """The first pose is the map's frame: known to this, rad and m."""

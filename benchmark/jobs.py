@@ -18,7 +18,7 @@ import variants
 import worlds
 from worlds import World
 
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.common.types import FloatArray
 
 DRAWS = 4
 """Sets of outliers, over which scores are averaged."""

@@ -9,14 +9,14 @@ from estimators import EKF, observer
 import numpy as np
 from worlds import drive, Loop, simulated_settings, without_calibration, World
 
-from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.consistency import (
     average_nees_band,
     normalised_squared_errors,
 )
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.types import FloatArray
 
 CHECKPOINT_S = 5
 

@@ -6,12 +6,12 @@ from typing import TypeAlias
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import paths, se3
-from slam_observer_ros.motion.noise import MotionNoise
-from slam_observer_ros.motion.velocity_history import VelocityHistory
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.sensor_models.motion_noise import MotionNoise
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.settings.estimator_settings import Settings
 
 Event: TypeAlias = VelocityEvent | ObservationEvent
 """What the worlds consist of: each velocity is one sensor's."""

@@ -8,8 +8,8 @@ import numpy as np
 from odometry import Event
 from worlds import World
 
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.types import FloatArray, IntArray
 
 GROSS_SHARE = 0.05
 GROSS_M = (0.5, 20.0)

@@ -21,9 +21,9 @@ import numpy as np
 from scores import Scores
 from variants import CLEAN, FALSE_POINTS, LEFT_OUT, NO_IDS, OUTLIER_COLUMNS, OUTLIERS, WORST
 
-from slam_observer_ros.evaluation.drawing import BLUE, GREEN, GREY, RED, save, STYLE
-from slam_observer_ros.gains import DESIGNS
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.plots.drawing import BLUE, GREEN, GREY, RED, save, STYLE
+from slam_observer_ros.observer.designs import DESIGNS
 
 LEFT_OUT_COLUMN = 'riccati, these points left out'
 GROWTH_COLUMNS = (*OUTLIER_COLUMNS, 'riccati' + WORST, LEFT_OUT_COLUMN)

@@ -12,8 +12,8 @@ from worlds import World
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.metrics import landmark_errors, trajectory_errors
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.truth import LandmarkTruth
 
 
 @dataclass(frozen=True, slots=True)

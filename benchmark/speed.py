@@ -13,11 +13,11 @@ import time
 
 import numpy as np
 
-from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.common.threads import use_one_thread
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.gains import DESIGNS
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.threads import use_one_thread
+from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.settings.estimator_settings import Settings
 
 MAP_SIZES = (10, 30, 100, 300, 1000)
 SEEN = (1, 3, 10)

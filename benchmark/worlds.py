@@ -13,21 +13,21 @@ from pathlib import Path
 import numpy as np
 from odometry import Event
 
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.motion.held_velocities import HeldVelocities
-from slam_observer_ros.motion.noise import MotionNoise
-from slam_observer_ros.observation_noise import ObservationNoise
-from slam_observer_ros.parameter_file import read_parameter_file
-from slam_observer_ros.parameters import from_parameters, table
 from slam_observer_ros.recording.datasets.data_set import DataSet
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import load_starry_night
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+from slam_observer_ros.sensor_models.motion_noise import MotionNoise
+from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_file import read_parameter_file
+from slam_observer_ros.settings.parameter_table import from_parameters, table
 from slam_observer_ros.simulation import Scenario, Simulation
-from slam_observer_ros.truth import LandmarkTruth
-from slam_observer_ros.types import FloatArray
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIG_FOLDER = CHECKOUT / 'config'

@@ -13,4 +13,4 @@ for executable in slam-observer observer_node simulator_node; do
     test -x "$workspace/install/slam_observer_ros/lib/slam_observer_ros/$executable"
 done
 "$colcon" --log-base "$workspace/log" test "${bases[@]}" --return-code-on-test-failure \
-    --event-handlers console_direct+ --pytest-args test/test_package.py test/test_ament_style.py
+    --event-handlers console_direct+ --pytest-args test/project/test_package.py test/project/test_ament_style.py

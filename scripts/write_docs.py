@@ -22,12 +22,12 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 
-from slam_observer_ros.inputs.settings import AUTO, InputSettings
-from slam_observer_ros.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.nodes.observer_node import ObserverNode
 from slam_observer_ros.nodes.simulator_node import SimulatorNode
-from slam_observer_ros.parameters import Parameter, table
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import AUTO, InputSettings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
+from slam_observer_ros.settings.parameter_table import Parameter, table
 from slam_observer_ros.simulation import Scenario
 
 CHECKOUT = Path(__file__).resolve().parent.parent

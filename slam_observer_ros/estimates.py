@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
 IMPLAUSIBLE = 4.0
 """Standard deviations as stated by which no calibration is off: something else is wrong."""

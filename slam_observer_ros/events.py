@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
@@ -148,7 +148,7 @@ class ObservationEvent:
 
 
 Event: TypeAlias = VelocityEvent | AngularVelocityEvent | ObservationEvent
-"""Anything that :meth:`slam_observer_ros.estimator.Estimator.add` takes."""
+"""Anything that :meth:`slam_observer_ros.estimator.estimator.Estimator.add` takes."""
 
 
 def is_automatic(ids: IntArray) -> BoolArray:

@@ -14,12 +14,12 @@ from typing import TypeAlias
 
 import numpy as np
 
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_ns, to_s
+from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.parameters import parameter
-from slam_observer_ros.truth import LandmarkTruth, PoseTruth
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND, to_ns, to_s
+from slam_observer_ros.settings.parameter_table import parameter
 
 BODY_VELOCITY = (0.0, 0.0, 0.2, 1.0, 0.0, 0.0)
 """Section VI's (Ω, v), rad/s and m/s, body frame."""

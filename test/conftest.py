@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 from hypothesis import settings
 import pytest
 
-from slam_observer_ros import estimator  # noqa: F401  # loads what computes in threads
-from slam_observer_ros.threads import use_one_thread
+from slam_observer_ros.common.threads import use_one_thread
+from slam_observer_ros.estimator import estimator  # noqa: F401  # loads what computes in threads
 
 if TYPE_CHECKING:
     from node_processes import Client
 
-CHECKOUT = Path(__file__).resolve().parent.parent
+CHECKOUT = Path(__file__).resolve().parents[1]
 SESSION_VARIABLE = 'SLAM_OBSERVER_TEST_SESSION'
 # The ports of higher domain ids overlap those that Linux hands out to clients.
 DOMAIN_IDS = range(1, 102)

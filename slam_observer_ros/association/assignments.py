@@ -23,15 +23,15 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.riccati import RiccatiGains
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
-from slam_observer_ros.matrices import mahalanobis, transpose, with_blocks
-from slam_observer_ros.observer import Observer
-from slam_observer_ros.slam.slam import Slam
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
+from slam_observer_ros.state.state import Slam
 
 MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""

@@ -14,14 +14,14 @@ from slam_observer_ros.association.joint_compatibility import (
     joint_cost,
     unpaired_cost,
 )
-from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import gated
-from slam_observer_ros.matrices import mahalanobis, with_blocks
-from slam_observer_ros.slam.map_management import rejected_before
-from slam_observer_ros.slam.measurement import MatchedObservation
-from slam_observer_ros.slam.slam import Slam
-from slam_observer_ros.types import BoolArray, FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
+from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
+from slam_observer_ros.observer.robust import gated
+from slam_observer_ros.state.map_management import rejected_before
+from slam_observer_ros.state.matching import MatchedObservation
+from slam_observer_ros.state.state import Slam
 
 SLIP_COST = 20.0
 """What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""

@@ -24,6 +24,7 @@ from slam_observer_ros.association.interpretations import (
     may_relabel,
 )
 from slam_observer_ros.association.joint_compatibility import PRUNING_COST, RESOLUTION
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
@@ -31,14 +32,13 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
 )
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.matrices import mahalanobis
-from slam_observer_ros.motion.velocity_history import VelocityHistory
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.slam.map_management import disbelieve, note_surroundings
-from slam_observer_ros.slam.measurement import MatchedObservation
-from slam_observer_ros.slam.slam import Slam
-from slam_observer_ros.slam.update import Outcome, update
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.geometry.matrices import mahalanobis
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.state.map_management import disbelieve, note_surroundings
+from slam_observer_ros.state.matching import MatchedObservation
+from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.step import Outcome, update
 
 
 @dataclass(frozen=True, slots=True)

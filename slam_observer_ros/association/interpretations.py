@@ -26,15 +26,15 @@ from slam_observer_ros.association.costs import (
     SLIP_COST,
 )
 from slam_observer_ros.association.slip import slip
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.gains.base import Residuals
-from slam_observer_ros.gains.riccati import RiccatiGains
-from slam_observer_ros.gains.robust import are_far, far_from_the_others
-from slam_observer_ros.matrices import mahalanobis
-from slam_observer_ros.slam.measurement import MatchedObservation
-from slam_observer_ros.slam.slam import Slam
-from slam_observer_ros.slam.update import is_contradiction
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.matrices import mahalanobis
+from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.riccati.riccati import RiccatiGains
+from slam_observer_ros.observer.robust import are_far, far_from_the_others
+from slam_observer_ros.state.matching import MatchedObservation
+from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.step import is_contradiction
 
 
 def _none() -> IntArray:

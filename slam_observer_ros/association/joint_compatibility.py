@@ -22,8 +22,8 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.matrices import diagonal_blocks, mahalanobis, transpose
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, transpose
 
 MAX_PARTIAL = 16
 """Pairings of the points so far, the cheapest, that are gone on with at the next point.

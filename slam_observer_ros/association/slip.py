@@ -7,14 +7,14 @@ import math
 import numpy as np
 
 from slam_observer_ros.association.joint_compatibility import huber_loss
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.motion.held_velocities import HeldVelocities
-from slam_observer_ros.motion.motion import Motion
-from slam_observer_ros.slam.measurement import MatchedObservation
-from slam_observer_ros.slam.slam import Slam
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.state.matching import MatchedObservation
+from slam_observer_ros.state.state import Slam
 
 MAX_DURATION_S = 4.0
 """Time, seconds, for which odometry is taken to have told nothing, at most."""

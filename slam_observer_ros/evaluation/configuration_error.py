@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.metrics import root_mean_square
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.truth import LandmarkTruth
-from slam_observer_ros.types import FloatArray, IntArray
 
 MAX_JOINT = 100
 """Landmarks whose errors are normalised together, at most: it costs the cube of them."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from slam_observer_ros.errors import EvaluationError
+from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.types import FloatArray, IntArray
-from slam_observer_ros.units import to_s
+from slam_observer_ros.geometry.matrices import transpose
 
 MAX_SHARE_OF_ANCHOR = 0.1
 """ANEES that the anchor's own error may make up at most; 1 is what all errors together have."""

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.errors import EvaluationError
+from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.truth import LandmarkTruth
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.units import to_s
+from slam_observer_ros.geometry.matrices import transpose
 
 MIN_POSES = 3
 """Fewer positions can be aligned without an error left."""

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.errors import EvaluationError
+from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.geometry import paths, so3
-from slam_observer_ros.output_files import unfinished_file
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 MAX_GAP_NS = NANOSECONDS_PER_SECOND // 2
 """Truth is not interpolated between samples further apart than this."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.types import FloatArray
 
 _RANK_TOLERANCE = 1e-12
 """Singular values (m²) below this part of the largest carry no direction, only rounding."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray, Immutable
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.types import FloatArray, Immutable
 
 
 class Axes(Immutable):

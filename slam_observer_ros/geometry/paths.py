@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.geometry.matrices import transpose
 
 
 def path(start: FloatArray, twists: FloatArray) -> FloatArray:

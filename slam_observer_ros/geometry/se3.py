@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.geometry.matrices import transpose
 
 _HAT = np.array(
     [

@@ -4,7 +4,7 @@ The paper writes A p̄ for points and A v⃗ for directions; here these are `se3
 `se3.rotate`. All functions take n = 0, 1 or many landmarks and any leading axes.
 
 Of these the package only uses `exp`, at each correction by Riccati gains that map. The rest is
-what the paper states; tests hold :class:`slam_observer_ros.observer.Observer` against it.
+what the paper states; tests hold :class:`slam_observer_ros.observer.observer.Observer` against it.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.geometry.matrices import transpose
 
 _IDENTITY = np.eye(3)
 

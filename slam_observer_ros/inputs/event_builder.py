@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import logging
 from typing import TypeAlias
 
-from slam_observer_ros.errors import InvalidEventError, TransformError
+from slam_observer_ros.common.errors import InvalidEventError, TransformError
+from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityEvent
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.pose_differences import PoseDifferences
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import AnyMeasurement, Measurement
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
-from slam_observer_ros.units import to_ns
 
 MAX_WAITING = 1000
 """Most measurements that wait for a transform; the oldest go first."""

@@ -7,19 +7,19 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from slam_observer_ros.errors import ParameterError, TransformError
+from slam_observer_ros.common.errors import ParameterError, TransformError
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
-from slam_observer_ros.extrinsics import (
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.detections import TagDetections
+from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
+from slam_observer_ros.sensor_models.extrinsics import (
     move_observation,
     move_velocity,
     turn_angular_velocity,
 )
-from slam_observer_ros.geometry import se3
-from slam_observer_ros.inputs.settings import InputSettings
-from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.detections import TagDetections
-from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
-from slam_observer_ros.types import FloatArray
+from slam_observer_ros.settings.input_settings import InputSettings
 
 EventT = TypeVar('EventT', ObservationEvent, VelocityEvent, AngularVelocityEvent)
 

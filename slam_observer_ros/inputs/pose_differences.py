@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.errors import InvalidEventError
+from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import to_s
 
 POSE_JUMP = 'pose_jump'
 """Reason under which a difference of poses is dropped that no robot can have moved by."""

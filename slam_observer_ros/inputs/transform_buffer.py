@@ -12,11 +12,11 @@ import logging
 
 import numpy as np
 
-from slam_observer_ros.errors import TransformError
+from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import AGREEING_STAMPS, NEAR_NS
 from slam_observer_ros.geometry import paths, se3
-from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import to_s
 
 logger = logging.getLogger(__name__)
 

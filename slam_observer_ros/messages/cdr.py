@@ -7,9 +7,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from slam_observer_ros.errors import MessageError
-from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 """One serialised message, as rclpy's raw subscriptions and rosbags' raw data give it."""

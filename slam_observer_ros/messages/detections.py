@@ -12,13 +12,13 @@ import re
 
 import numpy as np
 
-from slam_observer_ros.errors import MessageError
+from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import without_unmeasured
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
-from slam_observer_ros.types import FloatArray
 
 _POSE = 7
 _COVARIANCE = 36

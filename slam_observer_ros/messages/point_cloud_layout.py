@@ -10,10 +10,10 @@ import struct
 
 import numpy as np
 
-from slam_observer_ros.errors import MessageError
+from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.events import MAX_ID, UNKNOWN_ID
-from slam_observer_ros.types import FloatArray, IntArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 ID_NAME = 'id'
 POINT_NAMES = ('x', 'y', 'z')

@@ -11,7 +11,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_observer_ros.errors import MessageError
+from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.cloud_fields import read_field
@@ -26,7 +27,6 @@ from slam_observer_ros.messages.point_cloud_layout import (
     UNKNOWN_UINT32_ID,
     VELOCITY_NAMES,
 )
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 MAX_UNKNOWN_POINTS = 500
 """Most points without id in a message: telling them apart costs their number cubed."""

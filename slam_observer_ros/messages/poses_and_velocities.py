@@ -12,12 +12,12 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.errors import MessageError
+from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import AngularVelocityEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.types import FloatArray
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
 _QUATERNION_NORM_TOLERANCE = 0.1

@@ -8,14 +8,14 @@ from typing import Any
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from slam_observer_ros.errors import SlamObserverError
-from slam_observer_ros.node_settings import ObserverNodeSettings
+from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.nodes.entities import Entities
 from slam_observer_ros.nodes.log_bridge import forward_logging
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.parameters import declare_settings
+from slam_observer_ros.nodes.ros_parameters import declare_settings
 from slam_observer_ros.nodes.runner import run
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 
 class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes untyped

@@ -11,23 +11,23 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
-from slam_observer_ros.errors import ParameterError
-from slam_observer_ros.estimator import Estimator
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
-from slam_observer_ros.node_settings import ObserverNodeSettings
-from slam_observer_ros.nodes.controls import Controls
-from slam_observer_ros.nodes.diagnostics import Diagnostics
 from slam_observer_ros.nodes.entities import Entities
-from slam_observer_ros.nodes.initial_pose import InitialPose
-from slam_observer_ros.nodes.input_topics import open_inputs
-from slam_observer_ros.nodes.inputs import Input
-from slam_observer_ros.nodes.intake import Intake
-from slam_observer_ros.nodes.maps import Maps
-from slam_observer_ros.nodes.outputs import Outputs, TOPICS
-from slam_observer_ros.nodes.parameters import read_settings
-from slam_observer_ros.nodes.transform_listener import open_transforms
-from slam_observer_ros.parameters import changed_names
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.nodes.intake.input_topics import open_inputs
+from slam_observer_ros.nodes.intake.intake import Intake
+from slam_observer_ros.nodes.intake.subscriptions import Input
+from slam_observer_ros.nodes.intake.transform_listener import open_transforms
+from slam_observer_ros.nodes.publishing.diagnostics import Diagnostics
+from slam_observer_ros.nodes.publishing.publishers import Outputs, TOPICS
+from slam_observer_ros.nodes.ros_parameters import read_settings
+from slam_observer_ros.nodes.services.controls import Controls
+from slam_observer_ros.nodes.services.initial_pose import InitialPose
+from slam_observer_ros.nodes.services.map_services import Maps
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.parameter_table import changed_names
 
 OVERVIEW_PERIOD_S = 0.5
 DIAGNOSTICS_PERIOD_S = 1.0

@@ -6,12 +6,12 @@ import sys
 
 from rclpy.node import Node
 
-from slam_observer_ros.node_settings import ObserverNodeSettings
 from slam_observer_ros.nodes.log_bridge import forward_logging
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.parameters import declare_settings
+from slam_observer_ros.nodes.ros_parameters import declare_settings
 from slam_observer_ros.nodes.runner import run
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 
 class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped

@@ -15,8 +15,8 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from slam_observer_ros.errors import SlamObserverError
-from slam_observer_ros.threads import use_one_thread
+from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.common.threads import use_one_thread
 
 REFUSALS = (SlamObserverError, InvalidParameterValueException, InvalidParameterTypeException)
 """What a node may raise at its start; the last one of what rclpy declares, as use_sim_time."""

@@ -14,23 +14,23 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
 
+from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
-from slam_observer_ros.node_settings import SimulatorNodeSettings
-from slam_observer_ros.nodes.conversions import (
+from slam_observer_ros.nodes.publishing.conversions import (
     header_message,
     point_cloud2_message,
     pose_message,
     time_message,
     twist_message,
 )
-from slam_observer_ros.nodes.parameters import declare_settings, read_settings
+from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
 from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.ros_parameters import declare_settings, read_settings
 from slam_observer_ros.nodes.runner import run
-from slam_observer_ros.nodes.transform_publisher import TransformPublisher
+from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
-from slam_observer_ros.truth import PoseTruth
-from slam_observer_ros.units import to_ns
 
 QUEUE_DEPTH = 1000
 """Deep enough that nothing is lost while a reliable reader falls behind for a moment."""

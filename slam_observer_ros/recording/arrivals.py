@@ -6,7 +6,7 @@ from array import array
 
 import numpy as np
 
-from slam_observer_ros.units import to_s
+from slam_observer_ros.common.units import to_s
 
 
 class Arrivals:

@@ -10,8 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from slam_observer_ros.errors import MessageError
-from slam_observer_ros.inputs.settings import InputSettings
+from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.messages.cloud_fields import missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.message_types import (
@@ -30,6 +29,7 @@ from slam_observer_ros.recording.decoding import (
 )
 from slam_observer_ros.recording.sources import MessageSource, RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.settings.input_settings import InputSettings
 
 MAX_EMPTY_CLOUDS = 1000
 """Most clouds of a topic that are looked at for one with points, which tells of ids."""

@@ -7,10 +7,9 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
-from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.inputs.event_builder import Measured
-from slam_observer_ros.inputs.settings import InputSettings, POSE_DIFFERENCES
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.detections import decode_apriltags, observed_tags
 from slam_observer_ros.messages.measurement import Measurement
@@ -31,6 +30,7 @@ from slam_observer_ros.messages.poses_and_velocities import (
 )
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
 
 Decode: TypeAlias = Callable[[RawMessage], Sequence[Measured]]
 """From a message to what it measures.

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.point_cloud_layout import PointCloud2Layout
-from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 
 class MessageFactory:

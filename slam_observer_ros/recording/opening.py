@@ -7,7 +7,7 @@ from pathlib import Path, PurePath
 
 import yaml
 
-from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.recording.sources import (
     BagSource,
     MessageSource,

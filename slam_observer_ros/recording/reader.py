@@ -10,7 +10,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
-from slam_observer_ros.errors import MessageError, RecordingError
+from slam_observer_ros.common.errors import MessageError, RecordingError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import Event
 from slam_observer_ros.inputs.event_builder import (
     drop_reason,
@@ -20,7 +22,6 @@ from slam_observer_ros.inputs.event_builder import (
     with_receive_time,
 )
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
-from slam_observer_ros.inputs.settings import InputSettings
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.recording.arrivals import Arrivals
 from slam_observer_ros.recording.contents import Contents
@@ -31,12 +32,11 @@ from slam_observer_ros.recording.decoding import (
     input_decoders,
 )
 from slam_observer_ros.recording.opening import open_source
+from slam_observer_ros.recording.recorded_truth import base_in_frames, frames_beside, Truth
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
-from slam_observer_ros.recording.truth import base_in_frames, frames_beside, Truth
-from slam_observer_ros.settings import Settings
-from slam_observer_ros.types import FloatArray
-from slam_observer_ros.units import to_s
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')

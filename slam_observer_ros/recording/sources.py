@@ -16,7 +16,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_typestore, Stores
 
-from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.messages.cdr import Buffer
 
 

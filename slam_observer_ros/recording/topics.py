@@ -6,8 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 import logging
 
-from slam_observer_ros.errors import RecordingError
-from slam_observer_ros.inputs.settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
+from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
@@ -21,6 +20,7 @@ from slam_observer_ros.messages.message_types import (
 )
 from slam_observer_ros.recording.sources import last_part, Topic
 from slam_observer_ros.recording.transform_topics import transform_topics, TransformTopics
+from slam_observer_ros.settings.input_settings import AUTO, InputSettings, ON_TF, POSE_DIFFERENCES
 
 TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
 """Topics with one of these between the slashes of their name hold truth, not measurements."""

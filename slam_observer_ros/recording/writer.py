@@ -24,13 +24,13 @@ from rosbags.rosbag2 import (
     WriterError,
 )
 
-from slam_observer_ros.errors import RecordingError
+from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.common.output_files import destination
+from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.point_cloud_layout import point_cloud2_layout
-from slam_observer_ros.output_files import destination
 from slam_observer_ros.recording.message_factory import MessageFactory
-from slam_observer_ros.truth import LandmarkTruth, PoseTruth
 
 VELOCITY_TOPIC = '/twist'
 LANDMARKS_TOPIC = '/landmarks'

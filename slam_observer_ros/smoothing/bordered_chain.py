@@ -24,8 +24,8 @@ from scipy.linalg.blas import dtbsv
 from scipy.linalg.lapack import dtbtrs
 from scipy.sparse import csc_array
 
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.types import FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry.matrices import transpose
 
 STRIDE = 8
 

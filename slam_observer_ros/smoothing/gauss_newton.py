@@ -17,13 +17,13 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.matrices import transpose
-from slam_observer_ros.settings import Settings
+from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.smoothing.prior import EXACT_M, Prior
-from slam_observer_ros.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.types import FloatArray, IntArray
 
 ANYWHERE_M = 1e3
 """Standard deviation of a landmark of which nothing is known, metres."""

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
-from slam_observer_ros.truth import LandmarkTruth, PoseTruth
-from slam_observer_ros.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,12 +13,12 @@ import warnings
 
 import numpy as np
 
-from slam_observer_ros.errors import DataSetError
+from slam_observer_ros.common.errors import DataSetError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.datasets.data_set import DataSet
-from slam_observer_ros.truth import LandmarkTruth
-from slam_observer_ros.types import FloatArray, IntArray
 
 FIRST_LANDMARK_SUBJECT = 6
 """Subjects 1 to 5 are the robots."""

@@ -11,13 +11,13 @@ import zlib
 import numpy as np
 import scipy.io
 
-from slam_observer_ros.errors import DataSetError
+from slam_observer_ros.common.errors import DataSetError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.datasets.data_set import DataSet
-from slam_observer_ros.truth import LandmarkTruth
-from slam_observer_ros.types import FloatArray, IntArray
-from slam_observer_ros.units import NANOSECONDS_PER_SECOND
 
 EPOCH_NS = 1_256_566_448 * NANOSECONDS_PER_SECOND
 """Time zero of the recording, which states none: when its file was made, 2009-10-26."""

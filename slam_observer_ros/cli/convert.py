@@ -1,0 +1,55 @@
+"""``slam-observer convert``: public data sets as recordings."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from slam_observer_ros.cli.console import print_table
+from slam_observer_ros.cli.outputs import add_force_option, check_outputs, recording_path
+from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.recording.datasets.starry_night import load_starry_night
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the command line."""
+    parser = commands.add_parser(
+        'convert',
+        help='make a recording of a public data set',
+        description='Make an MCAP recording, with TwistStamped, PointCloud2 and the truth, '
+        'of a public data set.',
+    )
+    data_sets = parser.add_subparsers(dest='data_set', required=True, metavar='DATA-SET')
+    starry_night = data_sets.add_parser(
+        'starry-night', help='stereo camera and IMU moved by hand: dataset3.mat'
+    )
+    starry_night.add_argument('file', type=Path, metavar='FILE', help='dataset3.mat')
+    starry_night.set_defaults(run=_run, load=lambda args: load_starry_night(args.file))
+    mrclam = data_sets.add_parser(
+        'mrclam', help='wheeled robots among coded landmarks: MRCLAM_Dataset1 to 9'
+    )
+    mrclam.add_argument('folder', type=Path, metavar='FOLDER', help='such as MRCLAM_Dataset6')
+    mrclam.add_argument(
+        '--robot', type=int, required=True, metavar='N', help='which robot, from 1 to 5'
+    )
+    mrclam.set_defaults(run=_run, load=lambda args: load_mrclam(args.folder, args.robot))
+    for data_set in (starry_night, mrclam):
+        data_set.add_argument(
+            'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
+        )
+        add_force_option(data_set)
+
+
+def _run(args: argparse.Namespace) -> None:
+    check_outputs([args.output], args.force)
+    data_set: DataSet = args.load(args)
+    write_data_set(data_set, args.output, args.force)
+    rows = {
+        'velocities': str(len(data_set.velocity_stamps_ns)),
+        'observations': str(len(data_set.observations)),
+        'true poses': str(len(data_set.truth_stamps_ns)),
+        'true landmarks': str(len(data_set.landmarks.ids)),
+    }
+    rows |= {f'left out: {reason}': str(count) for reason, count in data_set.left_out.items()}
+    print_table(str(args.output), rows)

@@ -1,0 +1,115 @@
+"""The ``slam-observer`` command: the observer on simulations and recordings, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import io
+import logging
+import os
+from pathlib import Path
+import signal
+import sys
+from typing import Any, NoReturn
+
+from slam_observer_ros import __version__
+from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
+from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.common.threads import use_one_thread
+from slam_observer_ros.settings.parameter_table import suggestion
+
+EXIT_ERROR = 2
+EXIT_SIGNAL = 128
+"""To which the number of the signal that ended the program is added, as shells do."""
+
+EXAMPLES = """\
+examples:
+  slam-observer simulate --plot figures
+      the paper's simulation, and its figures 3 and 4
+  slam-observer convert mrclam MRCLAM_Dataset6 --robot 1 robot1.mcap
+      a public data set as a recording
+  slam-observer replay robot1.mcap --plot figures --tum robot1.tum
+      a recording through the observer, and its accuracy
+  slam-observer replay my_robot.mcap --config my_robot.yaml --json
+      your own recording, with the parameter file of your observer_node
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line, and that guesses no option from its start."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(allow_abbrev=False, **settings)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse what is not known here, where the command whose help tells more is known."""
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            meant = suggestion(unknown[0].partition('=')[0], self._option_string_actions)
+            self.error(f'unrecognized arguments: {" ".join(unknown)}{meant}')
+        return namespace, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Show what is wrong and where help is, and exit."""
+        show_message('error', f"{message}; see '{self.prog} --help'")
+        sys.exit(EXIT_ERROR)
+
+
+def make_parser() -> Parser:
+    """Return the parser of the whole command line."""
+    # These take a second to load. Here, Ctrl-C meanwhile is handled as it is at any other time.
+    from slam_observer_ros.cli import convert, simulate
+    from slam_observer_ros.cli.replay import replay
+
+    parser = Parser(
+        prog=PROGRAM,
+        description='The SLAM observer of Mahony and Hamel on simulations and recordings.',
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
+    commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
+    for command in (simulate, convert, replay):
+        command.add_parser(commands)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Default: those that the program was started with.
+
+    """
+    if sys.stdout is None:  # a shell has closed it
+        sys.stdout = Path(os.devnull).open('w', encoding='utf-8')  # noqa: SIM115 (till the end)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors='replace')  # a terminal without ± is no reason to end
+    try:
+        logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
+        args = make_parser().parse_args(arguments)
+        use_one_thread()
+        # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
+        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(EXIT_SIGNAL + number))
+        args.run(args)
+        sys.stdout.flush()
+    except (SlamObserverError, OSError) as error:
+        if isinstance(error, BrokenPipeError):
+            return _leave_broken_pipe()
+        show_message('error', str(error))
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        return EXIT_SIGNAL + signal.SIGINT
+    return 0
+
+
+def _leave_broken_pipe() -> int:
+    """Let the interpreter flush to nowhere at exit: whoever read the output has gone."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return EXIT_SIGNAL + signal.SIGPIPE
+
+
+if __name__ == '__main__':
+    sys.exit(main())

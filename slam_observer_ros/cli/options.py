@@ -1,0 +1,198 @@
+"""Command-line options that several commands share: the estimator's settings, typed values."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
+from importlib import metadata
+import json
+import logging
+import os
+from pathlib import Path
+from types import MappingProxyType
+
+from slam_observer_ros.common.errors import ParameterError, UsageError
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.parameter_file import (
+    mixed_lists,
+    names_of_others,
+    read_parameter_file,
+)
+from slam_observer_ros.settings.parameter_table import from_parameters, Parameter, table, Value
+
+logger = logging.getLogger(__name__)
+
+_PACKAGE = 'slam_observer_ros'
+_ESTIMATOR_NAMES = frozenset(row.name for row in table(Settings))
+_NODE_NAMES = frozenset(row.name for row in table(ObserverNodeSettings))
+_ROS_NAMES = ('use_sim_time', 'qos_overrides.', 'start_type_description_service')
+"""Parameters that every ROS node has; a name that ends with a dot stands for all below it."""
+
+
+def add_settings_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--config``, ``--gains`` and ``--set``."""
+    gains = next(row for row in table(Settings) if row.name == 'gains')
+    group = parser.add_argument_group('estimator')
+    group.add_argument(
+        '--config',
+        metavar='FILE',
+        help="the observer node's parameter file, or the name of one that comes with the package",
+    )
+    group.add_argument('--gains', choices=gains.choices, help='gain design')
+    group.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='set any other parameter of the estimator; may be given several times',
+    )
+
+
+def read_settings(
+    args: argparse.Namespace,
+    other_names: Collection[str] = (),
+    instead: Mapping[str, str] = MappingProxyType({}),
+    **defaults: Value,
+) -> Settings:
+    """Build settings from defaults, ``--config``, ``--set`` and ``--gains``; later ones win.
+
+    Parameters
+    ----------
+    args : Namespace
+        With the options of :func:`add_settings_options`.
+    other_names : collection of str
+        Names that ``--set`` takes for other settings of the command.
+    instead : mapping of str to str
+        Options that do what the node's parameters of these names do.
+    **defaults : Value
+        What the command sets if the user doesn't.
+
+    Raises
+    ------
+    SlamObserverError
+        If a file, a name or a value is wrong.
+
+    """
+    values: dict[str, object] = dict(defaults)
+    values |= _for_estimator(read_config(args))
+    for name, value in read_assignments(args).items():
+        if name in other_names:
+            continue
+        if _is_only_for_node(name):
+            hint = f'use {instead[name]}' if name in instead else 'of no use here'
+            raise UsageError(f"--set {name}: that is the node's parameter; {hint}")
+        values[name] = value
+    if args.gains is not None:
+        values['gains'] = args.gains
+    return from_parameters(Settings, values)
+
+
+def read_config(args: argparse.Namespace) -> dict[str, object]:
+    """Read the parameter file that ``--config`` names, the node's own parameters included."""
+    return {} if args.config is None else read_parameter_file(find_config(args.config))
+
+
+def read_assignments(args: argparse.Namespace) -> dict[str, object]:
+    """Return what ``--set`` sets, by name."""
+    return dict(_parse_assignment(text) for text in args.set)
+
+
+def _is_only_for_node(name: str) -> bool:
+    if name in _ESTIMATOR_NAMES:
+        return False
+    return name in _NODE_NAMES or any(
+        name.startswith(ros_name) if ros_name.endswith('.') else name == ros_name
+        for ros_name in _ROS_NAMES
+    )
+
+
+def _for_estimator(values: Mapping[str, object]) -> dict[str, object]:
+    """Return what of a parameter file is for the estimator.
+
+    Other names than the observer's are ignored with a warning, as by the node: they may be other
+    nodes'.
+    """
+    written = [name for name in values if not _is_only_for_node(name)]
+    unknown = names_of_others(written, _ESTIMATOR_NAMES | _NODE_NAMES)
+    if unknown and len(unknown) == len(values):
+        raise ParameterError("none of the parameters of --config is the observer's")
+    if mixed := mixed_lists(values):
+        logger.warning(
+            "The node can't read %s of --config: in ROS all numbers of a list are written alike, "
+            '0.0 for 0.',
+            ', '.join(mixed),
+        )
+    if unknown:
+        logger.warning('Unknown parameters of --config are ignored: %s.', ', '.join(unknown))
+    return {name: value for name, value in values.items() if name in _ESTIMATOR_NAMES}
+
+
+def find_config(name: str) -> Path:
+    """Return the path of a parameter file, or of one that comes with the package, by its name."""
+    path = Path(name)
+    shipped = {file.stem: file for file in _shipped_configs()}
+    if path.exists() or len(path.parts) > 1:
+        return path
+    if path.stem in shipped and path.suffix in ('', '.yaml'):
+        return shipped[path.stem]
+    if path.suffix:
+        return path
+    usable = sorted(name for name, file in shipped.items() if _is_for_observer(file))
+    raise ParameterError(
+        f"no parameter file '{name}'; those that come with the package: "
+        f'{", ".join(usable) or "none"}'
+    )
+
+
+def _is_for_observer(file: Path) -> bool:
+    try:
+        return bool(read_parameter_file(file))
+    except ParameterError:
+        return False
+
+
+def _shipped_configs() -> Iterable[Path]:
+    """List the files in config/ of the source tree, or of where pip or ROS has installed it."""
+    share = Path('share') / _PACKAGE / 'config'
+    names = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    prefixes = [Path(name) for name in names if name]
+    installed: Iterable[metadata.PackagePath] = ()
+    with suppress(metadata.PackageNotFoundError):
+        installed = metadata.files(_PACKAGE) or ()
+    return (
+        *(Path(__file__).parents[2] / 'config').glob('*.yaml'),
+        *(Path(str(file.locate())) for file in installed if file.match(f'{share}/*.yaml')),
+        *(file for prefix in reversed(prefixes) for file in (prefix / share).glob('*.yaml')),
+    )
+
+
+def _parse_assignment(text: str) -> tuple[str, object]:
+    name, equals, value = text.partition('=')
+    if not (name and equals):
+        raise UsageError(f"--set takes NAME=VALUE, not '{text}'")
+    return name, _parse_value(value)
+
+
+def _parse_value(text: str) -> object:
+    """Read a number, true, false or a [list]; anything else is a string."""
+    if text in ('True', 'False'):  # as YAML has it, too
+        return text == 'True'
+    with suppress(ValueError, RecursionError):  # of what is no JSON, has too many digits or levels
+        return json.loads(text)
+    with suppress(ValueError):
+        return float(text)
+    return text
+
+
+def value_of(row: Parameter) -> Callable[[str], Value]:
+    """Return an argparse type that takes what the parameter ``row`` takes."""
+
+    def parse(text: str) -> Value:
+        try:
+            return row.check(_parse_value(text))
+        except ParameterError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return parse

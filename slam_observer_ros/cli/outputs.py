@@ -1,0 +1,152 @@
+"""Output files: refused before the work if they are in the way, and never half-written."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import tempfile
+
+from slam_observer_ros.common.errors import EvaluationError, OutputError, UsageError
+from slam_observer_ros.common.output_files import destination
+
+
+def add_force_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--force``."""
+    parser.add_argument('--force', action='store_true', help='replace files that exist already')
+
+
+def recording_path(text: str) -> Path:
+    """Take the name of a recording to be made, as an argparse type."""
+    path = Path(text)
+    if path.suffix != '.mcap':
+        raise argparse.ArgumentTypeError(f"recordings are .mcap files, so not '{text}'")
+    return path
+
+
+def figures_path(text: str) -> Path:
+    """Take the name of a directory for figures, as an argparse type."""
+    if not text:
+        raise argparse.ArgumentTypeError('a directory is needed: . for this one')
+    return Path(text)
+
+
+def check_outputs(files: Iterable[Path | None], force: bool) -> None:
+    """Refuse files that can't be written, before any work is done.
+
+    Parameters
+    ----------
+    files : iterable of Path or None
+        Files to be written; None for those not asked for.
+    force : bool
+        Whether files may be replaced.
+
+    Raises
+    ------
+    UsageError
+        If a file exists and may not be replaced, is a directory, a pipe or a device, or would
+        lie in no directory or one that may not be written to, or two are the same.
+
+    """
+    wanted = [file for file in files if file is not None]
+    for number, file in enumerate(wanted):
+        if file.is_dir():
+            raise UsageError(f'{file} is a directory; give the name of a file')
+        if file.exists() and not file.is_file():
+            raise UsageError(f'{file} is there, and no regular file; give another name')
+        if file.exists() and not force:
+            raise UsageError(f'{file} exists already; give another name, or --force to replace it')
+        if not file.parent.is_dir():
+            raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
+        if not os.access(file.parent, os.W_OK):
+            raise UsageError(f'{file}: nothing may be written to {file.parent}')
+        if file.resolve() in [other.resolve() for other in wanted[:number]]:
+            raise UsageError(f'{file} is named for two outputs')
+
+
+def check_inputs_stay(
+    outputs: Mapping[str, Path | None], inputs: Mapping[str, Iterable[Path]]
+) -> None:
+    """Refuse outputs that would replace a file which is read, by whatever name.
+
+    Parameters
+    ----------
+    outputs : mapping of str to Path or None
+        Files to be written, by option; None for those not asked for.
+    inputs : mapping of str to iterable of Path
+        Files that are read, by what they are.
+
+    Raises
+    ------
+    UsageError
+        If a file is both.
+
+    """
+    read = {file.resolve(): what for what, files in inputs.items() for file in files}
+    for option, file in outputs.items():
+        if file is not None and file.resolve() in read:
+            what = read[file.resolve()]
+            raise UsageError(f'{option} {file} would replace {what}; give another name')
+
+
+def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> None:
+    """Refuse a directory for figures that can't take them.
+
+    Parameters
+    ----------
+    directory : Path or None
+        Where the figures go; it need not exist, but its parent must. None if none are asked for.
+    names : iterable of str
+        Names of the figures.
+    force : bool
+        Whether figures may be replaced.
+
+    Raises
+    ------
+    UsageError
+        If it is a file, lies in no directory or one that may not be written to, or holds one of
+        the figures already.
+
+    """
+    if directory is None:
+        return
+    if directory.is_dir():
+        check_outputs((directory / name for name in names), force)
+    elif directory.exists():
+        raise UsageError(f'{directory} is a file; give a directory for the figures')
+    elif not directory.parent.is_dir():
+        raise UsageError(f'{directory}: there is no directory {directory.parent}; make it first')
+    elif not os.access(directory.parent, os.W_OK):
+        raise UsageError(f'{directory}: nothing may be written to {directory.parent}')
+
+
+@contextmanager
+def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
+    """Give a directory to write in, whose files go to ``directory`` when all are written.
+
+    Of ``names`` those that were not written this time are removed from there.
+
+    Raises
+    ------
+    OutputError
+        If that fails.
+
+    """
+    beside = directory if directory.is_dir() else directory.parent
+    try:
+        with tempfile.TemporaryDirectory(dir=beside, prefix='.writing-') as unfinished:
+            try:
+                yield Path(unfinished)
+            except EvaluationError as error:  # which names a directory that is gone then
+                raise OutputError(str(error).replace(unfinished, str(directory))) from error
+            directory.mkdir(exist_ok=True)
+            files = sorted(Path(unfinished).iterdir())
+            for file in files:
+                file.replace(destination(directory / file.name))
+            for name in set(names) - {file.name for file in files}:
+                (directory / name).unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or error  # its whole text names a directory that is gone by now
+        raise OutputError(f"can't write figures to {directory}: {reason}") from error

@@ -1,0 +1,1 @@
+"""``slam-observer replay``."""

@@ -1,0 +1,215 @@
+"""What a replay must have, and what it gives reason to warn of, before its outcome is told."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.cli.replay.replay_outcome import unused_messages
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.counts import MAX_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.events import is_automatic
+from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.runs.replay import Replay
+from slam_observer_ros.settings.input_settings import InputSettings
+
+MAX_UNMAPPED = 0.5
+"""Share of the points beyond which they are more than what a map lacks."""
+
+PLACES = (
+    '--set sensor_pose=[X,Y,Z,ROLL,PITCH,YAW] places a sensor that is not on /tf, '
+    '--base-frame names another frame of the robot'
+)
+"""What to do where /tf does not connect sensor and robot."""
+
+logger = logging.getLogger(__name__)
+
+
+def tell_restart(result: Replay) -> None:
+    """Warn if only a part of the recording is told of, because the clock jumped."""
+    if not result.restarts:
+        return
+    logger.warning(
+        'Trajectory, map, errors and figures are only of the %.1f s after the last jump of the '
+        'clock (%d in all).',
+        result.seconds_until(result.estimator.stamp_ns or 0),
+        result.restarts,
+    )
+
+
+def check_used(
+    args: argparse.Namespace,
+    recording: Recording,
+    selected: SelectedTopics,
+    inputs: InputSettings,
+    result: Replay,
+) -> None:
+    """Warn if no velocity was used, none of the Imu, or no observation.
+
+    Raises
+    ------
+    UsageError
+        If no observation was used though ``--smooth``, ``--map`` or ``--load-map`` needs some.
+
+    """
+    dropped = result.estimator.dropped + unused_messages(recording, selected)
+    _warn_of_unused_velocities(selected, result, dropped)
+    counts = result.estimator.counts
+    # In a map that was loaded there may be none because the place was not found: told elsewhere.
+    if result.observations or (counts['observed_point'] and not result.estimator.is_localised):
+        return
+    unused = Counter({'without a point that is used': counts['observation']})
+    unused += Counter({f'points {fate}': counts[name] for name, fate in UNUSED_POINTS.items()})
+    why = f'observation was used (dropped: {list_dropped(unused + dropped)})'
+    hint = ''
+    if recording.dropped[NO_TRANSFORM] or not unused + dropped:
+        hint = recording.contents.missing_tags(selected, inputs.tag_frame_prefix)
+    if recording.dropped[NO_TRANSFORM]:
+        hint = hint or PLACES
+    why += f'; {hint}' if hint else ''
+    if args.smooth or args.map is not None or args.load_map is not None:
+        raise UsageError(f'no {why}; --smooth, --map and --load-map need some')
+    logger.warning('No %s; the trajectory is that of the velocities alone.', why)
+
+
+def _warn_of_unused_velocities(
+    selected: SelectedTopics, result: Replay, dropped: Counter[str]
+) -> None:
+    if not result.estimator.counts['velocity']:
+        logger.warning(
+            'No velocity was used (dropped: %s); the landmarks alone move the robot.',
+            list_dropped(dropped),
+        )
+    if selected.imu is not None and not result.angular_velocities:
+        logger.warning(
+            'No angular velocity of %s was used (dropped: %s); that of %s was taken.',
+            selected.imu.name,
+            list_dropped(dropped),
+            selected.velocity.name,
+        )
+
+
+def list_dropped(dropped: Mapping[str, int]) -> str:
+    """Return how many events were dropped, by reason, as text."""
+    return ', '.join(f'{count} {reason}' for reason, count in dropped.items()) or 'none'
+
+
+def check_place(args: argparse.Namespace, result: Replay, known: LandmarkMap) -> None:
+    """Refuse an outcome that is not in the frame of the map that was loaded.
+
+    Where the place was found and lost again the trajectory is still of use, but not the map.
+
+    Raises
+    ------
+    UsageError
+        If the place was never found, or is not known at the end and the map is asked for.
+
+    """
+    if result.estimator.is_localised:
+        return
+    if not len(result.trajectory):
+        raise UsageError(_never_found(args.load_map, result, known))
+    end_s = result.seconds_until(result.trajectory.stamps_ns[-1])
+    lost = (
+        f'the place in the map {args.load_map} was lost after {end_s:.1f} s, and not found again'
+    )
+    if args.map is not None or args.smooth:
+        raise UsageError(f'{lost}; --map and --smooth need it at the end')
+    logger.warning('%s; the trajectory ends there.', lost[0].upper() + lost[1:])
+
+
+def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
+    named = known.ids[~is_automatic(known.ids)]
+    least = 'two' if result.estimator.settings.two_d_mode else 'three'
+    return (
+        f'the place in the map {path} was not found: that takes {least} of its landmarks or more, '
+        'recognised by their ids, well apart, and seen where the map has them; '
+        f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(known.ids)} were '
+        f'seen{_advice(result)}'
+    )
+
+
+def _advice(result: Replay) -> str:
+    """Return what to do if the landmarks seen did not tell the place."""
+    counts, settings = result.estimator.counts, result.estimator.settings
+    if counts['unknown_id'] and settings.gains != 'riccati':
+        return f'; {counts["unknown_id"]} points without id take --gains riccati'
+    if 2 * counts['repeated_id'] > counts['observed_point']:
+        return f'; {counts["repeated_id"]} points were {UNUSED_POINTS["repeated_id"]}'
+    if settings.set_initial_pose:
+        return '; they contradict the pose that was told'
+    return (
+        '. Where the start is known: --set set_initial_pose=true '
+        '--set initial_position=[X,Y,Z] --set initial_yaw=YAW'
+    )
+
+
+def warn_of_input(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
+    """Say what of the recording, or of the settings, is likely to be wrong."""
+    _warn_of_missing_stamps(recording)
+    _warn_of_rejections(result)
+    _warn_of_calibration(result)
+    _warn_of_unmapped(result)
+    _warn_of_unused_poses(recording, selected, result)
+
+
+def _warn_of_missing_stamps(recording: Recording) -> None:
+    """Say which times were used, if publishers don't fill in header.stamp."""
+    if recording.unstamped:
+        logger.warning(
+            'Stamps are zero on %s; %d messages have the time of their reception instead.',
+            ', '.join(recording.unstamped),
+            recording.unstamped.total(),
+        )
+
+
+def _warn_of_rejections(result: Replay) -> None:
+    """Say what may be wrong if more points were rejected than a sensor has outliers."""
+    share = point_share(result.estimator.counts, 'rejected_landmark')
+    if share > MAX_REJECTED:
+        logger.warning(
+            '%.0f %% of the points were rejected: look at the signs, units and frames of the '
+            'velocity and of the points, then at their noise%s.',
+            100.0 * share,
+            ', and whether the map is still true' if result.in_known_map else '',
+        )
+
+
+def _warn_of_calibration(result: Replay) -> None:
+    """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
+    for part in result.estimator.calibration:
+        if part.trouble:
+            logger.warning('%s', part.trouble)
+
+
+def _warn_of_unmapped(result: Replay) -> None:
+    """Say what may be wrong if most points are of no landmark of a map that does not grow."""
+    settings = result.estimator.settings
+    share = point_share(result.estimator.counts, 'unmapped_landmark')
+    is_growing = not result.in_known_map or settings.localization_mode == 'off'
+    if share > MAX_UNMAPPED and not is_growing:
+        logger.warning(
+            '%.0f %% of the points are of no landmark of the map: is it the map of this place%s?',
+            100.0 * share,
+            ', and did the robot start where it was said to' if settings.set_initial_pose else '',
+        )
+
+
+def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
+    """Say where the motion is, if an odometry's velocities are all zero and its poses are not."""
+    poses = result.dead_reckoning.poses
+    stands_still = len(poses) > 1 and bool((poses == poses[0]).all())
+    if stands_still and recording.contents.poses_move(selected.velocity):
+        logger.warning(
+            'All velocities on %s are zero, but its poses move; '
+            'try --velocity-source pose_differences.',
+            selected.velocity.name,
+        )

@@ -1,0 +1,135 @@
+"""A replay, and how accurate it was."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+import logging
+
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.evaluation.metrics import TrajectoryErrors
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.runs.accuracy import Accuracy, measure, measure_smoothed
+from slam_observer_ros.runs.replay import Replay
+
+MALFORMED = 'malformed'
+"""Reason under which messages that can't be decoded are counted."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOutcome:
+    """A replay and all that is told about it.
+
+    Attributes
+    ----------
+    selected : SelectedTopics
+        Which topics were used.
+    result : Replay
+        What the estimator made of the recording.
+    truth : Truth
+        What the recording holds of it.
+    accuracy : Accuracy
+        The one compared with the other.
+    duration_s : float
+        Time that the recording spans, seconds.
+    unused : Counter
+        Messages that did not become events, by reason.
+    missing_ids : str
+        What :meth:`.Contents.missing_ids` says of the landmarks.
+    smoothed, smoothed_errors, smoothed_landmark_rmse_m
+        Trajectory and map in hindsight and how far they are off; None if not asked for.
+
+    """
+
+    selected: SelectedTopics
+    result: Replay
+    truth: Truth
+    accuracy: Accuracy
+    duration_s: float
+    unused: Counter[str]
+    missing_ids: str
+    smoothed: Smoothed | None = None
+    smoothed_errors: TrajectoryErrors | None = None
+    smoothed_landmark_rmse_m: float | None = None
+
+    @property
+    def events(self) -> int:
+        """How many events came in, dropped ones included."""
+        return self.result.events + self.unused.total()
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How many of them were dropped, by reason."""
+        return dict(self.result.estimator.dropped + self.unused)
+
+    @property
+    def truth_covered(self) -> float | None:
+        """Share of the trajectory that the truth covers; None without true poses."""
+        errors = self.accuracy.pose_errors
+        return None if errors is None else float(errors.covered.mean())
+
+    @property
+    def localised_after_s(self) -> float | None:
+        """Time until the place in a loaded map was found, seconds; None without such a map."""
+        if not (self.result.in_known_map and len(self.result.trajectory)):
+            return None
+        return self.result.seconds_until(self.result.trajectory.stamps_ns[0])
+
+    @property
+    def unaligned_rmse_m(self) -> float | None:
+        """See :class:`.TrajectoryErrors`; None without truth or a loaded map."""
+        errors = self.accuracy.pose_errors
+        return errors.unaligned_rmse_m if errors and self.result.in_known_map else None
+
+
+def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[str]:
+    """Count the messages that did not become events, by reason."""
+    malformed = sum(recording.malformed[topic.name] for topic in selected.inputs)
+    return recording.dropped + Counter({MALFORMED: malformed})
+
+
+def outcome_of(
+    recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
+) -> ReplayOutcome:
+    """Measure a replay of a recording that has been read to its end."""
+    return ReplayOutcome(
+        selected,
+        result,
+        truth,
+        measure(result, truth),
+        recording.duration_s,
+        unused_messages(recording, selected),
+        recording.contents.missing_ids(selected.landmarks),
+    )
+
+
+def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
+    """Add what the whole recording tells in hindsight.
+
+    Raises
+    ------
+    UsageError
+        If the history holds no observation.
+
+    """
+    smoothed = outcome.result.estimator.smooth()
+    if not len(smoothed.stamps_ns):
+        raise UsageError(f'nothing to smooth: no observation since {smoothed.since}')
+    if len(smoothed.stamps_ns) < outcome.result.observations:
+        logger.warning(
+            'Only the last %d observations are smoothed: those since %s.',
+            len(smoothed.stamps_ns),
+            smoothed.since,
+        )
+    errors, landmark_rmse_m = measure_smoothed(smoothed, outcome.truth)
+    return replace(
+        outcome,
+        smoothed=smoothed,
+        smoothed_errors=errors,
+        smoothed_landmark_rmse_m=landmark_rmse_m,
+    )

@@ -1,0 +1,149 @@
+"""What ``slam-observer replay`` tells of its outcome."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from slam_observer_ros.cli.console import print_table
+from slam_observer_ros.cli.replay.replay_checks import list_dropped
+from slam_observer_ros.cli.replay.replay_outcome import ReplayOutcome
+from slam_observer_ros.counts import point_share, UNUSED_POINTS, used_points
+from slam_observer_ros.evaluation.metrics import TrajectoryErrors
+from slam_observer_ros.runs.replay import Replay
+
+NEARLY_ALL = 0.99
+"""Share of the trajectory that the truth covers, up to which it is told."""
+
+LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
+"""What befalls landmarks that are in the map."""
+
+ACCURACY_ROWS = {
+    'ate_rmse_m': ('position error (ATE), RMS', 'm after alignment'),
+    'dead_reckoning_ate_rmse_m': ('of the velocities alone', 'm after alignment'),
+    'unaligned_rmse_m': ('position error, not aligned', "m if the truth is in the map's frame"),
+    'heading_rmse_rad': ('heading error, RMS', 'rad after alignment'),
+    'landmark_rmse_m': ('landmark error, RMS', 'm after alignment'),
+    'configuration_rmse_m': ('configuration error, RMS', 'm, not aligned'),
+    'anees': ('ANEES of the pose', '(1 is consistent)'),
+    'configuration_anees': ('ANEES of the configuration', '(1 is consistent)'),
+    'smoothed_ate_rmse_m': ('smoothed: position error, RMS', 'm after alignment'),
+    'smoothed_landmark_rmse_m': ('smoothed: landmark error, RMS', 'm after alignment'),
+}
+"""Figures of ``--json`` that are in the table, their names there and their units."""
+
+
+def as_json(outcome: ReplayOutcome) -> dict[str, object]:
+    """Return the figures as ``--json`` prints them; null is what was not measured."""
+    estimator, accuracy = outcome.result.estimator, outcome.accuracy
+    errors = accuracy.pose_errors
+    selected = outcome.selected
+    return {
+        'velocity_topic': selected.velocity.name,
+        'landmarks_topic': selected.landmarks.name,
+        'imu_topic': None if selected.imu is None else selected.imu.name,
+        'gains': estimator.settings.gains,
+        'events': outcome.events,
+        'duration_s': outcome.duration_s,
+        'seconds': outcome.result.seconds,
+        'landmarks': len(estimator.landmark_ids),
+        'dropped': outcome.dropped,
+        'used': dict(estimator.counts),
+        'calibration': {part.name: asdict(part) for part in estimator.calibration},
+        'localised_after_s': outcome.localised_after_s,
+        'truth_covered': outcome.truth_covered,
+        'ate_rmse_m': _ate_rmse_m(errors),
+        'unaligned_rmse_m': outcome.unaligned_rmse_m,
+        'rotation_rmse_rad': None if errors is None else errors.rotation_rmse_rad,
+        'heading_rmse_rad': None if errors is None else errors.heading_rmse_rad,
+        'landmark_rmse_m': accuracy.landmark_rmse_m,
+        'configuration_rmse_m': accuracy.configuration_rmse_m,
+        'anees': accuracy.anees,
+        'configuration_anees': accuracy.configuration_anees,
+        'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
+        'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
+        'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,
+    }
+
+
+def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
+    return None if errors is None else errors.ate_rmse_m
+
+
+def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str, Path]) -> None:
+    """Print the figures as a table, and what was written where."""
+    selected = outcome.selected
+    estimator = outcome.result.estimator
+    note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
+    rows = {
+        'velocity topic': str(selected.velocity),
+        'landmarks topic': f'{selected.landmarks}{note}',
+        **({} if selected.imu is None else {'Imu topic': str(selected.imu)}),
+        'events': f'{outcome.events} over {outcome.duration_s:.1f} s',
+        'estimator': f'{estimator.settings.gains} gains, '
+        f'{outcome.result.seconds:.2f} s of CPU time',
+        'landmarks': _told_landmarks(len(estimator.landmark_ids), estimator.counts),
+        'observed points': _told_points(estimator.counts),
+        'dropped': list_dropped(outcome.dropped),
+    }
+    if slips := estimator.counts['slip']:
+        rows['slips'] = f'{slips} × the robot was not where odometry had it'
+    if strange := estimator.counts['strange_place']:
+        rows['strange places'] = f'{strange} × nothing seen was where the map has it'
+    if outcome.localised_after_s is not None:
+        rows['place in the map'] = _told_place(outcome.result, outcome.localised_after_s)
+    rows |= {part.name: str(part) for part in estimator.calibration}
+    rows |= _accuracy_rows(outcome)
+    rows |= {name: str(path) for name, path in written.items()}
+    print_table(str(recording), rows)
+
+
+def _told_place(result: Replay, localised_after_s: float) -> str:
+    told = f'found after {localised_after_s:.1f} s, where the trajectory begins'
+    if result.estimator.settings.set_initial_pose:
+        told = 'given at the start'
+    lost = result.estimator.counts['lost']
+    return f'{told}; lost {lost} × and searched anew' if lost else told
+
+
+def _told_landmarks(landmarks: int, counts: Counter[str]) -> str:
+    befell = {fate: counts[f'{fate}_landmark'] for fate in LANDMARK_FATES}
+    told = [f'{count} {fate}' for fate, count in befell.items() if count]
+    return ', '.join([str(landmarks), *told])
+
+
+def _told_points(counts: Counter[str]) -> str:
+    """Tell how many points were used, and what befell the others."""
+    told = [f'{used_points(counts)} used']
+    told += [
+        f'{counts[name]} {fate} ({100.0 * point_share(counts, name):.1f} %)'
+        for name, fate in UNUSED_POINTS.items()
+        if counts[name]
+    ]
+    return ', '.join(told)
+
+
+def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
+    """Tell of how much of the trajectory the figures are, if not of nearly all."""
+    share = outcome.truth_covered
+    if share is None or share > NEARLY_ALL:
+        return {}
+    return {'truth': f'covers {100.0 * share:.1f} % of the trajectory'}
+
+
+def _accuracy_rows(outcome: ReplayOutcome) -> dict[str, str]:
+    figures = as_json(outcome)
+    rows = _covered_rows(outcome) | {
+        name: f'{figures[key]:.3f} {unit}'
+        for key, (name, unit) in ACCURACY_ROWS.items()
+        if figures[key] is not None
+    }
+    if rows:
+        return rows
+    has_truth = len(outcome.truth.stamps_ns) > 0 or outcome.truth.landmarks is not None
+    why = 'the truth fits nothing estimated'
+    if not has_truth:
+        why = 'the recording holds no truth to compare with'
+    return {'accuracy': f'not known: {why}'}

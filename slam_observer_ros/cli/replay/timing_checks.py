@@ -1,0 +1,94 @@
+"""What a replay warns of in the times of its messages: silence, and clocks that differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import logging
+
+from slam_observer_ros.recording.arrivals import Arrivals
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.topics import SelectedTopics
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+MAX_CLOCK_OFFSET_S = ObserverNodeSettings.max_clock_offset
+
+MAX_SILENCE = 0.1
+"""Share of the time beyond which velocities that are missing are more than a pause."""
+
+MAX_END_SILENCE = 1.0 / 3.0
+"""Share of the time after which landmarks that come no more are more than out of view."""
+
+FEWEST = 10
+"""Messages that a topic of landmarks has at least if it can be said to have ended."""
+
+logger = logging.getLogger(__name__)
+
+
+def warn_of_timing(recording: Recording, selected: SelectedTopics, timeout_s: float) -> None:
+    """Say which inputs were silent for long, or have the stamps of another clock.
+
+    Parameters
+    ----------
+    recording : Recording
+        Read to its end.
+    selected : SelectedTopics
+        The inputs.
+    timeout_s : float
+        How long a velocity holds, seconds.
+
+    """
+    names = [topic.name for topic in selected.inputs]
+    inputs = {name: recording.arrivals[name] for name in names if recording.arrivals[name]}
+    if not inputs:
+        return
+    start_s = min(arrivals.received_s[0] for arrivals in inputs.values())
+    end_s = recording.end_s
+    velocity, landmarks = selected.velocity.name, selected.landmarks.name
+    if velocity in inputs:
+        silence_s = inputs[velocity].silence_s(start_s, end_s, timeout_s)
+        fate = 'the pose was held, but for what landmarks say'
+        _warn_of_silence('velocity', velocity, silence_s, end_s - start_s, fate)
+    if selected.imu is not None and selected.imu.name in inputs:
+        silence_s = inputs[selected.imu.name].silence_s(start_s, end_s, timeout_s)
+        fate = f'that of {velocity} was taken'
+        _warn_of_silence('angular velocity', selected.imu.name, silence_s, end_s - start_s, fate)
+    if landmarks in inputs:
+        _warn_of_landmarks_end(landmarks, inputs[landmarks], start_s, end_s)
+    _warn_of_clocks(inputs)
+
+
+def _warn_of_silence(
+    what: str, topic_name: str, silence_s: float, duration_s: float, fate: str
+) -> None:
+    if silence_s > MAX_SILENCE * duration_s:
+        logger.warning(
+            'No %s on %s for %.1f s of %.1f s (velocity_timeout): %s.',
+            what, topic_name, silence_s, duration_s, fate,
+        )  # fmt: skip
+
+
+def _warn_of_landmarks_end(
+    topic_name: str, arrivals: Arrivals, start_s: float, end_s: float
+) -> None:
+    silence_s = end_s - arrivals.received_s[-1]
+    if len(arrivals) >= FEWEST and silence_s > MAX_END_SILENCE * (end_s - start_s):
+        logger.warning(
+            'No landmarks on %s for the last %.1f s of %.1f s: did the detector end?',
+            topic_name,
+            silence_s,
+            end_s - start_s,
+        )
+
+
+def _warn_of_clocks(inputs: Mapping[str, Arrivals]) -> None:
+    """Say which inputs have stamps that are far from those of the first, the velocity's."""
+    (first_name, first), *others = inputs.items()
+    for name, arrivals in others:
+        behind_s = arrivals.behind_s(first)
+        if abs(behind_s) > MAX_CLOCK_OFFSET_S:
+            logger.warning(
+                'Stamps of %s are %.1f s %s those of %s, by when both were received: synchronise '
+                'the clocks; a node with correct_clock_offset takes this recording, played with '
+                '--clock, as it is.',
+                name, abs(behind_s), 'behind' if behind_s > 0.0 else 'ahead of', first_name,
+            )  # fmt: skip

@@ -1,0 +1,185 @@
+"""``slam-observer simulate``: the paper's section VI, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+import math
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.cli.console import print_json, print_table, show_progress
+from slam_observer_ros.cli.options import add_settings_options, read_settings, value_of
+from slam_observer_ros.cli.outputs import (
+    add_force_option,
+    check_outputs,
+    check_plots,
+    figures_path,
+    filled_directory,
+    recording_path,
+)
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.evaluation.plots.simulation_plots import plot_configuration, plot_lyapunov
+from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.runs.simulated_run import run_simulation, SimulatedRun
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_table import from_parameters, table
+from slam_observer_ros.simulation import Scenario, SimulatedEvent, Simulation
+
+START_NS = 1_000_000_000
+"""Stamp of the first event; ROS takes a stamp of zero for an unknown one."""
+
+MAX_STEP_S = 10.0
+
+FIGURES = ('lyapunov.png', 'configuration.png')
+
+_SCENARIO_OPTIONS = {
+    '--seed': 'seed',
+    '--bias': 'initial_bias',
+    '--landmarks': 'landmark_count',
+    '--distance': 'landmark_distance',
+}
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the command line."""
+    parser = commands.add_parser(
+        'simulate',
+        help="run the paper's simulation",
+        description="Run the paper's simulation (section VI): a robot drives a circle of 5 m "
+        'radius and sees landmarks whose first sighting is biased; the observer makes up for it, '
+        "with the paper's constant gains if --gains names no others.",
+    )
+    parser.add_argument(
+        '--duration', type=float, default=80.0, metavar='S', help='simulated seconds (default 80)'
+    )
+    parser.add_argument(
+        '--step',
+        type=float,
+        default=0.02,
+        metavar='S',
+        help='seconds from one velocity and observation to the next (default 0.02)',
+    )
+    _add_scenario_options(parser)
+    parser.add_argument(
+        '--output', type=recording_path, metavar='OUT.mcap', help='write a recording'
+    )
+    parser.add_argument(
+        '--plot', type=figures_path, metavar='DIR', help=f'draw {", ".join(FIGURES)}'
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    add_force_option(parser)
+    add_settings_options(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_scenario_options(parser: argparse.ArgumentParser) -> None:
+    rows = {row.name: row for row in table(Scenario)}
+    for option, name in _SCENARIO_OPTIONS.items():
+        row = rows[name]
+        text = row.description[0].lower() + row.description[1:]
+        unit = f' [{row.unit}]' if row.unit else ''
+        parser.add_argument(
+            option,
+            dest=name,
+            type=value_of(row),
+            default=row.default,
+            metavar='N' if isinstance(row.default, int) else 'M',
+            help=f'{text}{unit} (default {row.default})',
+        )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Simulate, and write what was asked for."""
+    scenario = _scenario(args)
+    # The paper's gains, whatever is the best on real sensors; and each simulated velocity holds
+    # until the next one.
+    settings = read_settings(
+        args,
+        gains='constant',
+        velocity_timeout=max(2.0 * args.step, Settings().velocity_timeout),
+        max_innovation_time=max(args.step, Settings().max_innovation_time),
+    )
+    check_outputs([args.output], args.force)
+    check_plots(args.plot, FIGURES, args.force)
+    simulation = Simulation(scenario, START_NS)
+    result = run_simulation(simulation, _events(simulation, 'simulating'), settings)
+    if args.output is not None:
+        _record(simulation, args.output, args.force)
+    if args.plot is not None:
+        with filled_directory(args.plot, FIGURES) as unfinished:
+            _draw(simulation, result, unfinished)
+    if args.json:
+        print_json(_as_json(args, result))
+    else:
+        _print_summary(args, result)
+
+
+def _scenario(args: argparse.Namespace) -> Scenario:
+    if not 0.0 < args.step <= MAX_STEP_S:
+        raise UsageError(f'--step takes seconds above 0, up to {MAX_STEP_S:g}, not {args.step:g}')
+    if not args.step <= args.duration < math.inf:
+        raise UsageError(
+            f'--duration takes seconds, at least one step of {args.step:g}, not {args.duration:g}'
+        )
+    values = {name: getattr(args, name) for name in _SCENARIO_OPTIONS.values()}
+    values['duration'] = args.duration
+    values['velocity_rate'] = values['observation_rate'] = 1.0 / args.step
+    return from_parameters(Scenario, values)
+
+
+def _events(simulation: Simulation, description: str) -> Iterator[SimulatedEvent]:
+    scenario = simulation.scenario
+    total = round(scenario.end_s * (2.0 * scenario.velocity_rate + scenario.observation_rate))
+    events = (delivery.event for delivery in simulation.deliveries())
+    return show_progress(events, description, total)
+
+
+def _record(simulation: Simulation, path: Path, force: bool) -> None:
+    start_ns = simulation.start_ns
+    with RecordingWriter(path, overwrite=force) as writer:
+        writer.write_landmarks(start_ns, simulation.landmark_truth(start_ns))
+        for event in _events(simulation, 'recording'):
+            writer.write_event(event)
+
+
+def _draw(simulation: Simulation, result: SimulatedRun, directory: Path) -> None:
+    # Where L is zero nothing is drawn, rather than the floor.
+    log10_lyapunov = np.where(result.lyapunov > 0.0, result.log10_lyapunov, -np.inf)
+    plot_lyapunov(directory / 'lyapunov.png', result.times_s, log10_lyapunov, result.slope_per_s)
+    plot_configuration(
+        directory / 'configuration.png',
+        result.estimate,
+        result.truth,
+        result.landmark_tracks,
+        simulation.world_points(simulation.start_ns),
+    )
+
+
+def _as_json(args: argparse.Namespace, result: SimulatedRun) -> dict[str, object]:
+    return {
+        'time_s': result.times_s.tolist(),
+        'log10_lyapunov': result.log10_lyapunov.tolist(),
+        'slope_per_s': result.slope_per_s,
+        'step_s': args.step,
+    }
+
+
+def _print_summary(args: argparse.Namespace, result: SimulatedRun) -> None:
+    slope = result.slope_per_s
+    rows = {
+        'simulated': f'{args.duration:g} s in steps of {args.step:g} s',
+        'landmarks': str(result.landmark_tracks.shape[1]),
+        'log10 L, first': f'{result.log10_lyapunov[0]:.2f}',
+        'log10 L, last': f'{result.log10_lyapunov[-1]:.2f}',
+        'slope of log10 L': 'none: too few values of L that are more than rounding'
+        if slope is None
+        else f'{slope:.4f} per second after the transient',
+    }
+    rows |= {
+        name: str(path)
+        for name, path in (('recording', args.output), ('figures', args.plot))
+        if path is not None
+    }
+    print_table('Simulation', rows)

@@ -1,1 +1,0 @@
-"""What ``slam-observer`` can do: one module a command, each with ``add_parser``."""

@@ -1,0 +1,1 @@
+"""Time-stamped events in, pose and map out: order, time, refusals."""

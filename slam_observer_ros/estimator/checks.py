@@ -1,0 +1,185 @@
+"""Refuses events and poses that can't be used, before they touch the state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    MAX_ID,
+    ObservationEvent,
+    UNKNOWN_ID,
+    VelocityEvent,
+)
+from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+
+ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
+"""Relative error of a covariance whose message has it in single precision."""
+
+ROTATION_TOLERANCE = 1e-3
+"""How far RᵀR of a pose may be from identity: much further than single precision puts it."""
+
+MAX_STAMP_NS = 2**63 - 1
+"""What fits into the integers of numpy."""
+
+MAX_MEASURED = 1e6
+"""Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
+
+_INTEGERS = (int, np.int64)
+
+
+def check_event(event: Event) -> None:
+    """Check an event's shapes and values.
+
+    Raises
+    ------
+    InvalidEventError
+        With the reason ``'wrong_type'``, ``'negative_stamp'``, ``'wrong_shape'``,
+        ``'not_finite'``, ``'too_large'``, ``'negative_id'`` or ``'bad_covariance'``.
+
+    """
+    if isinstance(event, VelocityEvent):
+        _check_velocity(event.body_velocity, event.covariance, 6)
+    elif isinstance(event, AngularVelocityEvent):
+        _check_velocity(event.angular_velocity, event.covariance, 3)
+    elif isinstance(event, ObservationEvent):
+        _check_observation(event)
+    else:
+        raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
+    _check_times(event.stamp_ns, event.receive_ns)
+
+
+def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
+    """Check that ``pose`` is a rigid motion (4, 4), and its ``covariance`` (6, 6) is one.
+
+    Raises
+    ------
+    ParameterError
+        If one of them is not.
+
+    """
+    try:
+        _check_array('pose', pose, (4, 4))
+        if covariance is not None:
+            _check_array('pose covariance', covariance, (6, 6))
+            _check_definite('pose covariance', covariance)
+    except InvalidEventError as error:
+        raise ParameterError(str(error)) from error
+    R = pose[:3, :3]
+    is_rotation = np.abs(R.T @ R - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0
+    if not is_rotation or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
+        raise ParameterError('pose: no matrix [[R, x], [0, 1]] with a rotation R')
+
+
+def check_map(landmark_map: LandmarkMap) -> None:
+    """Check a map's shapes and values.
+
+    Raises
+    ------
+    MapError
+        If an array does not fit, a value can't be right, or an id is there twice.
+
+    """
+    if not isinstance(landmark_map, LandmarkMap):
+        kind = type(landmark_map).__name__
+        raise MapError(f'a {kind} is no LandmarkMap; maps.map_file.read_map makes one of a file')
+    try:
+        ids, n = landmark_map.ids, len(landmark_map.ids)
+        _check_array('map ids', ids, (n,))
+        _check_array('map counts', landmark_map.counts, (n,))
+        _check_array('map points', landmark_map.world_points, (n, 3))
+        if landmark_map.covariances is not None:
+            _check_array('map covariances', landmark_map.covariances, (n, 3, 3))
+            _check_definite('map covariances', landmark_map.covariances)
+    except InvalidEventError as error:
+        raise MapError(str(error)) from error
+    if ids.dtype.kind not in 'iu' or np.any((ids < 0) | (ids > MAX_ID)):
+        raise MapError(f'map ids: integers from 0 to {MAX_ID} are wanted')
+    if np.any(landmark_map.counts < 0):
+        raise MapError('map counts: one is negative')
+    if len(np.unique(ids)) < n:
+        raise MapError('an id is there more than once in the map')
+
+
+def _check_times(stamp_ns: int, receive_ns: int | None) -> None:
+    if not isinstance(stamp_ns, _INTEGERS):
+        reason = f'stamp {stamp_ns!r} is no int or np.int64: stamps are in nanoseconds'
+        raise InvalidEventError('wrong_type', reason)
+    if stamp_ns < 0:
+        raise InvalidEventError('negative_stamp', f'stamp {stamp_ns} ns is negative')
+    if stamp_ns > MAX_STAMP_NS:
+        raise InvalidEventError('too_large', f'stamp {stamp_ns} ns is beyond 64 bits')
+    if receive_ns is not None and not isinstance(receive_ns, _INTEGERS):
+        raise InvalidEventError('wrong_type', f'receive_ns {receive_ns!r} is no int or np.int64')
+
+
+def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: int) -> None:
+    _check_coordinates('velocity', velocity, (size,))
+    if covariance is not None:
+        _check_array('velocity covariance', covariance, (size, size))
+        _check_definite('velocity covariance', covariance)
+
+
+def _check_observation(event: ObservationEvent) -> None:
+    is_stack = isinstance(event.points, np.ndarray) and event.points.ndim > 0
+    m = len(event.points) if is_stack else 0
+    if not _is_plain(event.ids) or event.ids.dtype.kind not in 'iu':
+        raise InvalidEventError('wrong_type', 'landmark ids are not an array of integers')
+    if event.ids.dtype == np.uint64:  # which NumPy joins with int64 as float64
+        raise InvalidEventError('wrong_type', 'landmark ids are uint64: make them int64')
+    _check_coordinates('landmark points', event.points, (m, 3))
+    if event.ids.shape != (m,):
+        raise InvalidEventError('wrong_shape', f'ids {event.ids.shape} for {m} landmark points')
+    for landmark_id in event.ids.tolist():
+        if landmark_id < 0 and landmark_id != UNKNOWN_ID:
+            raise InvalidEventError('negative_id', f'landmark id {landmark_id} is negative')
+        if landmark_id > MAX_ID:
+            raise InvalidEventError('too_large', f'landmark id {landmark_id} is beyond {MAX_ID}')
+    if event.covariances is not None:
+        _check_array('landmark covariances', event.covariances, (m, 3, 3))
+        _check_definite('landmark covariances', event.covariances)
+    if event.velocities is not None:
+        _check_coordinates('landmark velocities', event.velocities, (m, 3))
+    if event.sensor is not None:
+        _check_coordinates("sensor's positions", event.sensor, (m, 3))
+
+
+def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+    if type(array) is np.ndarray and array.shape == shape and array.dtype == np.float64:
+        # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
+        entries = array.ravel()
+        if entries.dot(entries) <= MAX_MEASURED**2:
+            return
+    _check_array(name, array, shape)
+    if np.abs(array).max(initial=0.0) > MAX_MEASURED:
+        raise InvalidEventError('too_large', f'an entry of the {name} is beyond {MAX_MEASURED:g}')
+
+
+def _check_array(name: str, array: FloatArray | IntArray, shape: tuple[int, ...]) -> None:
+    if not _is_plain(array) or array.dtype not in (np.float64, np.float32, np.int64):
+        text = f'{name}: no plain numpy array of float64, float32 or int64'
+        raise InvalidEventError('wrong_type', text)
+    if array.shape != shape:
+        raise InvalidEventError('wrong_shape', f'{name}: shape {array.shape}, not {shape}')
+    if not np.isfinite(array).all():
+        raise InvalidEventError('not_finite', f'an entry of the {name} is NaN or infinite')
+
+
+def _is_plain(array: object) -> bool:
+    """Return whether something is an array on which all operations mean what they should."""
+    return isinstance(array, np.ndarray) and not isinstance(array, np.ma.MaskedArray | np.matrix)
+
+
+def _check_definite(name: str, covariances: FloatArray) -> None:
+    """Check that covariances (…, d, d) are symmetric and have no negative eigenvalue."""
+    with np.errstate(over='ignore'):  # the largest number there is means 'unknown'
+        allowed = ROUNDING * np.trace(covariances, axis1=-2, axis2=-1)
+    skew = np.abs(covariances - transpose(covariances)).max(axis=(-2, -1))
+    if np.any(skew > allowed) or np.any(np.linalg.eigvalsh(covariances)[..., 0] < -allowed):
+        raise InvalidEventError(
+            'bad_covariance', f'{name}: asymmetric, or with a negative eigenvalue'
+        )

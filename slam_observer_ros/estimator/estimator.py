@@ -1,0 +1,489 @@
+"""Time-stamped events in, pose and map out: the one estimator of node, replay and simulation."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+import logging
+
+import numpy as np
+
+from slam_observer_ros.common.errors import InvalidEventError, ParameterError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.units import to_ns, to_s
+from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
+from slam_observer_ros.estimator.checks import check_event, check_map, check_pose
+from slam_observer_ros.estimator.event_queue import EventQueue
+from slam_observer_ros.estimator.event_warnings import EventWarnings
+from slam_observer_ros.estimator.timeline import OnMotion, Timeline
+from slam_observer_ros.estimator.usable_points import usable_points
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    VelocityEvent,
+)
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.localiser import MapFrame
+from slam_observer_ros.observer.observer import lyapunov
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_table import changed_names, checked, table
+from slam_observer_ros.state import covariances
+from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.step import Outcome
+
+logger = logging.getLogger(__name__)
+
+
+class Estimator:
+    """Pose and landmark map from time-stamped velocities and observations.
+
+    The state advances only at event stamps, in stamp order, so its bits don't depend on when
+    anybody asks for them: a live run and a replay of what it received agree exactly.
+
+    Parameters
+    ----------
+    settings : Settings
+        All settings.
+    initial_pose : FloatArray, optional
+        (4, 4) pose at the first event, body to world; also the reference P°. Default: that of
+        the settings, or identity.
+    on_update : callable, optional
+        Called with an :class:`Update` after each observation that was used.
+    on_stamp : callable, optional
+        Called when all events of a stamp have been used: before the first one of a later stamp
+        or after a jump of the clock that holds the pose, and by :meth:`flush`.
+    on_motion : callable, optional
+        Called with the velocities and two stamps, nanoseconds, before the state is moved on along
+        them from one to the other.
+    on_jump : callable, optional
+        Called when the clock has jumped, and the estimate goes on as ``on_time_jump`` says.
+
+    Attributes
+    ----------
+    dropped : Counter
+        Events refused, by reason.
+    jumps : int
+        How often the clock has jumped.
+    last_update : Update or None
+        The latest update; None before the first observation.
+
+    Raises
+    ------
+    ParameterError
+        If a setting does not fit its table, or the pose is none.
+
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        initial_pose: FloatArray | None = None,
+        on_update: Callable[[Update], None] | None = None,
+        on_stamp: Callable[[], None] | None = None,
+        on_motion: OnMotion | None = None,
+        on_jump: Callable[[], None] | None = None,
+    ) -> None:
+        self.settings = settings = checked(settings)
+        self._counts: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.jumps = 0
+        self._warnings = EventWarnings()
+        self.last_update: Update | None = None
+        self._on_update, self._on_stamp = on_update, on_stamp
+        self._on_motion, self._on_jump = on_motion, on_jump
+        self._frame = MapFrame(settings)
+        self.reset(initial_pose)
+        changed = set(changed_names(settings))
+        if unused := [name for name in self._slam.gains.ignores if name in changed]:
+            logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
+
+    def reset(self, pose: FloatArray | None = None) -> None:
+        """Forget the motion, what was mapped and events held back, and start again.
+
+        Parameters
+        ----------
+        pose : FloatArray, optional
+            (4, 4) body to world. By default the one of the settings, if there is one; otherwise
+            identity, or unknown in a map that was loaded.
+
+        Raises
+        ------
+        ParameterError
+            If the pose is no rigid motion.
+
+        """
+        if pose is not None:
+            check_pose(pose)
+        self._frame.start_run(pose)
+        self._begin()
+
+    def restart_time(self) -> None:
+        """Begin anew in time, after a jump of the clock, as ``on_time_jump`` says.
+
+        What is held back for late events is used before. ``reset`` starts again where the run
+        began; in a loaded map where the settings say, or anywhere. ``hold`` keeps pose and map,
+        and goes on from there.
+        """
+        newest_ns = self.newest_stamp_ns
+        after = '' if newest_ns is None else f' after {to_s(newest_ns):.3f} s'
+        self.release()
+        if self.settings.on_time_jump == 'reset':
+            logger.warning(
+                'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
+                after,
+            )
+            self._frame.restart_run()
+            self._begin()
+        else:
+            logger.warning('The clock has jumped%s; pose and map are held.', after)
+            self._timeline.catch_up()
+            self._tell_stamp()
+            self._frame.restart_time()
+            self._forget_time()
+        self.jumps += 1
+        if self._on_jump is not None:
+            self._on_jump()
+
+    def load_map(
+        self,
+        landmark_map: LandmarkMap,
+        pose: FloatArray | None = None,
+        pose_covariance: FloatArray | None = None,
+    ) -> None:
+        """Estimate in the frame of a map from now on, as ``localization_mode`` says.
+
+        Parameters
+        ----------
+        landmark_map : LandmarkMap
+            What is known. It takes the place of a map loaded before.
+        pose : FloatArray, optional
+            (4, 4) pose in the map's frame; what was mapped until now is forgotten. By default
+            the pose is that of the settings if they have one and the robot is still there.
+            Otherwise it is unknown: it follows from landmarks of the map that are seen, three in
+            space or two in a plane, if they have ids, and what was mapped until then is carried
+            into the map's frame. See :attr:`is_localised`.
+        pose_covariance : FloatArray, optional
+            (6, 6) covariance of ``pose`` as :attr:`pose_covariance` has it; default exact.
+
+        Raises
+        ------
+        MapError, ParameterError
+            If the map, or the pose or its covariance, can't be right; nothing is changed then.
+
+        """
+        check_map(landmark_map)
+        if pose is not None:
+            check_pose(pose, pose_covariance)
+            self._timeline.catch_up()
+        self._frame.load(landmark_map, pose, pose_covariance, self.stamp_ns is not None)
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
+        """Move the robot as of ``stamp_ns``; the map stays.
+
+        Parameters
+        ----------
+        pose : FloatArray
+            (4, 4) body to world. If the place in a loaded map was not known, it is now.
+        covariance : FloatArray, optional
+            (6, 6) its covariance, as :attr:`pose_covariance` has it; default exact.
+
+        Raises
+        ------
+        ParameterError
+            If one of them can't be right; nothing is changed then.
+
+        """
+        check_pose(pose, covariance)
+        self._timeline.catch_up()
+        self._frame.set_pose(pose, covariance)
+
+    def change_settings(self, settings: Settings) -> None:
+        """Use other values of the settings that may change while running, from now on.
+
+        Raises
+        ------
+        ParameterError
+            If another setting differs, or one does not fit its table.
+
+        """
+        settings = checked(settings)
+        fixed = [row.name for row in table(Settings) if row.read_only]
+        changed = [
+            name for name in fixed if getattr(settings, name) != getattr(self.settings, name)
+        ]
+        if changed:
+            raise ParameterError(f'{", ".join(changed)} can only be set before the start')
+        self.settings = settings
+        self._frame.change_settings(settings)
+
+    def add(self, event: Event) -> bool:
+        """Take an event; return whether it was accepted.
+
+        A bad event is dropped whole, counted in ``dropped`` by its reason and logged; the state
+        is untouched. The event's arrays are not copied: don't change them any more.
+        """
+        try:
+            check_event(event)
+            jumped = self._queue.push(event)
+        except InvalidEventError as error:
+            self._drop(error)
+            return False
+        if jumped:
+            self.restart_time()
+            self._queue.push(event)
+        for ready in self._queue.pop_ready():
+            self._process(ready)
+        return True
+
+    def release(self) -> None:
+        """Use the events that are held back for others, as before something is changed.
+
+        One with a stamp far ahead stays: it may be wrong, and would make all others too late.
+        """
+        for ready in self._queue.pop_believed():
+            self._process(ready)
+
+    def flush(self) -> None:
+        """Use all events that are held back and move on to the last: the recording is over."""
+        for ready in self._queue.pop_all():
+            self._process(ready)
+        self._timeline.catch_up()
+        self._tell_stamp()
+
+    def smooth(self) -> Smoothed:
+        """Return trajectory and map in hindsight; the state is not changed.
+
+        They cover the observations since the history began, all of them with the setting
+        ``hindsight_window`` 0, as far as a point of them was believed.
+
+        Raises
+        ------
+        ParameterError
+            If the gain design keeps no history.
+        SmoothingError
+            If the observations don't determine the whole trajectory.
+
+        """
+        return self._slam.smooth()
+
+    def forget(self, landmark_id: int) -> bool:
+        """Remove a landmark from the map; return whether it was known."""
+        return self._frame.hypotheses.forget(landmark_id)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """How many events were used, by kind, and what befell the landmarks in them.
+
+        Events used (``'velocity'``, ``'observation'``), those of them that came late
+        (``'late_velocity'``, ``'late_observation'``), points in observations
+        (``'observed_point'``), observations made before the place in a loaded map was found
+        (``'not_localised'``), how often it was lost again (``'lost'``), how often the robot was
+        not where odometry had it (``'slip'``) or nothing in view, without ids, where the map has
+        it (``'strange_place'``), and what became of landmarks
+        (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``,
+        ``'repeated_id'`` and ``'reserved_id'``, which are not used).
+        """
+        return self._counts + self._frame.counts
+
+    @property
+    def is_localised(self) -> bool:
+        """Whether the estimate is in its final frame: always, unless a map was loaded.
+
+        Until the place in a loaded map is found, the estimate is in a frame of its own.
+        """
+        return self._frame.is_localised
+
+    @property
+    def landmark_map(self) -> LandmarkMap:
+        """The present map, as it can be saved and loaded: without landmarks that move.
+
+        Its covariances are those in its own frame: without the error of how it lies to where
+        the robot started, unless the frame is that of a map that was loaded.
+        """
+        return self._frame.landmark_map
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Stamp of the last event that was used, nanoseconds; None before the first."""
+        return self._timeline.stamp_ns
+
+    @property
+    def newest_stamp_ns(self) -> int | None:
+        """Newest stamp received, nanoseconds; it may still be held back."""
+        return self._queue.newest_ns
+
+    @property
+    def pose(self) -> FloatArray:
+        """(4, 4) estimated pose at ``stamp_ns``, body to world."""
+        return self.pose_at(self.stamp_ns or 0)
+
+    def pose_at(self, stamp_ns: int) -> FloatArray:
+        """Return the pose (4, 4) at any time: the state, moved on by the velocities since."""
+        slam, state_ns = self._slam, self._timeline.state_ns
+        if state_ns is None or stamp_ns == state_ns:
+            return slam.observer.pose
+        return slam.observer.pose @ self._timeline.motion(state_ns, stamp_ns)
+
+    @property
+    def pose_covariance(self) -> FloatArray | None:
+        """(6, 6) covariance of the pose at ``stamp_ns``: rotation vector, then position.
+
+        Both along the world's axes, rad² and m². Where it is in doubt what was seen, it holds
+        that the most likely place may be the wrong one. None where the gains know none.
+        """
+        timeline = self._timeline
+        start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
+        hypotheses = self._frame.hypotheses
+        return hypotheses.pose_covariance_after(timeline.velocities, start_ns, end_ns)
+
+    @property
+    def body_velocity(self) -> FloatArray:
+        """(6,) newest velocity (Ω, v), calibrated, rad/s and m/s; zero when it has timed out.
+
+        It is that of ``stamp_ns``, unless a delay is calibrated: then a little before or after.
+        """
+        velocity = self._timeline.body_velocity
+        return np.zeros(6) if velocity is None else self._slam.gains.calibration.apply(velocity)
+
+    @property
+    def velocity_is_stale(self) -> bool:
+        """Whether no velocity was in force at ``stamp_ns``, so that the pose is being held."""
+        return self._timeline.body_velocity is None
+
+    @property
+    def landmark_ids(self) -> IntArray:
+        """(n,) ids of the landmarks in the map: those seen ``confirmations`` times or more."""
+        return self._slam.landmarks.ids[self._slam.confirmed]
+
+    @property
+    def landmark_counts(self) -> IntArray:
+        """(n,) number of observations of each landmark."""
+        return self._slam.landmarks.counts[self._slam.confirmed]
+
+    @property
+    def world_points(self) -> FloatArray:
+        """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
+        points, lead_s = self._slam.world_points[self._slam.confirmed], self._timeline.lead_s
+        return points + lead_s * self.landmark_velocities if lead_s else points
+
+    @property
+    def landmark_covariances(self) -> FloatArray | None:
+        """(n, 3, 3) covariances of the landmarks at ``stamp_ns``, world, m²; None if unknown."""
+        of_all = self._slam.landmark_covariances_after(self._timeline.lead_s)
+        return None if of_all is None else of_all[self._slam.confirmed]
+
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
+
+        In the body frame, of the first k coordinates: 2 in ``two_d_mode``, else 3. It is that of
+        the state, which is moved on at observations: ask for it in ``on_update``. ``rows`` (m,)
+        are places in ``landmark_ids``. None where the gains know none, and for landmarks that are
+        fixed, whose errors nobody knows.
+        """
+        slam = self._slam
+        if slam.is_fixed:
+            return None
+        confirmed = slam.confirmed[rows]
+        return covariances.of_configuration(slam.observer, slam.gains, slam.axes, confirmed)
+
+    @property
+    def landmark_velocities(self) -> FloatArray:
+        """(n, 3) velocities of landmarks that move, known or estimated, m/s, world."""
+        observer = self._slam.observer
+        return se3.rotate(observer.reference_pose, observer.u[self._slam.confirmed])
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """Scale, bias and delay of the velocity, those that the settings ask for."""
+        gains = self._slam.gains
+        return gains.calibration.estimates(gains.calibration_variances)
+
+    @property
+    def lyapunov(self) -> float:
+        """L (34) of the latest observation's residuals; zero before the first."""
+        return 0.0 if self.last_update is None else self.last_update.lyapunov
+
+    @property
+    def _slam(self) -> Slam:
+        """The most likely state."""
+        return self._frame.slam
+
+    def _drop(self, error: InvalidEventError) -> None:
+        self.dropped[error.reason] += 1
+        self._warnings.dropped(error)
+
+    def _process(self, event: Event) -> None:
+        if event.stamp_ns > (self.stamp_ns or 0):
+            self._tell_stamp()
+        if isinstance(event, ObservationEvent):
+            self._process_observation(event)
+        else:
+            self._process_velocity(event)
+
+    def _tell_stamp(self) -> None:
+        """Tell that all events of the present stamp have been used."""
+        if self._on_stamp is not None and self.stamp_ns is not None:
+            self._on_stamp()
+
+    def _process_velocity(self, event: VelocityEvent | AngularVelocityEvent) -> None:
+        is_late = self._timeline.is_late(event)
+        try:
+            is_used = self._timeline.append(event)
+        except InvalidEventError as error:
+            self._drop(error)
+            return
+        self._counts['velocity'] += is_used
+        if is_late:
+            self._counts['late_velocity'] += 1
+            self._warnings.late_velocity()
+
+    def _process_observation(self, event: ObservationEvent) -> None:
+        usable = usable_points(event, self.settings, self._counts, self._warnings)
+        event = self._timeline.meet(usable)
+        outcome = self._frame.observe(event)
+        self._counts['observation'] += 1
+        self._counts['late_observation'] += event.stamp_ns > usable.stamp_ns
+        self._warn_of(event, outcome)
+        self.last_update = self._update(event.stamp_ns, outcome)
+        if self._on_update is not None:
+            self._on_update(self.last_update)
+
+    def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
+        """Tell what is amiss with an observation, with what came of it, or with the map."""
+        settings, warnings = self.settings, self._warnings
+        if 0 < settings.max_landmarks < len(event.ids) and self._slam.is_mapping:
+            warnings.more_than_max(len(event.ids), settings.max_landmarks)
+        if len(outcome.moved_ids):
+            warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
+        warnings.lost_places(self._frame.count)
+        if settings.gains == 'riccati':
+            warnings.large_map(len(self._slam.landmarks))
+
+    def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
+        observer = self._slam.observer
+        return Update(
+            stamp_ns,
+            observer.pose,
+            outcome.ids,
+            se3.rotate(observer.reference_pose, outcome.residuals),
+            outcome.rejected,
+            lyapunov(self.settings.gain_k, outcome.residuals),
+        )
+
+    def _begin(self) -> None:
+        """Wait for the first event."""
+        self._forget_time()
+        self.last_update = None
+
+    def _forget_time(self) -> None:
+        """Forget all that has a stamp but the map."""
+        settings = self.settings
+        self._queue = EventQueue(
+            window_ns=to_ns(settings.reorder_window),
+            max_jump_ns=to_ns(settings.max_stamp_jump),
+            late_limit_ns=to_ns(settings.late_limit),
+        )
+        self._timeline = Timeline(self._frame, settings, self._on_motion)

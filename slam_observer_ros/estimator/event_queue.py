@@ -1,0 +1,217 @@
+"""Puts events in stamp order and refuses stamps that can't be right."""
+
+from __future__ import annotations
+
+from collections import deque
+from hashlib import blake2b
+import heapq
+from typing import TypeAlias
+
+from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.events import AGREEING_STAMPS, Event, NEAR_NS, ObservationEvent
+
+Key: TypeAlias = tuple[int, bool, bytes]
+
+RECENT = 1000
+"""Events that tell how far ahead of their reception stamps are.
+
+More than inputs keep while the node is busy: those were received late, and tell of no delay.
+"""
+
+HELD_UP_NS = 250_000_000
+"""Stamps far behind that are received so soon after one in time tell of no jump of the clock."""
+
+MIN_KNOWN = 1024
+"""Events that may be known before those too old to come again are looked for and forgotten."""
+
+
+class EventQueue:
+    """Holds events back for a reorder window, then gives them out in stamp order.
+
+    Of two events with one stamp the velocity comes first, and two observations are ordered by
+    a digest of their ids and points, so the order does not depend on which arrived first. A
+    second velocity of one kind and stamp is a duplicate; so is an observation that has the ids
+    and points of another one.
+
+    A stamp that is ahead of all others by more than events may be late is kept, but not believed
+    at once: one wrong stamp would make all other events too late. It is believed when time has
+    got there, or when ``AGREEING_STAMPS`` stamps agree that there was a pause; at once where
+    events come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
+    received for as long: then it was a silence, not the clock.
+
+    Stamps behind all others are refused. ``AGREEING_STAMPS`` in a row tell that the clock has
+    jumped back, but only where those of one kind of event go back themselves, as a sensor that is
+    always too late goes on from its own last stamp, and not right after an event that is in time:
+    then they were held up on the way, and come in a burst.
+
+    Parameters
+    ----------
+    window_ns : int
+        How far behind the newest stamp an event is given out, nanoseconds.
+    max_jump_ns : int
+        How long a pause may be, nanoseconds: what is further ahead is refused.
+    late_limit_ns : int
+        How far behind the window an event may be, nanoseconds.
+
+    Attributes
+    ----------
+    newest_ns : int or None
+        Newest stamp that is believed, nanoseconds.
+
+    """
+
+    def __init__(self, window_ns: int, max_jump_ns: int, late_limit_ns: int) -> None:
+        self._window_ns = window_ns
+        self._max_jump_ns = max_jump_ns
+        self._reach_ns = window_ns + late_limit_ns
+        self._near_ns = max(self._reach_ns, NEAR_NS)
+        self._heap: list[tuple[Key, Event]] = []
+        self._known: set[Key] = set()
+        self._most_known = MIN_KNOWN
+        self._strays: set[int] = set()
+        self._stray_ns = 0
+        # Newest stamp of each kind of event that was not ahead of all others.
+        self._newest_of_kind_ns: dict[type, int] = {}
+        # The newest stamp that is taken, believed or not.
+        self._lead_ns = 0
+        # How far ahead a stamp may be that is believed at once.
+        self._usual_ns = min(self._near_ns, max_jump_ns)
+        self._ahead_of_reception_ns: deque[int] = deque(maxlen=RECENT)
+        self._in_time_receive_ns: int | None = None
+        self.newest_ns: int | None = None
+
+    def push(self, event: Event) -> bool:
+        """Take an event; return whether it shows that the clock has jumped.
+
+        Raises
+        ------
+        InvalidEventError
+            If the stamp is far from all others (``'stamp_jump'``, ``'too_late'``), or the event
+            is already known (``'duplicate'``).
+
+        """
+        stamp_ns = event.stamp_ns
+        if self.newest_ns is None:
+            self.newest_ns = self._lead_ns = stamp_ns
+        ahead_ns = stamp_ns - self.newest_ns
+        too_late = ahead_ns < -self._reach_ns
+        if -self._near_ns <= ahead_ns <= self._usual_ns:
+            if too_late:
+                raise _refusal(ahead_ns)
+            self._insert(event)
+            self._note_reception(event)
+            self._note_kind(event)
+            self._strays.clear()
+            self._believe(max(self.newest_ns, stamp_ns))
+            return False
+        too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
+        if too_late or too_early:
+            is_no_jump = too_late and (self._note_kind(event) or self._is_held_up(event))
+            if not is_no_jump and self._count_stray(stamp_ns):
+                return True
+            raise _refusal(ahead_ns)
+        self._insert(event)
+        self._lead_ns = max(self._lead_ns, stamp_ns)
+        if self._count_stray(stamp_ns):
+            self._note_reception(event)
+            self._believe(self._lead_ns)
+        return False
+
+    def pop_ready(self) -> list[Event]:
+        """Give out, in order, the events that have left the window."""
+        return self._pop_until((self.newest_ns or 0) - self._window_ns)
+
+    def pop_believed(self) -> list[Event]:
+        """Give out, in order, all events but those with a stamp that waits for others."""
+        return self._pop_until(self.newest_ns or 0)
+
+    def pop_all(self) -> list[Event]:
+        """Give out all events that are left, in order."""
+        return [heapq.heappop(self._heap)[1] for _ in range(len(self._heap))]
+
+    def _pop_until(self, stamp_ns: int) -> list[Event]:
+        events = []
+        while self._heap and self._heap[0][0][0] <= stamp_ns:
+            events.append(heapq.heappop(self._heap)[1])
+        return events
+
+    def _insert(self, event: Event) -> None:
+        key = _key(event)
+        if key in self._known:
+            raise InvalidEventError('duplicate', 'this event is already known')
+        self._known.add(key)
+        heapq.heappush(self._heap, (key, event))
+        if len(self._known) > self._most_known:
+            self._forget_old()
+
+    def _forget_old(self) -> None:
+        """Forget events so old that they would be refused as too late; O(1) for each event."""
+        oldest_ns = (self.newest_ns or 0) - self._reach_ns
+        self._known = {key for key in self._known if key[0] >= oldest_ns}
+        self._most_known = max(2 * len(self._known), MIN_KNOWN)
+
+    def _note_reception(self, event: Event) -> None:
+        if event.receive_ns is not None:
+            self._ahead_of_reception_ns.append(event.stamp_ns - event.receive_ns)
+            self._in_time_receive_ns = event.receive_ns
+
+    def _was_silent(self, event: Event) -> bool:
+        """Return whether the time of reception has gone on as far as the stamp, or nearly."""
+        if event.receive_ns is None or not self._ahead_of_reception_ns:
+            return False
+        expected_ns = event.receive_ns + max(self._ahead_of_reception_ns)
+        return event.stamp_ns <= expected_ns + self._max_jump_ns
+
+    def _believe(self, newest_ns: int) -> None:
+        step_ns = newest_ns - (self.newest_ns or 0)
+        if step_ns > 0:
+            self._usual_ns = min(max(self._near_ns, 2 * step_ns), self._max_jump_ns)
+        self.newest_ns = self._lead_ns = newest_ns
+
+    def _note_kind(self, event: Event) -> bool:
+        """Note the newest stamp of each kind of event; return whether this one is, as the first.
+
+        Else those of its kind have gone back.
+        """
+        kind = type(event)
+        is_newest = event.stamp_ns > self._newest_of_kind_ns.get(kind, event.stamp_ns - 1)
+        if is_newest:
+            self._newest_of_kind_ns[kind] = event.stamp_ns
+        return is_newest
+
+    def _is_held_up(self, event: Event) -> bool:
+        """Return whether an event was received right after one that was in time."""
+        if event.receive_ns is None or self._in_time_receive_ns is None:
+            return False
+        return 0 <= event.receive_ns - self._in_time_receive_ns < HELD_UP_NS
+
+    def _count_stray(self, stamp_ns: int) -> bool:
+        """Count a stamp far from the newest one; return whether enough have agreed on it now.
+
+        Events of one stamp count once: they may be of one message.
+        """
+        newest_ns = self.newest_ns or 0
+        same_side = (stamp_ns > newest_ns) == (self._stray_ns > newest_ns)
+        if not (same_side and abs(stamp_ns - self._stray_ns) <= self._max_jump_ns):
+            self._strays.clear()
+        self._strays.add(stamp_ns)
+        self._stray_ns = stamp_ns
+        if len(self._strays) < AGREEING_STAMPS:
+            return False
+        self._strays.clear()
+        return True
+
+
+def _key(event: Event) -> Key:
+    if not isinstance(event, ObservationEvent):
+        return event.stamp_ns, False, type(event).__name__.encode()
+    # Keys outlive their events, which may be clouds of many points.
+    content = event.ids.tobytes() + event.points.tobytes()
+    return event.stamp_ns, True, blake2b(content, digest_size=16).digest()
+
+
+def _refusal(ahead_ns: int) -> InvalidEventError:
+    reason, side = ('stamp_jump', 'ahead of') if ahead_ns > 0 else ('too_late', 'behind')
+    message = f"stamp is {to_s(abs(ahead_ns)):.3f} s {side} the newest event's"
+    return InvalidEventError(reason, message)

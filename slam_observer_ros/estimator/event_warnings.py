@@ -1,0 +1,122 @@
+"""What the log is told of events, at the 1st, the 10th, the 100th time that it happens."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+import logging
+
+from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.types import IntArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID, LAST_AUTOMATIC_ID
+
+logger = logging.getLogger(__name__)
+
+MAX_NAMED = 10
+"""Ids that a warning lists at most."""
+
+MANY_LANDMARKS = 1000
+"""Landmarks from which on Riccati gains take too long for most sensors."""
+
+MANY_MOVED = 5
+"""Landmarks that seem to have moved lately from which on the odometry may be at fault."""
+
+MOVED_LATELY_NS = 60 * NANOSECONDS_PER_SECOND
+"""How long ago that is at most, nanoseconds."""
+
+LOST_PLACES = {
+    'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
+    'strange_place': 'Nothing that is seen is where the map has it: if the robot slipped or was '
+    'carried, it is not found again, as the points have no ids',
+}
+"""What is wrong with the robot's place when these counts grow."""
+
+
+class EventWarnings:
+    """Counts what there is to warn of, and logs it more and more seldom."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._places: Counter[str] = Counter()
+        self._moved_ns: dict[int, int] = {}
+
+    def dropped(self, error: InvalidEventError) -> None:
+        """Tell that an event is not used, and why."""
+        self._warn(error.reason, f'Dropped an event, {error.reason}: {error}')
+
+    def late_velocity(self) -> None:
+        """Tell that a velocity came too late to be put in order."""
+        text = 'A velocity came later than reorder_window allows and counts only from then on'
+        self._warn('late_velocity', text)
+
+    def repeated_ids(self, ids: Sequence[int]) -> None:
+        """Tell that an observation has several points of each of these ids."""
+        text = f'Not used: an observation has several points of the ids {_list(ids)}'
+        self._warn('repeated_id', text)
+
+    def reserved_ids(self, ids: Sequence[int]) -> None:
+        """Tell that a sensor has ids which landmarks without one are given."""
+        text = (
+            f'Not used: points with the ids {_list(ids)}; those from {FIRST_AUTOMATIC_ID} to '
+            f'{LAST_AUTOMATIC_ID} number landmarks without an id: give these others'
+        )
+        self._warn('reserved_id', text)
+
+    def unknown_ids(self, gains: str) -> None:
+        """Tell that these gains can't use points without an id."""
+        text = f'Points without an id are not used by {gains} gains, only by riccati'
+        self._warn('unknown_id', text)
+
+    def large_map(self, count: int) -> None:
+        """Tell once that Riccati gains are slow if a map has so many landmarks."""
+        if count >= MANY_LANDMARKS and not self._counts['large_map']:
+            self._counts['large_map'] = 1
+            logger.warning(
+                'The map has %d landmarks, and the time that riccati gains take grows with their '
+                'square: scheduled gains take many more, if points have ids, and max_landmarks '
+                'limits them.',
+                count,
+            )
+
+    def more_than_max(self, count: int, limit: int) -> None:
+        """Tell that one observation has more landmarks than may be kept."""
+        text = f'{count} points in one message, and max_landmarks is {limit}: some are always new'
+        self._warn('more_than_max', text)
+
+    def moved_landmarks(self, ids: IntArray, stamp_ns: int) -> None:
+        """Tell that landmarks are not any more where they were, and if many are so at a time."""
+        self._warn('moved_landmark', f'Landmarks {ids.tolist()} have moved')
+        moved_ns = self._moved_ns | dict.fromkeys(ids.tolist(), stamp_ns)
+        # Those after this stamp are from before a jump of the clock.
+        lately = {i: t for i, t in moved_ns.items() if 0 <= stamp_ns - t < MOVED_LATELY_NS}
+        self._moved_ns = lately
+        if len(lately) >= MANY_MOVED:
+            self._moved_ns = {}
+            text = (
+                f'{len(lately)} landmarks seem to have moved within a minute: odometry may err by '
+                'more than is stated. Look for a bias or scale that is not estimated '
+                '(angular_bias_error and the like), noise that is set too small, and time without '
+                'messages (unknown_linear_motion, unknown_angular_motion)'
+            )
+            self._warn('many_moved', text)
+
+    def lost_places(self, count: Callable[[str], int]) -> None:
+        """Tell that the robot is not where it was taken to be, if ``count`` says so again."""
+        for name, text in LOST_PLACES.items():
+            if count(name) > self._places[name]:
+                self._warn(name, text)
+                self._places[name] = count(name)
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Count one more of a kind; ``text`` is logged if their number is a power of ten."""
+        self._counts[kind] += 1
+        count = self._counts[kind]
+        if str(count).rstrip('0') == '1':
+            logger.warning('%s (%d so far).', text, count)
+
+
+def _list(ids: Sequence[int]) -> str:
+    """Return the first few ids, as a sentence names them."""
+    named = ', '.join(str(landmark_id) for landmark_id in ids[:MAX_NAMED])
+    return named + (' and others' if len(ids) > MAX_NAMED else '')

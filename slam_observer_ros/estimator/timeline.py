@@ -1,0 +1,151 @@
+"""The instant that an estimate is of, and the velocities that lead on from there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeAlias
+
+from slam_observer_ros.common.errors import InvalidEventError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_ns, to_s
+from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.localiser import MapFrame
+from slam_observer_ros.sensor_models.integration import transition
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
+from slam_observer_ros.state.late_observation import carried_forward
+
+OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
+"""Called with velocities, and with the two stamps between which they lead, nanoseconds."""
+
+MAX_PENDING_VELOCITIES = 128
+"""Velocities that may wait for an observation before the state is moved on without one."""
+
+
+class Timeline:
+    """Velocities of the recent past, and how far the hypotheses have been moved along them.
+
+    Parameters
+    ----------
+    frame : MapFrame
+        Holds the hypotheses; no event has been used yet.
+    settings : Settings
+        ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
+    on_motion : callable, optional
+        Called each time before the hypotheses are moved on.
+
+    Attributes
+    ----------
+    velocities : VelocityHistory
+        The velocities.
+    stamp_ns : int or None
+        Stamp of the last event that was used, nanoseconds; None before the first.
+    state_ns : int or None
+        Instant that the hypotheses are of: velocities since then wait for an observation.
+
+    """
+
+    def __init__(
+        self, frame: MapFrame, settings: Settings, on_motion: OnMotion | None = None
+    ) -> None:
+        self._frame = frame
+        timeout_ns = to_ns(settings.velocity_timeout)
+        self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
+        self.stamp_ns: int | None = None
+        self.state_ns: int | None = None
+        # A delay, and beyond it half of what velocities are averaged over to estimate it.
+        self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
+        self._on_motion = on_motion
+        self._pending = 0
+        self._in_force_ns = 0  # no velocity of before can change what is in force
+        self._newest_ns: dict[type, int] = {}
+
+    def is_late(self, event: Event) -> bool:
+        """Return whether what was in force at its stamp can't be changed any more."""
+        return event.stamp_ns < self._in_force_ns
+
+    def _begin(self, stamp_ns: int) -> int:
+        """Note the stamp of an event that is about to be used; return ``state_ns``."""
+        self.stamp_ns = max(stamp_ns, self.stamp_ns or stamp_ns)
+        if self.state_ns is None:
+            self.state_ns = stamp_ns
+        return self.state_ns
+
+    def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
+        """Add a velocity; return whether it is in force: an angular one waits for a linear one.
+
+        If it is late, it leads on from where velocities can still be changed. After many of them
+        the hypotheses are moved on without an observation.
+
+        Raises
+        ------
+        InvalidEventError
+            If a newer velocity of its kind was used before it (``'too_late'``).
+
+        """
+        kind = type(event)
+        if event.stamp_ns < self._newest_ns.get(kind, 0):
+            raise InvalidEventError('too_late', 'a newer velocity was already used')
+        self._newest_ns[kind] = event.stamp_ns
+        if self.is_late(event):
+            event = replace(event, stamp_ns=self._in_force_ns)
+        if not self.velocities.append(event):
+            return False
+        self._in_force_ns = event.stamp_ns
+        self._begin(event.stamp_ns)
+        self._pending += 1
+        if self._pending >= MAX_PENDING_VELOCITIES:
+            # No further: the stamp of an observation without points may be ahead of velocities.
+            self._advance(self._in_force_ns)
+        return True
+
+    @property
+    def body_velocity(self) -> FloatArray | None:
+        """(6,) velocity (Ω, v) in force at ``stamp_ns``; None if none is or it has timed out."""
+        return None if self.stamp_ns is None else self.velocities.latest(self.stamp_ns)
+
+    @property
+    def lead_s(self) -> float:
+        """Seconds from ``state_ns`` to ``stamp_ns``."""
+        return to_s((self.stamp_ns or 0) - (self.state_ns or 0))
+
+    def catch_up(self) -> None:
+        """Move the hypotheses on to the last event that was used."""
+        if self.stamp_ns is not None:
+            self._advance(self.stamp_ns)
+
+    def _advance(self, stamp_ns: int) -> None:
+        """Move the hypotheses, which are those of ``state_ns``, on to ``stamp_ns``, never back."""
+        self._pending = 0
+        start_ns = self.state_ns
+        if start_ns is None or stamp_ns <= start_ns:
+            return
+        if self._on_motion is not None:
+            self._on_motion(self.velocities, start_ns, stamp_ns)
+        self._frame.hypotheses.advance(self.velocities, start_ns, stamp_ns)
+        self.velocities.forget_before(stamp_ns - self._kept_ns)
+        self.state_ns = stamp_ns
+        self._in_force_ns = max(self._in_force_ns, stamp_ns)
+
+    def meet(self, event: ObservationEvent) -> ObservationEvent:
+        """Move the hypotheses on to an observation, or it to them if it is late; return it.
+
+        One without points, as an idle sensor sends, moves nothing: it would make others late.
+        """
+        state_ns = self._begin(event.stamp_ns)
+        if not len(event.ids):
+            return replace(event, stamp_ns=state_ns)
+        if event.stamp_ns < state_ns:
+            event = carried_forward(self._frame.slam, event, self.velocities, state_ns)
+        self._advance(event.stamp_ns)
+        self._in_force_ns = max(self._in_force_ns, event.stamp_ns)
+        return event
+
+    def motion(self, start_ns: int, end_ns: int) -> FloatArray:
+        """Return how the body moves (4, 4) between two stamps, backwards if need be."""
+        if end_ns < start_ns:
+            return se3.inverse(self.motion(end_ns, start_ns))
+        calibration = self._frame.slam.gains.calibration
+        return transition(self.velocities, calibration, start_ns, end_ns)

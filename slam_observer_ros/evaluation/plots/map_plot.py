@@ -1,0 +1,189 @@
+"""Figure of a replay, as a PNG file: its path and its map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.plots.drawing import (
+    END,
+    is_flat,
+    LANDMARKS,
+    legend_below,
+    LINKS,
+    PATH,
+    save,
+    START,
+    STYLE,
+    TRUE_END,
+    TRUE_LANDMARKS,
+    TRUE_PATH,
+)
+from slam_observer_ros.evaluation.plots.labels import label_points
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.truth import LandmarkTruth
+from slam_observer_ros.events import is_automatic
+from slam_observer_ros.geometry import se3
+
+_MAX_LABELS = 300
+"""Of more landmarks than this few ids would find room, and it would take long to look for it."""
+
+_PANELS_IN = 6.3
+"""Largest width and height of what is drawn, inches."""
+
+_LABELS_IN, _LEGEND_IN = 0.7, 0.9
+"""Room for the labels of an axis, and for the title and two lines of legend."""
+
+_Layer: TypeAlias = tuple[FloatArray, dict[str, Any]]
+"""Points (k, 3) and how they are drawn."""
+
+
+@mpl.rc_context(STYLE)
+def plot_map(
+    path: Path,
+    estimate: Trajectory,
+    ids: IntArray,
+    world_points: FloatArray,
+    truth: Trajectory | None = None,
+    landmark_truth: LandmarkTruth | None = None,
+    *,
+    in_hindsight: bool = False,
+) -> Path:
+    """Draw a replay's path and map over the truth, from above and, unless flat, from the side.
+
+    With a true path the estimate is moved by the alignment of :func:`trajectory_errors`. A line
+    leads from each landmark to the true one of the same id. Ids are written where there is room.
+
+    Parameters
+    ----------
+    path : Path
+        PNG file to write.
+    estimate : Trajectory
+        Estimated poses.
+    ids : IntArray
+        (n,) landmarks in the final map.
+    world_points : FloatArray
+        (n, 3) their estimated positions, metres.
+    truth : Trajectory, optional
+        True poses.
+    landmark_truth : LandmarkTruth, optional
+        True landmarks in the world of ``truth``; drawn only together with it.
+    in_hindsight : bool
+        Whether poses and map are smoothed, which the title says.
+
+    Returns
+    -------
+    Path
+        ``path``.
+
+    Raises
+    ------
+    EvaluationError
+        The file can't be written, or the truth covers no pose of the estimate.
+
+    """
+    if truth is not None:
+        alignment = trajectory_errors(estimate, truth).alignment
+        estimate, world_points = estimate.moved(alignment), se3.transform(alignment, world_points)
+        # Else paths that are long the same seem to end at different places.
+        truth = truth.during(estimate)
+    else:
+        landmark_truth = None
+    layers = _map_layers(estimate, ids, world_points, truth, landmark_truth)
+    figure, panels = _draw(layers, is_flat((estimate if truth is None else truth).positions))
+    title = 'Trajectory and map in hindsight' if in_hindsight else 'Trajectory and map'
+    if truth is not None:
+        title += ', after rigid alignment' if in_hindsight else ' after rigid alignment'
+    figure.suptitle(title, fontsize=11, fontweight='bold')
+    named = ~is_automatic(ids)
+    if 0 < np.sum(named) <= _MAX_LABELS:
+        figure.draw_without_rendering()  # only then it is known where there is room
+        _write_ids(panels[0], ids[named], world_points[named, :2], layers)
+    return save(figure, path)
+
+
+def _draw(layers: list[_Layer], flat: bool) -> tuple[Figure, list[Axes]]:
+    """Return a figure of layers, and its panels: from above and, unless flat, from the side."""
+    drawn = np.concatenate([np.zeros((0, 3)), *(points for points, _ in layers)])
+    drawn = drawn if len(drawn) else np.zeros((1, 3))
+    low, high = np.nanmin(drawn, axis=0), np.nanmax(drawn, axis=0)
+    margin = 0.06 * float(np.max(high - low)) or 1.0
+    low, high = low - margin, high + margin
+
+    views = [(0, 1)] if flat else [(0, 1), _side_view(high - low)]
+    figure, panels = _panels(views, high - low)
+    for axes, (across, up) in zip(panels, views, strict=True):
+        for points, style in layers:
+            axes.plot(points[:, across], points[:, up], **style)
+        axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]), aspect='equal')
+        axes.set(xlabel=f'{"xyz"[across]} [m]', ylabel=f'{"xyz"[up]} [m]')
+    figure.align_ylabels(panels)
+    legend_below(figure, panels[-1], columns=3)
+    return figure, panels
+
+
+def _side_view(spans_m: FloatArray) -> tuple[int, int]:
+    """Return the axes, across and up, of a view from the side that shows the longer one."""
+    return (1, 2) if spans_m[1] > spans_m[0] else (0, 2)
+
+
+def _panels(views: list[tuple[int, int]], spans_m: FloatArray) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each view, all at one scale.
+
+    One below the other if they share the axis across; else side by side.
+    """
+    widths_m, heights_m = (spans_m[list(axis)] for axis in zip(*views, strict=True))
+    side_by_side = len({across for across, _ in views}) > 1
+    if side_by_side:
+        width_m, height_m = widths_m.sum(), heights_m.max()
+        layout: dict[str, Any] = {'ncols': len(views), 'width_ratios': widths_m}
+    else:
+        width_m, height_m = widths_m[0], heights_m.sum()
+        layout = {'nrows': len(views), 'height_ratios': heights_m}
+    in_per_m = min(_PANELS_IN / width_m, _PANELS_IN / height_m)
+    width_in = in_per_m * width_m + _LABELS_IN * layout.get('ncols', 1)
+    height_in = in_per_m * height_m + _LABELS_IN * layout.get('nrows', 1) + _LEGEND_IN
+    figure = Figure(figsize=(max(width_in, 5.0), height_in))
+    return figure, figure.subplots(squeeze=False, **layout).ravel().tolist()
+
+
+def _map_layers(
+    estimate: Trajectory,
+    ids: IntArray,
+    world_points: FloatArray,
+    truth: Trajectory | None,
+    landmark_truth: LandmarkTruth | None,
+) -> list[_Layer]:
+    """List what a map shows, first what lies lowest, without what there is none of."""
+    layers: list[_Layer] = [
+        (estimate.positions, {**PATH, 'linestyle': '-', 'linewidth': 0.9}),
+        (estimate.positions[:1], START),
+        (estimate.positions[-1:], END),
+        (world_points, LANDMARKS),
+    ]
+    if truth is not None:
+        layers[:0] = [(truth.positions, TRUE_PATH), (truth.positions[-1:], TRUE_END)]
+    if landmark_truth is not None:
+        layers.append((landmark_truth.world_points, TRUE_LANDMARKS))
+        layers.append((_links(ids, world_points, landmark_truth), LINKS))
+    return [(points, style) for points, style in layers if len(points)]
+
+
+def _links(ids: IntArray, world_points: FloatArray, truth: LandmarkTruth) -> FloatArray:
+    """Return lines from landmarks to the true ones of the same ids, with a break after each."""
+    _, rows, true_rows = np.intersect1d(ids, truth.ids, return_indices=True)
+    ends = [world_points[rows], truth.world_points[true_rows], np.full((len(rows), 3), np.nan)]
+    return np.stack(ends, axis=1).reshape(-1, 3)
+
+
+def _write_ids(axes: Axes, ids: IntArray, points: FloatArray, layers: list[_Layer]) -> None:
+    """Write ids beside their points (n, 2), where they hit no marker of any layer."""
+    markers = np.concatenate([drawn[:, :2] for drawn, style in layers if 'marker' in style])
+    label_points(axes, [str(landmark_id) for landmark_id in ids.tolist()], points, markers)

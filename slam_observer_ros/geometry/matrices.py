@@ -1,0 +1,94 @@
+"""Small matrices, of which a filter handles several at each observation."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dgesv
+
+from slam_observer_ros.common.types import FloatArray
+
+
+def transpose(M: FloatArray) -> FloatArray:
+    """Transpose each matrix of a stack: shape (..., m, n) to (..., n, m)."""
+    transposed: FloatArray = M.swapaxes(-1, -2)
+    return transposed
+
+
+def symmetric(P: FloatArray) -> FloatArray:
+    """Return P (…, q, q) without the skew part that rounding has left in it."""
+    half: FloatArray = 0.5 * (P + transpose(P))
+    return half
+
+
+def solve(S: FloatArray, right: FloatArray) -> FloatArray:
+    """Return S⁻¹ b for S (q, q) and b (q, …), as `numpy.linalg.solve` does at twice the cost.
+
+    Raises
+    ------
+    LinAlgError
+        If S is singular.
+
+    """
+    if not right.size:  # which SciPy does not take
+        return right
+    _, _, solution, is_singular = dgesv(S, right)
+    if is_singular:
+        raise np.linalg.LinAlgError('Singular matrix')
+    return np.asarray(solution, dtype=np.float64)
+
+
+def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
+    """Kalman update of P, in place, in Joseph's form; return the gain K = P Cᵀ S⁻¹.
+
+    That is (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, with S = C P Cᵀ + R: P stays positive.
+    """
+    K: FloatArray = solve(S, CP).T
+    half = K @ (0.5 * S @ K.T - CP)
+    P += half + half.T
+    return K
+
+
+def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return √(r_iᵀ Σ_i⁻¹ r_i) (m,) of residuals (m, k) with covariances (m, k, k)."""
+    whitened = np.linalg.solve(covariances, r[:, :, None])
+    return np.asarray(np.sqrt((r[:, None, :] @ whitened)[:, 0, 0]))
+
+
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """Return the block-diagonal matrix (m k, m k) of blocks (m, k, k)."""
+    m, k = blocks.shape[:2]
+    return with_blocks(np.zeros((m * k, m * k)), blocks)
+
+
+def with_blocks(matrix: FloatArray, blocks: FloatArray) -> FloatArray:
+    """Return a matrix (m k, m k) plus the block-diagonal one of blocks (m, k, k)."""
+    total: FloatArray = matrix.copy()
+    diagonal = diagonal_blocks(total, blocks.shape[1])
+    diagonal += blocks
+    return total
+
+
+def diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
+    """Return the blocks (m, k, k) on the diagonal of a matrix (m k, m k), as a view of it."""
+    m = len(matrix) // k
+    blocks: FloatArray = np.einsum('ijik->ijk', matrix.reshape(m, k, m, k))
+    return blocks
+
+
+def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
+    """Return covariances (..., d, d) without variances that would drown all others in rounding.
+
+    Standard deviations are at most ``largest`` (d,); the correlations stay.
+    """
+    # Rounding may have left a variance a hair below zero.
+    deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
+    scales = largest / np.maximum(deviations, largest)
+    scaled: FloatArray = covariances * scales[..., :, None] * scales[..., None, :]
+    return scaled
+
+
+def with_variances_above(least_m2: float, covariances: FloatArray) -> FloatArray:
+    """Return covariances (…, k, k) whose variances rounding has made neither too small nor < 0."""
+    variances, U = np.linalg.eigh(symmetric(covariances))
+    clipped: FloatArray = (U * np.maximum(variances, least_m2)[..., None, :]) @ transpose(U)
+    return clipped

@@ -1,0 +1,1 @@
+"""Maps that are known in advance: their files, and how an estimate enters one."""

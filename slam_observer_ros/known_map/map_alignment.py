@@ -1,0 +1,119 @@
+"""How the frames of two maps lie to each other, told by the landmarks that both have."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.matrices import block_diagonal
+from slam_observer_ros.observer.gauge import anchor, JITTER_M2
+
+MAX_TURN_STD_RAD = 0.2
+"""Standard deviation about any axis beyond which landmarks don't tell how the robot is turned.
+
+Three of them in a line leave the roll about it open; two that are close together, the heading.
+"""
+
+CONTRADICTION_SIGMAS = 4.0
+"""Landmarks whose misfit is as improbable as this contradict each other."""
+
+
+def find_transform(
+    source: FloatArray,
+    source_covariance: FloatArray,
+    target: FloatArray,
+    target_covariances: FloatArray,
+    axes: Axes,
+) -> tuple[FloatArray, BoolArray] | None:
+    """Find how the frames of two maps lie to each other, even if some landmarks are wrong.
+
+    Landmarks are left out, the worst one first, until the others don't contradict each other.
+
+    Parameters
+    ----------
+    source : FloatArray
+        (m, 3) landmarks in the robot's own frame, metres.
+    source_covariance : FloatArray
+        (p + m k, p + m k) covariance of the pose's error and theirs together, rad² and m².
+    target : FloatArray
+        (m, 3) the same landmarks in the other frame, metres.
+    target_covariances : FloatArray
+        (m, 3, 3) covariance of each of them in that frame, m².
+    axes : Axes
+        Whether they lie in space (k = 3) or in a plane (k = 2).
+
+    Returns
+    -------
+    tuple or None
+        Transform (4, 4) from the robot's frame to the other one, and by which landmarks (m,) it
+        was found. None unless at least k of them agree, and half of them all, and tell how the
+        robot is turned: of many landmarks some few fit by chance.
+
+    """
+    p, k = axes.p, axes.point
+    J = axes.output_matrix(source).reshape(len(source) * k, p)
+    G = np.vstack([np.eye(p), J])
+    agree = np.ones(len(source), dtype=np.bool_)
+    while agree.sum() >= max(k, 0.5 * len(source)):
+        rows = np.flatnonzero(np.append(np.ones(p, dtype=np.bool_), np.repeat(agree, k)))
+        P = source_covariance[np.ix_(rows, rows)]
+        T = _aligned(source[agree], P[p:, p:], target[agree], target_covariances[agree])
+        R = T[:3, :3]
+        there = block_diagonal((R.T @ target_covariances[agree] @ R)[:, :k, :k])
+        r = (source[agree] - se3.transform(se3.inverse(T), target[agree]))[:, :k]
+        if _turn_std_rad(P, G[rows], there, axes) > MAX_TURN_STD_RAD:
+            return None
+        misfit, doubts = _contradictions(G[rows[p:]], P[p:, p:] + there, r)
+        if misfit <= _improbable(r.size - p):
+            return T, agree
+        agree[np.flatnonzero(agree)[np.argmax(doubts)]] = False
+    return None
+
+
+def _improbable(degrees_of_freedom: int) -> float:
+    """Return the χ² that is as improbable as ``CONTRADICTION_SIGMAS``."""
+    # scipy.stats has it too, but takes a second to import, at the start of each node.
+    both_tails = 2.0 * special.ndtr(-CONTRADICTION_SIGMAS)
+    return float(special.chdtri(degrees_of_freedom, both_tails))
+
+
+def _aligned(
+    source: FloatArray, own: FloatArray, target: FloatArray, there: FloatArray
+) -> FloatArray:
+    """Return the transform (4, 4) that aligns landmarks weighted by how well each is known."""
+    variances = np.diagonal(own).reshape(len(source), -1).sum(axis=1)
+    variances = variances + np.trace(there, axis1=1, axis2=2) + JITTER_M2
+    return rigid_alignment(source, target, 1.0 / variances)
+
+
+def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: Axes) -> float:
+    """Return the standard deviation of the robot's attitude in a map, about the worst axis.
+
+    Parameters are those of :func:`slam_observer_ros.observer.gauge.anchor`, for the pose and the
+    landmarks that the map has.
+    """
+    turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
+    try:
+        _, after = anchor(P, G, rows, there, np.zeros(len(rows)))
+    except np.linalg.LinAlgError:
+        return np.inf
+    # Where landmarks leave a turn open, rounding decides whether its variance is +∞ or −∞.
+    return float(np.sqrt(np.abs(np.linalg.eigvalsh(after[:turns, :turns])).max()))
+
+
+def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float, FloatArray]:
+    """Return how badly differences (m, k) fit together, squared, and each by itself (m,).
+
+    Each one is judged as in Baarda's data snooping: by what the others leave of it, Q r with
+    Q = S⁻¹ − S⁻¹ J (Jᵀ S⁻¹ J)⁻¹ Jᵀ S⁻¹, in units of its standard deviation.
+    """
+    weights = np.linalg.inv(S + JITTER_M2 * np.eye(len(S)))
+    W = weights @ J
+    Q = weights - W @ np.linalg.solve(J.T @ W, W.T)
+    left = Q @ r.ravel()
+    variances = np.maximum(np.diagonal(Q), 1e-6 * np.diagonal(weights))
+    return float(r.ravel() @ left), np.sum((left**2 / variances).reshape(r.shape), axis=1)

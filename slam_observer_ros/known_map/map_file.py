@@ -1,0 +1,289 @@
+"""Maps as YAML files: a head, then a line a landmark.
+
+The same format serves saved maps and surveyed ones. A surveyor writes no more than this::
+
+    format: slam_observer_ros map
+    version: 1
+    frame: map
+    landmarks:
+    - {id: 7, position: [1.5, -2.0, 0.3], sigma: 0.01}
+
+``sigma`` is the standard deviation of each coordinate, metres; a saved map has the whole
+``covariance`` (m²) in its place, ``observations`` (how often each landmark was seen), and tells
+in its head with which ``package_version`` and ``settings`` it was made.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+import dataclasses
+import os
+from pathlib import Path
+import re
+import tempfile
+from typing import Any
+
+import numpy as np
+import yaml
+
+from slam_observer_ros import __version__
+from slam_observer_ros.common.errors import MapError
+from slam_observer_ros.common.output_files import destination, unfinished_file
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.yaml_errors import reason_of, UniqueKeys
+from slam_observer_ros.events import MAX_ID
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.settings.estimator_settings import Settings
+
+FORMAT = 'slam_observer_ros map'
+FORMAT_VERSION = 1
+
+_INT, _FLOAT = 'tag:yaml.org,2002:int', 'tag:yaml.org,2002:float'
+
+_MAX_INT64 = 2**63 - 1
+
+_MAX_NUMBER = 1e12
+"""Metres; nothing larger is meant seriously, and its square still has all digits."""
+
+_ROUNDING = 1e-6
+"""Part of a covariance's largest entry by which it may miss being one."""
+
+# Faster by far, where libyaml is.
+_FastLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+class _StrictLoader(UniqueKeys, _FastLoader):  # type: ignore[misc]  # one of two classes
+    """Reads decimal numbers alone: by YAML 1.1, 010 is 8 and 1:30 is 90."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own)
+        first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT)]
+        for first, resolvers in _FastLoader.yaml_implicit_resolvers.items()
+    }
+
+
+_StrictLoader.add_implicit_resolver(
+    _INT, re.compile(r'^[-+]?(?:0|[1-9][0-9]*)$'), list('-+0123456789')
+)
+_StrictLoader.add_implicit_resolver(
+    _FLOAT,
+    re.compile(
+        r'^[-+]?(?:\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?$'
+        r'|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$'
+    ),
+    list('-+.0123456789'),
+)
+
+
+def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
+    """Write a map; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        File to create or replace.
+    landmark_map : LandmarkMap
+        What to write.
+    settings : Settings
+        With what the map was made, to be told in the file.
+
+    Raises
+    ------
+    MapError
+        If the map is empty, or the file can't be written.
+
+    """
+    if not len(landmark_map.ids):
+        raise MapError(f'the map is empty: nothing is written to {path}')
+    head = {
+        'format': FORMAT,
+        'version': FORMAT_VERSION,
+        'frame': landmark_map.frame_id,
+        'package_version': __version__,
+        'settings': {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in dataclasses.asdict(settings).items()
+        },
+    }
+    lines = [_on_one_line(landmark) for landmark in _as_mappings(landmark_map)]
+    try:
+        with unfinished_file(path) as unfinished, unfinished.open('w', encoding='utf-8') as file:
+            yaml.safe_dump(head, file, sort_keys=False)
+            file.write('landmarks:\n')
+            file.writelines(f'- {line}' for line in lines)
+            file.flush()
+            os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file
+    except OSError as error:
+        raise MapError(f"can't write map {path}: {error.strerror}") from error
+
+
+def check_writable(path: Path) -> None:
+    """Check that a map could be written, as long before there is one as may be.
+
+    Raises
+    ------
+    MapError
+        If the directory that its name leads to takes no file, or it is there and no file.
+
+    """
+    try:
+        if path.is_dir():
+            raise MapError(f"can't write map {path}: it is a directory")
+        directory = destination(path).parent
+    except OSError as error:
+        raise MapError(f"can't write map {path}: {error.strerror}") from error
+    try:
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        reason = f'the directory {directory} takes no file: {error.strerror}'
+        raise MapError(f"can't write map {path}: {reason}") from error
+
+
+def read_map(path: Path) -> LandmarkMap:
+    """Read a map, strictly.
+
+    Raises
+    ------
+    MapError
+        If the file can't be read, is no map of a version that is known, lacks a field or has one
+        too many, or holds a value that can't be right; the message names the file, the landmark
+        and the reason.
+
+    """
+    try:
+        content = yaml.load(path.read_text(encoding='utf-8'), _StrictLoader)
+    except OSError as error:
+        raise MapError(f"can't read map {path}: {error.strerror}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise MapError(f'map {path} is not valid YAML: {reason_of(error)}') from error
+    try:
+        return _parse(content)
+    except MapError as error:
+        raise MapError(f'map {path}: {error}') from error
+
+
+def _as_mappings(landmark_map: LandmarkMap) -> list[dict[str, Any]]:
+    landmarks: list[dict[str, Any]] = [
+        {'id': landmark_id, 'position': position, 'observations': count}
+        for landmark_id, position, count in zip(
+            landmark_map.ids.tolist(),
+            landmark_map.world_points.tolist(),
+            landmark_map.counts.tolist(),
+            strict=True,
+        )
+    ]
+    if landmark_map.covariances is not None:
+        for landmark, covariance in zip(landmarks, landmark_map.covariances, strict=True):
+            landmark['covariance'] = covariance.tolist()
+    return landmarks
+
+
+def _on_one_line(landmark: Mapping[str, Any]) -> str:
+    text: str = yaml.dump(
+        dict(landmark), Dumper=_Dumper, default_flow_style=True, sort_keys=False, width=10**6
+    )
+    return text
+
+
+def _parse(content: Any) -> LandmarkMap:
+    is_map = isinstance(content, dict) and content.get('format') == FORMAT
+    _expect(is_map, f"it has no line 'format: {FORMAT}'")
+    version = content.get('version')
+    if version != FORMAT_VERSION:
+        raise MapError(f'it has version {version!r}; this program reads {FORMAT_VERSION}')
+    required = ('format', 'version', 'frame', 'landmarks')
+    _check_names('it', content, required, ('package_version', 'settings'))
+    frame_id, rows = content['frame'], content['landmarks']
+    _expect(isinstance(frame_id, str) and frame_id != '', f"'frame' is {frame_id!r}, not a name")
+    _expect(isinstance(rows, list), "'landmarks' is not a list")
+    _expect(len(rows) > 0, 'it has no landmarks')
+    ids = [_landmark_id(row, place) for place, row in enumerate(rows)]
+    for landmark_id, times in Counter(ids).items():
+        _expect(times == 1, f'landmark {landmark_id} is there {times} times')
+    return LandmarkMap(
+        np.array(ids, dtype=np.int64),
+        np.array([_position(row) for row in rows], dtype=np.float64).reshape(-1, 3),
+        _covariances(rows),
+        np.array([_observations(row) for row in rows], dtype=np.int64),
+        frame_id,
+    )
+
+
+def _landmark_id(row: Any, place: int) -> int:
+    who = f'entry {place} of landmarks'
+    _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
+    _check_names(who, row, ('id', 'position'), ('sigma', 'covariance', 'observations'))
+    landmark_id = _natural(row['id'], f"{who}: 'id'")
+    _expect(landmark_id <= MAX_ID, f"{who}: 'id' is {landmark_id}, beyond {MAX_ID}")
+    return landmark_id
+
+
+def _position(row: Mapping[str, Any]) -> list[float]:
+    return _numbers(row['position'], 3, f"landmark {row['id']}: 'position'")
+
+
+def _observations(row: Mapping[str, Any]) -> int:
+    return _natural(row.get('observations', 0), f"landmark {row['id']}: 'observations'")
+
+
+def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:
+    """Return (n, 3, 3) covariances, m²; None where no landmark has one."""
+    if not any('sigma' in row or 'covariance' in row for row in rows):
+        return None
+    return np.array([_covariance(row) for row in rows])
+
+
+def _covariance(row: Mapping[str, Any]) -> FloatArray:
+    who = f'landmark {row["id"]}'
+    given = [name for name in ('sigma', 'covariance') if name in row]
+    _expect(len(given) < 2, f"{who} has both 'sigma' and 'covariance': leave one")
+    _expect(bool(given), f"{who} has no 'sigma' or 'covariance', as others have: give all one")
+    if 'sigma' in row:
+        (sigma_m,) = _numbers([row['sigma']], 1, f"{who}: 'sigma'")
+        _expect(sigma_m >= 0.0, f"{who}: 'sigma' is negative")
+        return sigma_m**2 * np.eye(3)
+    lines = row['covariance']
+    _expect(isinstance(lines, list) and len(lines) == 3, f"{who}: 'covariance' is not 3 × 3")
+    covariance = np.array([_numbers(line, 3, f"{who}: a row of 'covariance'") for line in lines])
+    tolerance = _ROUNDING * np.abs(covariance).max()
+    is_symmetric = np.abs(covariance - covariance.T).max() <= tolerance
+    _expect(
+        bool(is_symmetric and np.linalg.eigvalsh(covariance).min() >= -tolerance),
+        f"{who}: 'covariance' is not symmetric, or negative in some direction",
+    )
+    return covariance
+
+
+def _check_names(
+    who: str, mapping: Mapping[Any, Any], required: Sequence[str], optional: Sequence[str]
+) -> None:
+    for name in required:
+        _expect(name in mapping, f"{who} lacks '{name}'")
+    for name in mapping:
+        _expect(name in (*required, *optional), f"{who} has '{name}', which is not known here")
+
+
+def _natural(value: Any, what: str) -> int:
+    is_natural = isinstance(value, int) and not isinstance(value, bool)
+    _expect(
+        is_natural and 0 <= value <= _MAX_INT64,
+        f'{what} is {value!r}, not a whole number ≥ 0',
+    )
+    return int(value)
+
+
+def _numbers(value: Any, count: int, what: str) -> list[float]:
+    is_list = isinstance(value, list) and len(value) == count
+    _expect(is_list, f'{what} is {value!r}, not a list of {count} numbers')
+    for entry in value:
+        is_number = isinstance(entry, int | float) and not isinstance(entry, bool)
+        # Written so that NaN is refused too.
+        _expect(is_number and abs(entry) <= _MAX_NUMBER, f'{what} has {entry!r}, no finite number')
+    return [float(entry) for entry in value]
+
+
+def _expect(holds: bool, message: str) -> None:
+    if not holds:
+        raise MapError(message)

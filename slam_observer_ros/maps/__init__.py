@@ -1,1 +1,0 @@
-"""Maps as they are saved and loaded, and where the robot is in one."""

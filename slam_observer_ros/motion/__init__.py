@@ -1,1 +1,0 @@
-"""How the robot moves: velocities, how they are calibrated, and their noise."""

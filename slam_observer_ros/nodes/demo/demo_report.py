@@ -1,0 +1,104 @@
+"""What came of the demo: figures, a table, and whether the observer converged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.plots.simulation_plots import plot_configuration, plot_lyapunov
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.nodes.demo.demo_listener import DemoListener
+from slam_observer_ros.runs.simulated_run import fit_slope
+
+CHECKED_S = 60.0
+"""Simulated time at which the observer must have converged."""
+
+CONVERGED_LOG10 = -10.0
+"""log10 L below which it has."""
+
+FLOAT32_FLOOR = 1e-10
+"""L below which the rounding of the point clouds' float32 coordinates is felt."""
+
+
+def report(listener: DemoListener, folder: Path, console: Console) -> bool:
+    """Draw the figures, print the summary and return whether the observer converged.
+
+    Parameters
+    ----------
+    listener : DemoListener
+        What was heard.
+    folder : Path
+        Where the figures go.
+    console : Console
+        Where the summary goes.
+
+    """
+    times_s, lyapunov = listener.times_s, np.array(listener.lyapunov)
+    # Both topics carry one message an estimate; only one at the very end may be missing.
+    count = min(len(times_s), len(lyapunov))
+    times_s, lyapunov = times_s[:count], lyapunov[:count]
+    is_known = lyapunov > 0.0
+    if not np.any(is_known):
+        console.print('The observer has published no estimate.', style='red')
+        return False
+    times_s, lyapunov = times_s[is_known], lyapunov[is_known]
+    slope_per_s = fit_slope(times_s, lyapunov, FLOAT32_FLOOR)
+    _draw(listener, folder, times_s, lyapunov, slope_per_s)
+    checked_log10 = float(np.log10(lyapunov[times_s <= CHECKED_S][-1]))
+    has_converged = checked_log10 < CONVERGED_LOG10
+    rows = {
+        'log10 L, first': f'{np.log10(lyapunov[0]):.2f}',
+        f'log10 L at {min(CHECKED_S, times_s[-1]):.0f} s': f'{checked_log10:.2f}',
+        'log10 L, last': f'{np.log10(lyapunov[-1]):.2f}',
+        'slope of log10 L': 'none' if slope_per_s is None else f'{slope_per_s:.4f} per second',
+        **_accuracy(listener),
+        'estimates heard': str(count),
+        **{path.name: str(path) for path in sorted(folder.iterdir())},
+    }
+    _print(console, rows)
+    verdict = 'converged' if has_converged else 'did NOT converge'
+    console.print(f'The observer {verdict}.', style='green' if has_converged else 'red')
+    return has_converged
+
+
+def _draw(
+    listener: DemoListener,
+    folder: Path,
+    times_s: FloatArray,
+    lyapunov: FloatArray,
+    slope_per_s: float | None,
+) -> None:
+    plot_lyapunov(folder / 'lyapunov.png', times_s, np.log10(lyapunov), slope_per_s)
+    estimate, truth = listener.trajectories()
+    plot_configuration(
+        folder / 'configuration.png',
+        estimate,
+        truth,
+        listener.landmark_tracks(estimate.stamps_ns.tolist()),
+        listener.true_landmarks(),
+    )
+
+
+def _accuracy(listener: DemoListener) -> dict[str, str]:
+    """Return position errors, each after its own rigid alignment."""
+    estimate, truth = listener.trajectories()
+    half = len(estimate) // 2
+    settled = Trajectory(estimate.stamps_ns[half:], estimate.poses[half:])
+    return {
+        'ATE, whole run': f'{trajectory_errors(estimate, truth).ate_rmse_m:.4f} m',
+        'ATE, second half': f'{trajectory_errors(settled, truth).ate_rmse_m:.1e} m',
+    }
+
+
+def _print(console: Console, rows: dict[str, str]) -> None:
+    table = Table(title='Demo', title_justify='left', show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow='fold')
+    for name, value in rows.items():
+        table.add_row(name, value)
+    console.print(table)

@@ -1,0 +1,1 @@
+"""From ROS messages to events."""

@@ -1,0 +1,110 @@
+"""The observer's input topics, as the parameters ask for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, TypeVar
+
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.messages.detections import (
+    decode_apriltags,
+    decode_pose_array,
+)
+from slam_observer_ros.messages.message_types import (
+    APRILTAGS,
+    CLOUD_DECODERS,
+    DETECTION_DECODERS,
+    IMU,
+    ObservationDecoder,
+    ODOMETRY,
+    POSE_ARRAY,
+    TRANSFORMS,
+    VELOCITY_DECODERS,
+)
+from slam_observer_ros.messages.poses_and_velocities import (
+    decode_imu,
+    decode_odometry_pose,
+)
+from slam_observer_ros.nodes.intake.decoders import CloudDecoder, OdometryDecoder, TagDecoder
+from slam_observer_ros.nodes.intake.intake import Intake
+from slam_observer_ros.nodes.intake.subscriptions import Input
+from slam_observer_ros.settings.input_settings import AUTO, ON_TF, POSE_DIFFERENCES
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+ValueT = TypeVar('ValueT')
+
+
+def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> list[Input[Any]]:
+    """Subscribe to what the parameters name.
+
+    Raises
+    ------
+    ParameterError
+        If the package of a message type is not installed.
+
+    """
+    velocity = _velocity_input(node, settings, intake)
+    landmarks = _landmark_input(node, settings, intake)
+    imu: list[Input[Any]] = []
+    if settings.use_imu:
+        qos = _qos(settings.twist_qos, settings.queue_depth)
+        imu.append(Input(node, 'imu', {IMU: decode_imu}, partial(intake.add, 'imu'), qos))
+    velocity.read_first, landmarks.read_first = imu, [velocity, *imu]
+    return [velocity, landmarks, *imu]
+
+
+def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+    qos = _qos(settings.twist_qos, settings.queue_depth)
+    if settings.velocity_source == POSE_DIFFERENCES:
+        if settings.velocity_type not in (AUTO, 'Odometry'):
+            raise ParameterError(
+                f"velocity_type '{settings.velocity_type}' has no poses: with velocity_source "
+                "'pose_differences' it is 'Odometry' or 'auto'"
+            )
+        decoders: dict[str, Any] = {ODOMETRY: decode_odometry_pose}
+    else:
+        decoders = _chosen(
+            VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
+        )
+    return Input(node, 'twist', decoders, partial(intake.add, 'twist'), qos)
+
+
+def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+    qos = _qos(settings.landmarks_qos, settings.queue_depth)
+    if settings.landmarks_type == ON_TF:
+        decoder = TagDecoder(node, settings.tag_frame_prefix)
+        return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos)
+    if settings.landmarks_type == 'AprilTagDetectionArray':
+        decoders: dict[str, Any] = {APRILTAGS: decode_apriltags}
+        return Input(node, 'landmarks', decoders, partial(intake.add, 'landmarks'), qos)
+    if settings.landmarks_type == AUTO:
+        # Not detections: their package, which need not be installed, would be imported unasked.
+        decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
+        return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+    decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
+    return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+
+
+def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:
+    return {message_type: CloudDecoder(node, message_type) for message_type in CLOUD_DECODERS}
+
+
+def _chosen(decoders: Mapping[str, ValueT], type_choice: str) -> dict[str, ValueT]:
+    """Return the decoders of a short type name, or all of them."""
+    return {
+        name: decoder
+        for name, decoder in decoders.items()
+        if type_choice in (AUTO, name.rsplit('/', 1)[-1])
+    }
+
+
+def _qos(reliability: str, depth: int) -> QoSProfile:
+    return QoSProfile(
+        reliability=ReliabilityPolicy[reliability.upper()],
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+    )

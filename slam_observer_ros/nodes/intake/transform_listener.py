@@ -1,0 +1,120 @@
+"""Transforms from /tf and /tf_static, live."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import re
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.time import Time
+
+from slam_observer_ros.common.errors import MessageError, TransformError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
+from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
+from slam_observer_ros.messages.poses_and_velocities import decode_transforms, pose_matrices
+from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+
+try:
+    import tf2_ros
+except ImportError:  # No wheel of it exists; TopicTransforms does the same.
+    tf2_ros = None
+
+TF_QOS = QoSProfile(depth=100)
+TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class TopicTransforms:
+    """A listener of /tf and /tf_static of our own.
+
+    Parameters
+    ----------
+    node : Node
+        Node that subscribes; without tf2_msgs no transform is ever known.
+    own : tuple of str
+        Parent and child of the transform that the node itself publishes where nobody else tells
+        the child's parent: heard back, it would take the place of another parent.
+
+    """
+
+    def __init__(self, node: Node, own: tuple[str, str]) -> None:
+        self._node = node
+        self._own = own
+        self._buffer = TransformBuffer()
+        self.lookup = self._buffer.lookup
+        self.newest_ns = self._buffer.newest_ns
+        self.parent_of = self._buffer.parent_of
+        self.clear = self._buffer.clear
+        if TFMessage is not None:
+            self._subscribe('/tf', TF_QOS, is_static=False)
+            self._subscribe('/tf_static', TF_STATIC_QOS, is_static=True)
+
+    def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> None:
+        def receive(raw: bytes) -> None:
+            try:
+                transforms = decode_transforms(raw)
+            except MessageError as error:
+                self._node.get_logger().warning(
+                    f"malformed message on '{topic}' dropped: {error}", throttle_duration_sec=10.0
+                )
+                return
+            others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
+            insert_transforms(self._buffer, others, is_static=is_static)
+
+        self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
+
+
+class Tf2Transforms:
+    """tf2_ros's buffer and listener.
+
+    Parameters
+    ----------
+    node : Node
+        Node that subscribes.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._buffer = tf2_ros.Buffer()
+        self._listener = tf2_ros.TransformListener(self._buffer, node)
+        self.clear: Callable[[], None] = self._buffer.clear
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
+        """As :meth:`TransformSource.lookup`."""
+        try:
+            stamped = self._buffer.lookup_transform(target, source, Time(nanoseconds=stamp_ns))
+        except tf2_ros.TransformException as error:
+            raise TransformError(str(error)) from error
+        position, q = stamped.transform.translation, stamped.transform.rotation
+        return pose_matrices(
+            np.array([position.x, position.y, position.z]), np.array([q.x, q.y, q.z, q.w])
+        )
+
+    def parent_of(self, frame: str) -> str | None:
+        """As :meth:`TransformSource.parent_of`."""
+        # Not by a YAML parser: a frame's name may be what that takes for an alias.
+        entry = re.search(
+            rf"^{re.escape(frame)}: *\n(?: +.*\n)*? +parent: '?([^'\n]*)'?",
+            self._buffer.all_frames_as_yaml(),
+            re.MULTILINE,
+        )
+        return entry[1] if entry else None
+
+    def newest_ns(self, target: str, source: str) -> int | None:
+        """As :meth:`TransformSource.newest_ns`."""
+        try:
+            newest_ns: int = self._buffer.get_latest_common_time(target, source).nanoseconds
+        except tf2_ros.TransformException:
+            return None
+        return newest_ns or ALWAYS_NS  # tf2 has zero for what is static
+
+
+def open_transforms(node: Node, own: tuple[str, str]) -> TransformSource:
+    """Return tf2_ros's buffer where ROS provides it, else a listener of our own.
+
+    ``own`` are parent and child of what the node itself may publish.
+    """
+    # tf2 keeps the parent of each stamp, so that one does not take the place of another.
+    return TopicTransforms(node, own) if tf2_ros is None else Tf2Transforms(node)

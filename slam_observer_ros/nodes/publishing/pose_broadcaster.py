@@ -1,0 +1,208 @@
+"""The estimated pose on /tf: map to odom where others publish odom to base, else map to base."""
+
+from __future__ import annotations
+
+from collections import deque
+import time
+
+from rclpy.node import Node
+
+from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_ns, to_s
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.frames import TransformSource
+from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
+from slam_observer_ros.nodes.qos import RELIABLE_QOS
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+DISCOVERY_S = 2.0
+"""How long, from the first pose on, to look for odom to base on /tf before the base is taken to
+have no parent there."""
+
+MAX_WAITING_NS = 10_000_000_000
+"""How long a pose waits for odometry of its time, nanoseconds: as long as tf keeps transforms."""
+
+LATE_NS = 500_000_000
+"""Odometry that is further behind the poses than this is reported, nanoseconds."""
+
+LOOK_PERIOD_S = 0.5
+"""Time between two looks for another parent of the base."""
+
+REPORT_PERIOD_S = 10.0
+"""Shortest time between two reports of odometry that is behind."""
+
+
+class PoseBroadcaster:
+    """Keeps the tree of frames whole, as REP 105 asks: each frame has one parent.
+
+    Nothing goes out before it is known who is the base frame's parent. Where that is the odometry
+    frame, its correction goes out post-dated by ``transform_tolerance``, so that it holds until
+    the next one, and by how long poses are held back, which has passed by then; while the observer
+    is paused, the last correction is repeated. Odometry that begins later takes over. A frame is
+    never published twice with one stamp.
+
+    Parameters
+    ----------
+    node : Node
+        Node that publishes.
+    settings : ObserverNodeSettings
+        Frames and tolerances.
+    transforms : TransformSource
+        Where the odometry is, without what is published here.
+    reorder_window_s : float
+        How long poses are held back, seconds.
+
+    Attributes
+    ----------
+    trouble : str
+        Why no correction goes out, or late ones do; empty while all is well.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: ObserverNodeSettings,
+        transforms: TransformSource,
+        reorder_window_s: float,
+    ) -> None:
+        self._node = node
+        self._settings = settings
+        self._transforms = transforms
+        self._publisher = TransformPublisher(node, '/tf', RELIABLE_QOS)
+        self._tolerance_ns = to_ns(settings.transform_tolerance)
+        self._held_back_ns = to_ns(reorder_window_s)
+        self._begin_s: float | None = None
+        self._look_at_s = 0.0
+        self._parent = ''
+        self._child = '' if settings.odom_frame else settings.base_frame
+        self._waiting: deque[tuple[int, FloatArray]] = deque()
+        self._correction: FloatArray | None = None
+        self._last_ns: int | None = None
+        self.trouble = ''
+
+    def add(self, stamp_ns: int, pose: FloatArray) -> None:
+        """Publish a pose (4, 4) of the base in the map, now or once its odometry is there."""
+        if self._begin_s is None:
+            self._begin_s = time.monotonic()
+        self._waiting.append((stamp_ns, pose))
+        while self._waiting[0][0] < stamp_ns - MAX_WAITING_NS:
+            self._waiting.popleft()
+        self.retry()
+
+    def retry(self) -> None:
+        """Publish the newest pose that can be."""
+        if not self._waiting:
+            return
+        newest_ns = self._odometry_ns()
+        self.trouble = ''
+        self._find_parent(newest_ns)
+        self._look_for_delay(newest_ns)
+        if self._child == self._settings.odom_frame:
+            self._publish_correction(newest_ns)
+        elif self._child and not self._other_parent():
+            stamp_ns, pose = self._waiting.pop()
+            self._waiting.clear()
+            self._publish(stamp_ns, pose)
+
+    def repeat(self, now_ns: int) -> None:
+        """Publish the last correction of the odometry again, as of now; the base's pose never."""
+        if self._correction is not None:
+            self._publish(now_ns + self._tolerance_ns, self._correction)
+
+    def forget(self) -> None:
+        """Begin anew, as after a reset or a jump of the clock."""
+        self._waiting.clear()
+        self._correction = None
+        self.trouble = ''
+
+    def _odometry_ns(self) -> int | None:
+        """Return the newest stamp of the odometry on /tf; None if it has none."""
+        settings = self._settings
+        if not settings.odom_frame:
+            return None
+        return self._transforms.newest_ns(settings.odom_frame, settings.base_frame)
+
+    def _find_parent(self, newest_ns: int | None) -> None:
+        """Look who is the base's parent; odometry on /tf is, however late it comes."""
+        if newest_ns is not None and self._child != self._settings.odom_frame:
+            self._settle(self._settings.odom_frame, '/tf has')
+        searched_s = time.monotonic() - (self._begin_s or 0.0)
+        if not self._child and searched_s > DISCOVERY_S and not self._other_parent():
+            self._settle(self._settings.base_frame, 'nobody publishes')
+
+    def _other_parent(self) -> str:
+        """Return who is the base's parent on /tf if that forbids to publish its pose; else ''."""
+        now_s, settings = time.monotonic(), self._settings
+        if now_s >= self._look_at_s:
+            self._look_at_s = now_s + LOOK_PERIOD_S
+            parent = self._transforms.parent_of(settings.base_frame) or ''
+            # Without odom_frame it was asked for, whoever else tells the base.
+            is_told = settings.odom_frame and not settings.invert_tf
+            self._parent = parent if is_told and parent != settings.map_frame else ''
+        if self._parent:
+            self._report(
+                f"'{settings.base_frame}' has the parent '{self._parent}' on /tf, so that no pose "
+                'is published there: set odom_frame to the frame of the odometry, or base_frame '
+                "to the robot's uppermost frame, or publish_tf to false"
+            )
+        return self._parent
+
+    def _look_for_delay(self, newest_ns: int | None) -> None:
+        """Report odometry that is far behind the poses, or has ended."""
+        settings = self._settings
+        known_ns = self._waiting[0][0] if newest_ns is None else newest_ns
+        behind_ns = self._waiting[-1][0] - known_ns
+        if self._child != settings.odom_frame or behind_ns <= LATE_NS:
+            return
+        trouble = (
+            'without stamps' if newest_ns == 0 else f'{to_s(behind_ns):.1f} s behind the estimate'
+        )
+        self._report(
+            f"'{settings.odom_frame}' to '{settings.base_frame}' on /tf is {trouble}: "
+            f"'{settings.map_frame}' to '{settings.odom_frame}' waits for it; look at what "
+            'publishes it'
+        )
+
+    def _report(self, trouble: str) -> None:
+        self.trouble = trouble
+        self._node.get_logger().warning(trouble, throttle_duration_sec=REPORT_PERIOD_S)
+
+    def _publish_correction(self, newest_ns: int | None) -> None:
+        """Publish the newest correction that the odometry known by now gives."""
+        settings, found = self._settings, None
+        if newest_ns is None:
+            return
+        while self._waiting and self._waiting[0][0] <= newest_ns:
+            found = self._waiting.popleft()
+        if found is None:
+            return
+        stamp_ns, pose = found
+        try:
+            odometry = self._transforms.lookup(settings.odom_frame, settings.base_frame, stamp_ns)
+        except TransformError as error:
+            if stamp_ns < newest_ns - MAX_WAITING_NS:  # else it is of before the odometry began
+                self._report(f'odometry on /tf is stamped far ahead of the estimate: {error}')
+            return
+        self._correction = pose @ se3.inverse(odometry)
+        self._publish(stamp_ns + self._held_back_ns + self._tolerance_ns, self._correction)
+
+    def _settle(self, child: str, reason: str) -> None:
+        self._child = child
+        settings = self._settings
+        self._node.get_logger().info(
+            f"publishing '{settings.map_frame}' to '{child}' on /tf: "
+            f"{reason} '{settings.odom_frame}' to '{settings.base_frame}'"
+        )
+
+    def _publish(self, stamp_ns: int, pose: FloatArray) -> None:
+        if stamp_ns == self._last_ns:
+            return
+        self._last_ns = stamp_ns
+        if self._settings.invert_tf:
+            self._publisher.publish(
+                stamp_ns, self._child, self._settings.map_frame, se3.inverse(pose)
+            )
+        else:
+            self._publisher.publish(stamp_ns, self._settings.map_frame, self._child, pose)

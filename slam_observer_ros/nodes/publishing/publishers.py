@@ -1,0 +1,205 @@
+"""What the observer publishes about its estimate."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    TwistWithCovariance,
+)
+from nav_msgs.msg import Odometry, Path
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud, PointCloud2
+from std_msgs.msg import Float64
+from visualization_msgs.msg import MarkerArray
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.inputs.frames import TransformSource
+from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud, FLOAT32_ID_LIMIT
+from slam_observer_ros.nodes.publishing.conversions import (
+    header_message,
+    point_cloud2_message,
+    pose_covariance_field,
+    pose_message,
+    twist_message,
+    unknown_covariance_field,
+)
+from slam_observer_ros.nodes.publishing.markers import landmark_markers, no_markers
+from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
+from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
+"""Topics of the estimate, before remapping."""
+
+PATH_SPACING_NS = 100_000_000
+"""Least time between two poses of the path, nanoseconds."""
+
+
+class Outputs:
+    """Publishers of the estimate.
+
+    Each message carries the stamp of the estimator's state, never the present time, and no stamp
+    is published twice, unless landmarks were forgotten. Nothing is published while the place in a
+    loaded map is unknown, but an empty map in place of one that is out.
+
+    Parameters
+    ----------
+    node : Node
+        Node that publishes.
+    settings : ObserverNodeSettings
+        Frames, rates and lengths.
+    estimator : Estimator
+        Where the estimate comes from.
+    transforms : TransformSource
+        Where others' odometry is.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: ObserverNodeSettings,
+        estimator: Estimator,
+        transforms: TransformSource,
+    ) -> None:
+        self._node = node
+        self._settings = settings
+        self._estimator = estimator
+        self._fast_stamp_ns: int | None = None
+        self._slow_stamp_ns: int | None = None
+        self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
+        self._path_stamp_ns: int | None = None
+        self._odometry = node.create_publisher(Odometry, 'odometry', RELIABLE_QOS)
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', RELIABLE_QOS)
+        self._lyapunov = node.create_publisher(Float64, 'lyapunov', RELIABLE_QOS)
+        self._estimates = node.create_publisher(PointCloud, 'landmark_estimates', RELIABLE_QOS)
+        self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
+        self._map = node.create_publisher(PointCloud2, 'map', LATCHED_QOS)
+        self._markers = node.create_publisher(MarkerArray, 'markers', RELIABLE_QOS)
+        self._broadcaster: PoseBroadcaster | None = None
+        if settings.publish_tf:
+            self._broadcaster = PoseBroadcaster(
+                node, settings, transforms, estimator.settings.reorder_window
+            )
+
+    @property
+    def trouble(self) -> str:
+        """Why the transform is not published as it should be; empty while it is."""
+        return '' if self._broadcaster is None else self._broadcaster.trouble
+
+    def publish_state(self) -> None:
+        """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
+        if self._broadcaster is not None:
+            self._broadcaster.retry()
+        stamp_ns = self._estimator.stamp_ns
+        if stamp_ns in (None, self._fast_stamp_ns) or not self._estimator.is_localised:
+            return
+        self._fast_stamp_ns = stamp_ns
+        pose = self._estimator.pose
+        self._publish_pose(stamp_ns, pose)
+        if self._broadcaster is not None:
+            self._broadcaster.add(stamp_ns, pose)
+        self._extend_path(stamp_ns, pose)
+        self._lyapunov.publish(Float64(data=float(self._estimator.lyapunov)))
+        self._publish_estimates(stamp_ns)
+
+    def publish_overview(self) -> None:
+        """Publish path, map and markers if they are new; they are costly, so seldom."""
+        stamp_ns = self._estimator.stamp_ns
+        if stamp_ns in (None, self._slow_stamp_ns) or not self._estimator.is_localised:
+            return
+        self._slow_stamp_ns = stamp_ns
+        header = header_message(stamp_ns, self._settings.map_frame)
+        self._path_publisher.publish(Path(header=header, poses=list(self._path)))
+        self._publish_landmarks(stamp_ns)
+
+    def renew_landmarks(self) -> None:
+        """Replace map and markers, if any are out, as some of their landmarks are forgotten."""
+        if self._slow_stamp_ns is None:
+            return
+        stamp_ns, map_frame = self._estimator.stamp_ns, self._settings.map_frame
+        if stamp_ns is None:
+            stamp_ns = self._node.get_clock().now().nanoseconds
+        if self._estimator.is_localised:
+            self._publish_landmarks(stamp_ns)
+            return
+        no_ids = np.empty(0, dtype=np.int64)
+        self._map.publish(point_cloud2_message(stamp_ns, map_frame, no_ids, np.empty((0, 3))))
+        self._markers.publish(no_markers(header_message(stamp_ns, map_frame)))
+
+    def repeat_transform(self) -> None:
+        """Publish the odometry's correction as of now, while no new one comes."""
+        if self._broadcaster is not None:
+            self._broadcaster.repeat(self._node.get_clock().now().nanoseconds)
+
+    def begin_anew(self) -> None:
+        """Forget the path and what waits: the estimate is at another place, frame or time.
+
+        The map that is out, which is latched, and the markers are replaced.
+        """
+        self._path.clear()
+        self._path_stamp_ns = None
+        if self._broadcaster is not None:
+            self._broadcaster.forget()
+        self.renew_landmarks()
+
+    def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
+        header = header_message(stamp_ns, self._settings.map_frame)
+        covariance = pose_covariance_field(self._estimator.pose_covariance)
+        uncertain = PoseWithCovariance(pose=pose_message(pose), covariance=covariance)
+        twist = TwistWithCovariance(
+            twist=twist_message(self._estimator.body_velocity),
+            covariance=unknown_covariance_field(),
+        )
+        self._pose.publish(PoseWithCovarianceStamped(header=header, pose=uncertain))
+        self._odometry.publish(
+            Odometry(
+                header=header,
+                child_frame_id=self._settings.base_frame,
+                pose=uncertain,
+                twist=twist,
+            )
+        )
+
+    def _publish_landmarks(self, stamp_ns: int) -> None:
+        estimator, map_frame = self._estimator, self._settings.map_frame
+        velocities = estimator.landmark_velocities
+        self._map.publish(
+            point_cloud2_message(
+                stamp_ns,
+                map_frame,
+                estimator.landmark_ids,
+                estimator.world_points,
+                estimator.landmark_covariances,
+                velocities if velocities.any() else None,
+            )
+        )
+        if self._markers.get_subscription_count() > 0:
+            header = header_message(stamp_ns, map_frame)
+            self._markers.publish(landmark_markers(header, estimator))
+
+    def _publish_estimates(self, stamp_ns: int) -> None:
+        ids = self._estimator.landmark_ids
+        if np.any(ids >= FLOAT32_ID_LIMIT):
+            self._node.get_logger().warning(
+                f"landmark_estimates can't carry ids from {FLOAT32_ID_LIMIT} on; map does",
+                once=True,
+            )
+            return
+        points = self._estimator.world_points
+        raw = encode_point_cloud(stamp_ns, self._settings.map_frame, ids, points)
+        self._estimates.publish(raw)
+
+    def _extend_path(self, stamp_ns: int, pose: FloatArray) -> None:
+        last_ns = self._path_stamp_ns
+        if last_ns is not None and 0 <= stamp_ns - last_ns < PATH_SPACING_NS:
+            return
+        self._path_stamp_ns = stamp_ns
+        header = header_message(stamp_ns, self._settings.map_frame)
+        self._path.append(PoseStamped(header=header, pose=pose_message(pose)))

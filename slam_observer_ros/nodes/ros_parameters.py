@@ -1,0 +1,119 @@
+"""ROS parameters declared, checked and read from the typed tables."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.settings.parameter_file import names_of_others
+from slam_observer_ros.settings.parameter_table import (
+    Dataclass,
+    from_parameters,
+    Parameter,
+    SettingsT,
+    table,
+)
+
+INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+
+
+def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
+    """Declare every row of the settings' tables; from then on each change is checked.
+
+    Names that are set but in no table are ignored with a warning: they may be other nodes'.
+
+    Parameters
+    ----------
+    node : Node
+        The node that owns the parameters.
+    *settings_classes : type
+        Settings dataclasses; their names must not overlap.
+
+    Raises
+    ------
+    ParameterError
+        If the command line or a parameter file sets a name that is one of ours misspelt.
+    InvalidParameterValueException
+        If a value from the command line or a parameter file does not fit its row.
+
+    """
+    rows = [row for settings_class in settings_classes for row in table(settings_class)]
+    _check_names(node, [row.name for row in rows])
+
+    def check(changes: Sequence[RosParameter]) -> SetParametersResult:
+        try:
+            for settings_class in settings_classes:
+                _check_changes(node, settings_class, changes)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+    for row in rows:
+        node.declare_parameter(row.name, row.default, descriptor(row))
+
+
+def read_settings(node: Node, settings_class: type[SettingsT]) -> SettingsT:
+    """Return the settings that the node's parameters hold now."""
+    names = [row.name for row in table(settings_class)]
+    values = {name: node.get_parameter(name).value for name in names}
+    return from_parameters(settings_class, values)
+
+
+def descriptor(row: Parameter) -> ParameterDescriptor:
+    """Return the ROS descriptor of one row.
+
+    The type is left dynamic so that ``gain:=4`` may set a floating-point parameter; our own check
+    refuses what does not fit, with a better reason than rclpy's.
+    """
+    unit = f' [{row.unit}]' if row.unit else ''
+    result = ParameterDescriptor(
+        name=row.name,
+        description=f'{row.description}{unit}',
+        additional_constraints=row.range_text(),
+        read_only=row.read_only,
+        dynamic_typing=True,
+    )
+    if isinstance(row.default, float):
+        result.floating_point_range = [
+            FloatingPointRange(from_value=float(row.minimum), to_value=float(row.maximum))
+        ]
+    elif isinstance(row.default, int) and not isinstance(row.default, bool):
+        result.integer_range = [
+            IntegerRange(
+                from_value=int(max(row.minimum, INT64_MIN)),
+                to_value=int(min(row.maximum, INT64_MAX)),
+            )
+        ]
+    return result
+
+
+def _check_names(node: Node, names: Collection[str]) -> None:
+    """Raise ParameterError if a name that is set is misspelt; warn of those that are unlike."""
+    # rclpy, unlike rclcpp, has no public name for what the command line and files set.
+    written = [
+        name
+        for name in sorted(node._parameter_overrides)
+        if not (node.has_parameter(name) or name.startswith('qos_overrides.'))
+    ]
+    if ignored := names_of_others(written, names):
+        node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
+
+
+def _check_changes(
+    node: Node, settings_class: type[Dataclass], changes: Sequence[RosParameter]
+) -> None:
+    """Raise ParameterError unless the settings with these changes are whole and in range."""
+    names = [row.name for row in table(settings_class)]
+    values = {name: node.get_parameter(name).value for name in names if node.has_parameter(name)}
+    values.update({change.name: change.value for change in changes if change.name in names})
+    from_parameters(settings_class, values)

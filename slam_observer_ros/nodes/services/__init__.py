@@ -1,0 +1,1 @@
+"""Services and topics by which others steer the observer."""

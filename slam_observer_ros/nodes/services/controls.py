@@ -1,0 +1,68 @@
+"""Services and topics by which a person or another node steers the observer."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.nodes.intake.intake import Intake
+from slam_observer_ros.nodes.publishing.publishers import Outputs
+from slam_observer_ros.nodes.qos import RELIABLE_QOS
+
+
+class Controls:
+    """``~/reset``, ``~/pause``, ``~/resume`` and ``~/forget_landmark``.
+
+    Parameters
+    ----------
+    node : Node
+        Node that offers them.
+    estimator : Estimator
+        What is steered.
+    intake : Intake
+        What is paused.
+    outputs : Outputs
+        What has to follow.
+
+    """
+
+    def __init__(self, node: Node, estimator: Estimator, intake: Intake, outputs: Outputs) -> None:
+        self._node = node
+        self._estimator = estimator
+        self._intake = intake
+        self._outputs = outputs
+        node.create_service(Trigger, '~/reset', self._reset)
+        node.create_service(Trigger, '~/pause', self._pause)
+        node.create_service(Trigger, '~/resume', self._resume)
+        node.create_subscription(Int64, '~/forget_landmark', self._forget, RELIABLE_QOS)
+
+    def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._estimator.reset()
+        self._outputs.begin_anew()
+        return self._answer(response, 'pose and what was mapped are forgotten')
+
+    def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._estimator.release()  # what has come before the pause counts
+        self._intake.is_paused = True
+        return self._answer(response, 'paused: the pose is held, and all that comes in is dropped')
+
+    def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._intake.is_paused = False
+        return self._answer(response, 'resumed')
+
+    def _answer(self, response: Trigger.Response, text: str) -> Trigger.Response:
+        self._node.get_logger().info(text)
+        response.success = True
+        response.message = text
+        return response
+
+    def _forget(self, message: Int64) -> None:
+        self._estimator.release()  # else a sighting that is held back would bring it back
+        was_known = self._estimator.forget(message.data)
+        if was_known:
+            self._outputs.renew_landmarks()
+        self._node.get_logger().info(
+            f'landmark {message.data} is {"forgotten" if was_known else "not known"}'
+        )

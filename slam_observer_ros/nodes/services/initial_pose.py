@@ -1,0 +1,100 @@
+"""Poses that a person or another node gives to the observer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+from rclpy.node import Node
+
+from slam_observer_ros.common.errors import MessageError, ParameterError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.geometry.matrices import limited
+from slam_observer_ros.known_map.localiser import GIVEN_POSE_STD
+from slam_observer_ros.messages.poses_and_velocities import (
+    decode_pose_with_covariance_stamped,
+    PoseMessage,
+)
+from slam_observer_ros.nodes.qos import RELIABLE_QOS
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_table import table
+from slam_observer_ros.state.covariances import MAX_POSE_ERRORS
+
+TOPICS = ('initialpose', '~/set_pose')
+
+_MAX_POSITION_M = next(row.maximum for row in table(Settings) if row.name == 'initial_position')
+
+
+class InitialPose:
+    """Subscriptions whose poses move the robot.
+
+    Parameters
+    ----------
+    node : Node
+        Node that subscribes.
+    map_frame : str
+        Frame that the poses must be in.
+    estimator : Estimator
+        Whose robot is moved.
+    on_move : callable
+        Called after each move.
+
+    """
+
+    def __init__(
+        self, node: Node, map_frame: str, estimator: Estimator, on_move: Callable[[], None]
+    ) -> None:
+        self._node = node
+        self._map_frame = map_frame
+        self._estimator = estimator
+        self._on_move = on_move
+        for topic in TOPICS:
+            node.create_subscription(
+                PoseWithCovarianceStamped, topic, self._receive, RELIABLE_QOS, raw=True
+            )
+
+    def _receive(self, raw: bytes) -> None:
+        try:
+            message = decode_pose_with_covariance_stamped(raw)
+            self._check(message)
+            covariance = filled_in(message.covariance)
+            self._estimator.release()  # what has come before belongs to where the robot was
+            self._estimator.set_pose(message.pose, covariance)
+        except (MessageError, ParameterError) as error:
+            self._node.get_logger().error(f'the pose given is not used: {error}')
+            return
+        self._on_move()
+        x, y, z = message.position.tolist()
+        self._node.get_logger().info(f'the robot is set to ({x:.2f}, {y:.2f}, {z:.2f}) m')
+
+    def _check(self, message: PoseMessage) -> None:
+        if message.frame_id.lstrip('/') not in ('', self._map_frame):
+            raise MessageError(f"it is in frame '{message.frame_id}', not '{self._map_frame}'")
+        if not np.isfinite(message.position).all():
+            raise MessageError('its position has a NaN or infinite entry')
+        if np.abs(message.position).max() > _MAX_POSITION_M:
+            raise MessageError(f'its position has an entry beyond {_MAX_POSITION_M:g} m')
+
+
+def filled_in(covariance: FloatArray | None) -> FloatArray:
+    """Return a covariance (6, 6) with variances assumed where the message gives none.
+
+    RViz's 2D Pose Estimate, for one, gives those of x, y and yaw only, and zeros else. Those
+    that are so large that they only say 'unknown' are made less, lest they drown all others.
+
+    Raises
+    ------
+    MessageError
+        If the covariance is not finite, or negative in some direction.
+
+    """
+    given = np.zeros((6, 6)) if covariance is None else covariance
+    if np.isfinite(given).all():
+        given = limited(given, MAX_POSE_ERRORS)
+    rounding = 1e-9 + 1e-12 * np.trace(given)
+    if not (np.isfinite(given).all() and np.linalg.eigvalsh(given).min() > -rounding):
+        raise MessageError('its covariance is not finite, or negative in some direction')
+    assumed: FloatArray = np.where(np.diagonal(given) == 0.0, GIVEN_POSE_STD**2, 0.0)
+    return given + np.diag(assumed)

@@ -1,0 +1,204 @@
+"""Maps loaded and saved by the observer node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+from itertools import chain, count
+from pathlib import Path
+import shutil
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from slam_observer_ros.common.errors import MapError, ParameterError, SlamObserverError
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.known_map.map_file import check_writable, read_map, write_map
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+
+class Maps:
+    """The map file of the start, ``~/load_map``, ``~/save_map`` and the autosave at the end.
+
+    Parameters
+    ----------
+    node : Node
+        Node that offers the services; its parameter ``map_path`` names their file.
+    settings : ObserverNodeSettings
+        Files and frame.
+    estimator : Estimator
+        What is saved, and what loads.
+    on_load : callable
+        Called after a map was loaded: the estimate is in another frame then.
+
+    Raises
+    ------
+    MapError
+        If the map of the start can't be read, or that of the end could not be written.
+    ParameterError
+        If the map is to be saved at the end, but not where.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: ObserverNodeSettings,
+        estimator: Estimator,
+        on_load: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._map_frame = settings.map_frame
+        self._autosave = settings.autosave_map
+        self._estimator = estimator
+        self._on_load = on_load
+        # Files that hold what this node has loaded or saved, and that it may write again.
+        self._own_files: set[Path] = set()
+        if self._autosave:
+            self._check_autosave(settings.map_path)
+        if settings.map_file:
+            node.get_logger().info(self._load(_absolute(settings.map_file)))
+        elif estimator.settings.localization_mode != 'off':
+            node.get_logger().warning("no 'map_file': mapping until a map comes by ~/load_map")
+        self._warn_of_another(settings.map_path)
+        node.add_on_set_parameters_callback(self._check_changes)
+        node.create_service(Trigger, '~/save_map', self._answer_save)
+        node.create_service(Trigger, '~/load_map', self._answer_load)
+
+    def save_at_end(self) -> None:
+        """Save the map if that was asked for and there is one.
+
+        Raises
+        ------
+        MapError
+            If it can't be saved.
+
+        """
+        self._node.remove_on_set_parameters_callback(self._check_changes)
+        if not self._autosave or not len(self._estimator.landmark_ids):
+            return
+        try:
+            self._node.get_logger().info(self._save(self._path()))
+        except SlamObserverError as error:
+            raise MapError(f'the map is not saved: {error}') from error
+
+    def _check_changes(self, changes: list[Parameter]) -> SetParametersResult:
+        """Refuse a file that the map could not be saved to at the end."""
+        try:
+            for change in changes:
+                if change.name == 'map_path' and self._autosave:
+                    self._check_autosave(str(change.value))
+        except SlamObserverError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    @staticmethod
+    def _check_autosave(map_path: str) -> None:
+        if not map_path:
+            raise ParameterError("'autosave_map' needs a file in 'map_path'")
+        check_writable(_absolute(map_path))
+
+    def _warn_of_another(self, map_path: str) -> None:
+        """Warn that the map of the end will take the place of one that is not loaded."""
+        path = _absolute(map_path)
+        if self._autosave and self._is_another(path):
+            self._node.get_logger().warning(
+                f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
+                f'holds will be kept in {free_name(path).name}'
+            )
+
+    def _keep(self, path: Path) -> str:
+        """Keep a copy of a map that is not this node's own; return how to tell of it."""
+        try:
+            if not self._is_another(path):
+                return ''
+            backup = free_name(path)
+            shutil.copy2(path, backup)
+        except OSError as error:
+            raise MapError(f"can't keep a copy of map {path}: {error.strerror}") from error
+        return f'; what it held before is in {backup.name}'
+
+    def _is_another(self, path: Path) -> bool:
+        return path not in self._own_files and path.exists()
+
+    def _answer_save(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        return self._answer(response, self._save)
+
+    def _answer_load(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        return self._answer(response, self._load)
+
+    def _answer(self, response: Trigger.Response, act: Callable[[Path], str]) -> Trigger.Response:
+        try:
+            response.message = act(self._path())
+            response.success = True
+            self._node.get_logger().info(response.message)
+        except SlamObserverError as error:
+            response.message = str(error)
+            response.success = False
+            self._node.get_logger().error(response.message)
+        return response
+
+    def _path(self) -> Path:
+        path: str = self._node.get_parameter('map_path').value
+        if not path:
+            raise ParameterError("no file is named: set the parameter 'map_path'")
+        return _absolute(path)
+
+    def _save(self, path: Path) -> str:
+        estimator = self._estimator
+        estimator.release()
+        if not estimator.is_localised:
+            raise MapError('the place in the loaded map is not known yet: nothing is saved')
+        landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
+        kept = self._keep(path)
+        write_map(path, landmark_map, estimator.settings)
+        self._own_files.add(path)
+        moving = len(estimator.landmark_ids) - len(landmark_map.ids)
+        without = f' (without {moving} that move)' if moving else ''
+        what = f'{len(landmark_map.ids)} landmarks{without}'
+        return f"saved {what} in frame '{self._map_frame}' to {path}{kept}"
+
+    def _load(self, path: Path) -> str:
+        landmark_map = read_map(path)
+        if landmark_map.frame_id != self._map_frame:
+            raise MapError(
+                f"map {path} is in frame '{landmark_map.frame_id}', and 'map_frame' is "
+                f"'{self._map_frame}': make them the same"
+            )
+        self._estimator.release()  # what has come before belongs to the old frame
+        self._estimator.load_map(landmark_map)
+        self._own_files.add(path)
+        self._on_load()
+        return f'loaded {len(landmark_map.ids)} landmarks from {path}; {self._place()}'
+
+    def _place(self) -> str:
+        estimator = self._estimator
+        if not estimator.is_localised:
+            number = 'two' if estimator.settings.two_d_mode else 'three'
+            return (
+                f'the pose is unknown until {number} of them are recognised by their ids, or it '
+                'is given on initialpose'
+            )
+        if estimator.last_update is None:
+            x, y, z = estimator.pose[:3, 3].tolist()
+            return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
+        return 'the robot has found its place in it'
+
+
+def free_name(path: Path) -> Path:
+    """Return a name that is not taken for a copy of a file: with ~, ~2 and so on behind it."""
+    names = (path.with_name(f'{path.name}~{ending}') for ending in chain([''], count(2)))
+    return next(name for name in names if not name.exists())
+
+
+def _absolute(path: str) -> Path:
+    try:
+        return Path(path).expanduser().absolute()
+    except RuntimeError as error:  # of a user that there is none of
+        raise ParameterError(f"can't find {path}: {error}") from error

@@ -1,0 +1,175 @@
+"""The paper's gains: constant k_i and l_i, integrated so that every time step is stable.
+
+The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²/2). Here
+the pose is moved by an exponential integrator of the linearised flow. With J_i = [−[e_i]×, I],
+g = Σ k_i J_iᵀ r_i and the Gauss–Newton matrix H = Σ k_i J_iᵀ J_i, that is
+
+    ξ = −U diag((1 − e^{−λ dt})/λ) Uᵀ g,      H = U diag(λ) Uᵀ,
+
+and the landmarks close the share 1 − e^{−(l/k) dt} of what remains. For dt → ∞ it is one
+Gauss–Newton step. For dt → 0 it is −g dt about the centroid of the e_i, down the same L as the
+paper's Δ dt in another metric; with `step_mode: paper` it is Δ dt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.axes import Axes, axes_of, SPATIAL
+from slam_observer_ros.observer.filter import GainDesign, Residuals
+from slam_observer_ros.observer.observer import Correction, lyapunov, Observer
+from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.settings.estimator_settings import Settings
+
+PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
+"""Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
+
+
+class ConstantGains(GainDesign):
+    """Constant gains k and l, the same for every landmark.
+
+    Parameters
+    ----------
+    settings : Settings
+        ``gain_k`` is k of (30), ``gain_l`` is l of (31). The ``step_mode`` 'paper' turns about
+        the reference's origin with the metric of (10), and so converges to the paper's
+        differential equation for dt → 0; 'exponential' turns about the centroid of the e_i,
+        where rotation and translation do not compete. In ``two_d_mode`` all turns are about z.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        One that leaves the velocity as it is.
+
+    """
+
+    ignores = (
+        'angular_scale_error',
+        'linear_scale_error',
+        'angular_bias_error',
+        'linear_bias_error',
+        'velocity_delay_error',
+        'calibration_drift',
+        'landmark_velocity_error',
+        'observation_error_time',
+    )
+
+    def __init__(self, settings: Settings) -> None:
+        self._axes = axes_of(settings.two_d_mode)
+        self._settings = settings
+        self._is_fixed = False
+        self.calibration = Calibration(Settings(), self._axes)
+
+    def change_settings(self, settings: Settings) -> None:
+        """Take over k, l and the step mode."""
+        self._settings = settings
+
+    def anchor(
+        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
+    ) -> Correction:
+        """Return the correction that puts the known landmarks where they are known to be."""
+        return Correction(np.eye(4), rows, -r)
+
+    def with_fixed_landmarks(self, covariances: FloatArray) -> ConstantGains:
+        """Return these gains with l = 0."""
+        self._is_fixed = True
+        return self
+
+    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
+        """Return the correction; all points seen take part."""
+        settings = self._settings
+        gain_l = 0.0 if self._is_fixed else settings.gain_l
+        k = np.full(len(residuals.r), settings.gain_k)
+        step = paper_step if settings.step_mode == 'paper' else centroid_step
+        dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)
+        # One time for the pose: were the r_i to act for different ones, L (34) might grow.
+        act = partial(step, axes=self._axes)
+        D = safe_step(act, k, residuals.e, residuals.r, float(np.mean(dt_s)))  # (30)
+        remaining = se3.transform(D, residuals.e) - residuals.e + residuals.r
+        shares = -np.expm1(-gain_l / settings.gain_k * dt_s)
+        d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
+        return Correction(D, residuals.rows, d), np.ones(len(k))
+
+
+def centroid_step(
+    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: Axes = SPATIAL
+) -> FloatArray:
+    """Return the pose's step D (4, 4), turning about the gain-weighted centroid of the e_i.
+
+    Parameters
+    ----------
+    k : FloatArray
+        (m,) gains k_i.
+    e, r : FloatArray
+        (m, 3) errors and residuals, metres.
+    dt_s : float
+        Time step, seconds.
+    axes : Axes
+        Axes of the pose that are moved.
+
+    """
+    total = np.sum(k)
+    centre = k @ e / total if total > 0.0 else np.zeros(3)
+    return _step_about(centre, np.ones(6), k, e, r, dt_s, axes)
+
+
+def paper_step(
+    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: Axes = SPATIAL
+) -> FloatArray:
+    """Return the pose's step D (4, 4) that tends to exp(Δ dt), Δ as in (30), for dt → 0.
+
+    Parameters are those of :func:`centroid_step`.
+    """
+    return _step_about(np.zeros(3), PAPER_METRIC, k, e, r, dt_s, axes)
+
+
+def safe_step(
+    step: Callable[[FloatArray, FloatArray, FloatArray, float], FloatArray],
+    k: FloatArray,
+    e: FloatArray,
+    r: FloatArray,
+    dt_s: float,
+) -> FloatArray:
+    """Return ``step``'s D for the longest dt / 2^j at which L does not grow.
+
+    The flow itself never raises L (35), so a short enough step doesn't either. Only large
+    turns of few landmarks ever need j > 0.
+    """
+    rounding = np.finfo(float).eps * (np.max(np.abs(e), initial=0.0) + 1.0)
+    bound = lyapunov(k, r) * (1.0 + 1e-12) + lyapunov(k, np.full_like(r, rounding))
+    D = step(k, e, r, dt_s)
+    while lyapunov(k, se3.transform(D, e) - e + r) > bound:
+        dt_s /= 2.0
+        D = step(k, e, r, dt_s)
+    return D
+
+
+def _step_about(
+    centre: FloatArray,
+    metric: FloatArray,
+    k: FloatArray,
+    e: FloatArray,
+    r: FloatArray,
+    dt_s: float,
+    axes: Axes,
+) -> FloatArray:
+    """Return the exponential step D (4, 4) about ``centre`` with the diagonal ``metric``."""
+    J = axes.output_matrix(e - centre)
+    root, r = np.sqrt(metric[axes.pose]), r[:, : axes.point]
+    g = root * np.einsum('i,ijk,ij->k', k, J, r)
+    H = root[:, None] * np.einsum('i,ijk,ijl->kl', k, J, J) * root
+    rates, U = np.linalg.eigh(H)
+    xi = axes.full_pose(-root * (U @ (_held_time(rates, dt_s) * (U.T @ g))))
+    R = so3.exp(xi[:3])
+    return se3.pose(R, centre - R @ centre + xi[3:])
+
+
+def _held_time(rates: FloatArray, dt_s: float) -> FloatArray:
+    """Return (1 − e^{−λ dt})/λ for ``rates`` λ in 1/s, and its limit dt at λ = 0."""
+    positive = np.maximum(rates, np.finfo(float).tiny)
+    return np.where(rates > 0.0, -np.expm1(-positive * dt_s) / positive, dt_s)

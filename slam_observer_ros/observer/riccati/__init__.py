@@ -1,0 +1,1 @@
+"""The Riccati filter: gains from the full covariance."""

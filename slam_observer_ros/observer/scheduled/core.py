@@ -1,0 +1,177 @@
+"""The core of scheduled gains: what is estimated jointly, however many landmarks there are.
+
+The core z = (ε, c, ã_1 … ã_K) are the errors of the pose, of the velocity's calibration, and of
+the K landmarks seen last; P is their covariance. What they know of each other is all here, and
+how other landmarks hang on them is in :mod:`.postponed_landmarks`.
+
+When the core becomes z' = Φ z + noise, because the robot moves or one landmark takes the place of
+another, z = G z' + ζ with the regression G = P Φᵀ P'⁻¹, and ζ has the covariance
+V = P − G Φ P, here in Joseph's form. The landmarks that hang on the core are told of both.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.matrices import kalman_update, symmetric, transpose
+from slam_observer_ros.observer.prediction import initial_covariance, predict
+from slam_observer_ros.observer.scheduled.postponed_landmarks import Leaves
+from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.motion import Motion
+
+CAPACITY = 8
+"""K: three points fix a frame in space, and still do when half of eight have been exchanged."""
+
+NOBODY = -1
+"""In place of a landmark where there is none in the core."""
+
+NEVER = 1 << 62
+"""Age, in observations, of an empty place: older than any landmark's."""
+
+ROUNDING = 1e-12
+"""Share of its variances that is added to a covariance that may be singular to invert it."""
+
+
+class Core:
+    """Covariance of the core, and which landmarks are in it.
+
+    Parameters
+    ----------
+    axes : Axes
+        Which p axes of the pose and k of a point are estimated.
+    calibration : Calibration
+        The velocity's.
+
+    Attributes
+    ----------
+    P : FloatArray
+        (q, q) covariance of z. The entries of a place where no landmark is are zero.
+    leaves : Leaves
+        How all landmarks hang on z.
+    rows : IntArray
+        (K,) the landmarks in the core, or ``NOBODY``.
+
+    """
+
+    def __init__(self, axes: Axes, calibration: Calibration) -> None:
+        start = initial_covariance(axes, calibration)
+        self._axes, self._calibration = axes, calibration
+        self._p = axes.p
+        self._places = len(start) + np.arange(CAPACITY * axes.point).reshape(CAPACITY, axes.point)
+        self._unseen = np.full(CAPACITY, NEVER)
+        self.rows: IntArray = np.full(CAPACITY, NOBODY)
+        self.P: FloatArray = np.zeros((len(start) + self._places.size,) * 2)
+        self.P[: len(start), : len(start)] = start
+        self.leaves = Leaves(axes, len(self.P))
+
+    def predict(self, motion: Motion) -> None:
+        """Add a motion's noise to the pose, and what the calibration's error adds."""
+        before, Phi = self.P.copy(), np.eye(len(self.P))
+        _, F = predict(self.P, self._axes, self._calibration, motion)
+        Phi[: self._p, self._p : self._p + self._calibration.count] = F
+        self._tell_leaves(before, Phi)
+
+    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
+        """Take over the covariance (p, p) of ε, independent of all else."""
+        before, Phi = self.P.copy(), np.eye(len(self.P))
+        Phi[: self._p] = self.P[: self._p] = self.P[:, : self._p] = 0.0
+        self.P[: self._p, : self._p] = covariance
+        self._tell_leaves(before, Phi)
+
+    def step(self, H: FloatArray, gain_k: FloatArray, r: FloatArray) -> FloatArray:
+        """Return −P⁺ Σ H_iᵀ k_i r_i (q, 1), for H (m, k, q), k_i (m, k, k) and r (m, k, 1)."""
+        HtK = transpose(H) @ gain_k
+        information, gradient = np.sum(HtK @ H, axis=0), np.sum(HtK @ r, axis=0)
+        eye = np.eye(len(self.P))
+        x: FloatArray = -np.linalg.solve(eye + self.P @ information, self.P @ gradient)
+        return x
+
+    def measurement_update(self, H: FloatArray, gain_k: FloatArray) -> None:
+        """Update P by m observations with H (m, k, q) and k_i (m, k, k)."""
+        root = transpose(np.linalg.cholesky(gain_k).astype(np.float64)) @ H
+        W = np.asarray(np.linalg.qr(root.reshape(-1, len(self.P)), mode='r'))  # WᵀW = Σ Hᵀ k H
+        WP = W @ self.P
+        kalman_update(self.P, WP, WP @ W.T + np.eye(len(W)))
+
+    def turn(self, x: FloatArray) -> None:
+        """Let a motion of everything remain one where the step x (q,) has put landmarks."""
+        T = np.zeros_like(self.P)
+        shifts = self._axes.full_points(x[self._places].ravel())
+        T[self._places.ravel(), : self._p] = self._axes.turn_matrix(shifts).reshape(-1, self._p)
+        eye = np.eye(len(T))
+        self.P = _transformed(self.P, eye + T)
+        # (I + T)⁻¹ = I − T: T turns landmarks by the pose, and leaves the pose alone.
+        self.leaves.change_core(eye - T, np.zeros_like(T))
+
+    def admit(self, rows: IntArray) -> None:
+        """Take in landmarks (m,) just seen, for those that have not been seen for longest."""
+        seen = (self.rows[:, None] == rows).any(axis=1)
+        self._unseen = np.where(seen, 0, self._unseen + 1)
+        new = rows[~(rows[:, None] == self.rows).any(axis=1)][: np.sum(~seen)]
+        if not len(new):
+            return
+        places = np.argsort(-self._unseen, kind='stable')[: len(new)]
+        leaving, columns = self.rows[places], self._places[places]
+        self.leaves.release(leaving[leaving != NOBODY])
+        F, N, _ = self.leaves.now(new)
+        before, Phi = self.P, np.eye(len(self.P))
+        Phi[columns] = F
+        self.P = _transformed(before, Phi)
+        self.P[columns[:, :, None], columns[:, None, :]] += N
+        self._tell_leaves(before, Phi)
+        self.rows[places], self._unseen[places] = new, 0
+        self.leaves.hold(new, np.eye(len(Phi))[columns])
+
+    def dismiss(self, rows: IntArray) -> None:
+        """Let those of the landmarks (m,) that are in the core leave it."""
+        places = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != NOBODY))
+        if not len(places):
+            return
+        self.leaves.release(self.rows[places])
+        self.rows[places], self._unseen[places] = NOBODY, NEVER
+        before, Phi = self.P, np.eye(len(self.P))
+        Phi[self._places[places].ravel()] = 0.0
+        self.P = _transformed(before, Phi)
+        self._tell_leaves(before, Phi)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget landmarks (m,); those behind move up."""
+        self.dismiss(rows)
+        self.leaves.remove(rows)
+        self.rows -= np.searchsorted(np.sort(rows), self.rows)  # by 0 for NOBODY
+
+    def _tell_leaves(self, before: FloatArray, Phi: FloatArray) -> None:
+        """Let landmarks hang on z', whose covariance P is already; ``before`` is that of z."""
+        after = Phi @ before
+        G = _times_inverse(after.T, self.P)
+        shared = G @ after
+        self.leaves.change_core(G, before - shared - shared.T + G @ self.P @ G.T)
+
+
+def regression(P: FloatArray, of: IntArray, on: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return B and the covariance of ζ, for entries ``of`` = B · entries ``on`` + ζ.
+
+    Parameters
+    ----------
+    P : FloatArray
+        (N, N) joint covariance.
+    of, on : IntArray
+        (a,) and (b,) entries; B is (a, b).
+
+    """
+    B = _times_inverse(P[np.ix_(of, on)], P[np.ix_(on, on)])
+    return B, P[np.ix_(of, of)] - B @ P[np.ix_(on, of)]
+
+
+def _times_inverse(cross: FloatArray, P: FloatArray) -> FloatArray:
+    """Return cross P⁻¹ for a covariance P that may be singular."""
+    rounding = ROUNDING * np.diagonal(P) + np.finfo(np.float64).tiny
+    product: FloatArray = np.linalg.solve(P + np.diag(rounding), cross.T).T
+    return product
+
+
+def _transformed(P: FloatArray, Phi: FloatArray) -> FloatArray:
+    """Return Φ P Φᵀ, symmetric to the bit."""
+    return symmetric(Phi @ P @ Phi.T)

@@ -1,0 +1,295 @@
+"""Variance-scheduled gains: the paper's k_i and l_i, set by what is known, at O(m) for m seen.
+
+Errors of landmarks are correlated, as each was seen from a pose that is not quite known. But two
+landmarks have little to do with each other beyond where the robot and the landmarks about it are.
+So a full covariance P is kept of the errors of a small *core* z = (ε, c, ã_1 … ã_K) alone: pose,
+calibration of the velocity, and the K landmarks seen last. The error of any other landmark is told
+by that of the core, and by a part of its own, which is taken to be independent of all others:
+
+    ã_i = F_i z + η_i,  η_i ~ N(0, N_i);  when first seen, F_i = [−[y_i°]×, I, 0 …] and N_i = R_i.
+
+The residual is r_i ≈ C_i ε − ã_i = H_i z − η_i with C_i = [−[p̂_i]×, I] and H_i = C_i − F_i: what
+pose and landmark have in common cancels, so seeing it again and again tells nothing of that. With
+the noise R_i of the observation, the gains of (30) and (31) become matrices
+
+    k_i = (N_i + R_i)⁻¹,                 Δ = −P⁺ Σ H_iᵀ k_i r_i,  P⁺ = (P⁻¹ + Σ H_iᵀ k_i H_i)⁻¹
+    l_i / k_i · dt = N_i (N_i + R_i)⁻¹,  δ_i = F_i Δ + N_i k_i (r_i + H_i Δ)
+
+where Δ is a step of all of z, and F_i ← F_i + N_i k_i H_i, N_i ← N_i − N_i k_i N_i. A landmark out
+of view keeps F_i and N_i, and moves by F_i Δ. As far as P, F_i and N_i are right, this is what a
+Kalman filter does with the covariance of everything.
+
+They are not quite, because of what happens between observations: where the core becomes another
+one (:mod:`.scheduled.core`), landmarks that hung on the old one have in common what
+the new one does not tell of it. That is added to each N_i as if it were its own. So P is not that
+of an exact filter, and not published.
+
+An observation costs O(m) for the m landmarks seen. The n known ones follow when they are seen
+again (:mod:`.postponed_landmarks`), which makes it O(m log n) in the mean.
+
+To update a part of the state alone, and to compose what the rest has to follow later, is the idea
+of the compressed EKF (J. Guivant and E. Nebot, *Optimization of the simultaneous localization and
+map-building algorithm for real-time implementation*, 2001) and of postponement (J. Knight, A.
+Davison and I. Reid, *Towards constant time SLAM using postponement*, 2001). Both keep the
+covariance of everything, O(n²), and lose nothing; here landmarks have nothing in common but the
+core, so that each follows by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.geometry.matrices import (
+    block_diagonal,
+    diagonal_blocks,
+    mahalanobis,
+    symmetric,
+    transpose,
+)
+from slam_observer_ros.observer.filter import GainDesign, OF_CONSTANT_GAINS, Residuals
+from slam_observer_ros.observer.gauge import anchor
+from slam_observer_ros.observer.observer import Correction, Observer
+from slam_observer_ros.observer.robust import huber_weights, REWEIGHTINGS
+from slam_observer_ros.observer.scheduled.core import Core, regression
+from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.observation_noise import repetition_factors
+from slam_observer_ros.settings.estimator_settings import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """What m points ask for, a of which have passed the gate; see the module's text.
+
+    Attributes
+    ----------
+    Delta : FloatArray
+        (q, 1) step Δ of the core.
+    gain_k : FloatArray
+        (m, k, k) gains k_i, zero where the gate rejects a point.
+    k_left : FloatArray
+        (m, k, 1) k_i (r_i + H_i Δ), with what the step leaves of the residual.
+    noise : FloatArray
+        (a, k, k) R_i, over the weight and for errors that last.
+    weights : FloatArray
+        (m,) Huber's weights, zero where the gate rejects a point.
+
+    """
+
+    Delta: FloatArray
+    gain_k: FloatArray
+    k_left: FloatArray
+    noise: FloatArray
+    weights: FloatArray
+
+
+class ScheduledGains(GainDesign):
+    """Gains from the covariance of a small core and how each landmark hangs on it.
+
+    Parameters
+    ----------
+    settings : Settings
+        Noise, calibration, robustness and ``two_d_mode``.
+
+    """
+
+    ignores = (*OF_CONSTANT_GAINS, 'landmark_velocity_error')
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._axes = axes_of(settings.two_d_mode)
+        self.calibration = Calibration(settings, self._axes)
+        self._core = Core(self._axes, self.calibration)
+        self._leaves = self._core.leaves
+
+    def change_settings(self, settings: Settings) -> None:
+        """Take over the robustness."""
+        self._settings = settings
+
+    @property
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of what is estimated of the calibration."""
+        p = self._axes.p
+        variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
+        return variances
+
+    def predict(self, observer: Observer, motion: Motion) -> None:
+        """Add the motion's noise to the core's covariance."""
+        self._core.predict(motion)
+
+    def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks (m, 3): their error is that of the pose and of the observation."""
+        self._leaves.add(self._output_matrix(y_ref), self._noise(covariances))
+
+    def relocate_landmarks(
+        self, rows: IntArray, y_ref: FloatArray, covariances: FloatArray
+    ) -> None:
+        """Take landmarks for new ones."""
+        self._core.dismiss(rows)
+        self._leaves.update(rows, self._output_matrix(y_ref), self._noise(covariances))
+
+    def add_known_landmarks(self, covariances: FloatArray) -> None:
+        """Append landmarks (m,) as certain as the map has them."""
+        N = self._noise(covariances)
+        self._leaves.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
+
+    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
+        """Take over the covariance (6, 6) of ε, independent of all else."""
+        self._core.set_pose_error_covariance(covariance[self._axes.pose, self._axes.pose])
+
+    def joint_covariance(self, rows: IntArray) -> FloatArray:
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
+        F, N, _ = self._leaves.now(rows)
+        p, q = self._axes.p, len(self._core.P)
+        joint = self._with_landmarks(F, N)
+        columns = np.append(np.arange(p), np.arange(q, len(joint)))
+        return joint[np.ix_(columns, columns)]
+
+    def anchor(
+        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
+    ) -> Correction:
+        """Return the correction that puts pose and known landmarks where these are known to be.
+
+        The motion γ of everything, see :mod:`slam_observer_ros.observer.gauge`, is estimated, too.
+        Other landmarks' errors are ã_i = F_i (z − γ) + J_i γ + η_i, the core being the pose alone.
+        """
+        self._core.dismiss(self._core.rows)
+        everything, p = np.arange(len(self._leaves)), self._axes.p
+        m, k, q = len(r), self._axes.point, len(self._core.P)
+        F, N, _ = self._leaves.now(everything)
+        J = self._axes.output_matrix(observer.points)
+        z, known, gamma = np.split(np.arange(q + m * k + p), [q, q + m * k])
+        P, G = np.zeros((gamma[-1] + 1,) * 2), np.zeros((gamma[-1] + 1, p))
+        P[: gamma[0], : gamma[0]] = self._with_landmarks(F[rows], N[rows])
+        G[:p] = G[gamma] = np.eye(p)
+        G[known] = J[rows].reshape(-1, p)
+        R = block_diagonal(self._noise(covariances))
+        x, P = anchor(P, G, known, R, r[:, :k].ravel())
+
+        self._core.P = P[:q, :q]
+        # γ = B z + ζ, so ã_i = F_i z + (J_i − F_i) γ + η_i hangs on z by F_i + (J_i − F_i) B.
+        J_gamma = J - F[:, :, :p]
+        errors = F @ x[z] + J_gamma @ x[gamma]
+        B, left = regression(P, gamma, z)
+        F, N = F + J_gamma @ B, N + J_gamma @ left @ transpose(J_gamma)
+        # Known landmarks were estimated themselves: they hang on z as P has it.
+        errors[rows] = x[known].reshape(m, k)
+        B, left = regression(P, known, z)
+        F[rows] = B.reshape(m, k, q)
+        N[rows] = symmetric(diagonal_blocks(left, k))
+        shifts = -self._axes.full_points(errors.ravel())
+        F[:, :, :p] += self._axes.turn_matrix(shifts)
+        self._leaves.update(everything, F, N)
+        return self._as_correction(everything, -x[z], shifts, observer.a)
+
+    def with_fixed_landmarks(self, covariances: FloatArray) -> ScheduledGains:
+        """Return these gains with all landmarks taken for exact."""
+        count, k = len(covariances), self._axes.point
+        self._core.remove(np.arange(len(self._leaves)))
+        self._leaves.add(np.zeros((count, k, len(self._core.P))), np.zeros((count, k, k)))
+        return self
+
+    def recall(self, observer: Observer, rows: IntArray) -> None:
+        """Move landmarks that are about to be used to where they should have been moved by now."""
+        rows = np.union1d(rows[rows >= 0], self._leaves.due())
+        F, N, shifts = self._leaves.now(rows)
+        self._leaves.update(rows, F, N)
+        observer.a[rows] += shifts
+
+    def postponed_shifts(self) -> FloatArray:
+        """Return how far each landmark (n, 3) has yet to be moved, metres, reference frame."""
+        return self._leaves.postponed_shifts()
+
+    def remove_landmarks(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        self._core.remove(rows)
+
+    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
+        """Return the correction and the weight that each point was given."""
+        rows = residuals.rows
+        F, N, _ = self._leaves.now(rows)
+        H = self._output_matrix(residuals.e + residuals.a - residuals.r) - F
+        passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
+        step = self._reweighted_step(residuals, H, N, passed)
+        Delta, gain_k = step.Delta, step.gain_k
+        delta = self._axes.full_points((F @ Delta + N @ step.k_left).ravel())
+        F = F + N @ gain_k @ H
+        F[:, :, : self._axes.p] += self._axes.turn_matrix(delta)
+        N[passed] = symmetric(N[passed] @ gain_k[passed] @ step.noise)  # N − N k N, but positive
+        self._core.measurement_update(H[passed], gain_k[passed])
+        self._leaves.shift(Delta[:, 0])
+        self._leaves.update(rows, F, N)
+        self._core.turn(Delta[:, 0])
+        self._core.admit(rows[passed])
+        return self._as_correction(rows, Delta[:, 0], delta, residuals.a), step.weights
+
+    def _reweighted_step(
+        self, residuals: Residuals, H: FloatArray, N: FloatArray, passed: BoolArray
+    ) -> _Step:
+        """Return the step Δ that the points which passed the gate ask for, by Huber's weights."""
+        r, R = residuals.r[:, : self._axes.point, None], self._noise(residuals.covariances)
+        repeated = repetition_factors(
+            residuals.dt_s[passed], self._settings.observation_error_time
+        )
+        weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
+        for remaining in reversed(range(1 + REWEIGHTINGS)):
+            shares = weights[passed] / repeated
+            noise = R[passed] / shares[:, None, None]
+            gain_k[passed] = np.linalg.inv(N[passed] + noise)
+            Delta = self._core.step(H, gain_k, r)
+            k_left = gain_k @ (r + H @ Delta)
+            found = huber_weights(
+                k_left[passed, :, 0], R[passed], shares, self._settings.huber_threshold
+            )
+            if not remaining or (found == weights[passed]).all():
+                break
+            weights[passed] = found
+        return _Step(Delta, gain_k, k_left, noise, weights)
+
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        F, N, _ = self._leaves.now(residuals.rows)
+        return self._distances(residuals, F, N)
+
+    def _distances(self, residuals: Residuals, F: FloatArray, N: FloatArray) -> FloatArray:
+        """Return the Mahalanobis distances (m,), with C_i at the middle of the chord.
+
+        For the reason that Riccati gains have.
+        """
+        H = self._output_matrix(residuals.e + residuals.a - 0.5 * residuals.r) - F
+        S = H @ self._core.P @ transpose(H) + N + self._noise(residuals.covariances)
+        return mahalanobis(residuals.r[:, : self._axes.point], S)
+
+    def _with_landmarks(self, F: FloatArray, N: FloatArray) -> FloatArray:
+        """Return the covariance (q + m k, q + m k) of z and m landmarks."""
+        q = len(self._core.P)
+        J = np.vstack([np.eye(q), F.reshape(-1, q)])
+        joint: FloatArray = J @ self._core.P @ J.T
+        joint[q:, q:] += block_diagonal(N)
+        return joint
+
+    def _output_matrix(self, lever_arms: FloatArray) -> FloatArray:
+        """Return C_i (m, k, q), with zeros for all of z but ε."""
+        C = self._axes.output_matrix(lever_arms)
+        full = np.zeros((*C.shape[:2], len(self._core.P)))
+        full[:, :, : C.shape[2]] = C
+        return full
+
+    def _noise(self, covariances: FloatArray) -> FloatArray:
+        """Return the part (m, k, k) of covariances (m, 3, 3) on the axes that are estimated."""
+        k = self._axes.point
+        return covariances[:, :k, :k]
+
+    def _as_correction(
+        self, rows: IntArray, x: FloatArray, shifts: FloatArray, a: FloatArray
+    ) -> Correction:
+        """Return the element that moves the core by x and â_i (m, 3) by ``shifts`` alone."""
+        p = self._axes.p
+        self.calibration.shift(x[p : p + self.calibration.count])
+        D = se3.exp(self._axes.full_pose(x[:p]))
+        return Correction(D, rows, shifts + a - se3.rotate(D, a))

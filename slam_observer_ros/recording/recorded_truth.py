@@ -1,0 +1,176 @@
+"""What is known to be true, to compare an estimate with it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+import logging
+from operator import attrgetter
+from typing import TypeAlias
+
+import numpy as np
+
+from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.evaluation.truth import LandmarkTruth
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.inputs.frames import TransformSource
+from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
+
+logger = logging.getLogger(__name__)
+
+_AT_BASE = np.eye(4)
+
+_Positions: TypeAlias = dict[int, tuple[float, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkTracks:
+    """Where landmarks truly were, at the times between which they moved in a line or were at rest.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (j,) the times, increasing, nanoseconds.
+    ids : IntArray
+        (n,) landmark ids.
+    world_points : FloatArray
+        (j, n, 3) their positions in the world, metres; of one that was not told of yet, its first.
+
+    """
+
+    stamps_ns: IntArray
+    ids: IntArray
+    world_points: FloatArray
+
+    @classmethod
+    def from_messages(
+        cls, messages: Iterable[Measurement[ObservationEvent]]
+    ) -> LandmarkTracks | None:
+        """Gather positions of any order; None if no message has a landmark."""
+        stamps_ns: list[int] = []
+        states: list[_Positions] = []
+        for stamp_ns, told in _told_at(messages):
+            state = states[-1] | told if states else told
+            if states[-2:] == [state, state]:  # at rest: its beginning and its end are enough
+                stamps_ns[-1] = stamp_ns
+                continue
+            stamps_ns.append(stamp_ns)
+            states.append(state)
+        first: _Positions = {}
+        for state in reversed(states):
+            first |= state
+        ids = sorted(first)
+        points = [[state.get(i, first[i]) for i in ids] for state in states]
+        return cls(np.array(stamps_ns), np.array(ids), np.array(points)) if ids else None
+
+    def at(self, stamp_ns: int) -> LandmarkTruth:
+        """Return where they were, in a line from one position to the next."""
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns, side='right'))
+        before, after = max(after - 1, 0), min(after, len(self.stamps_ns) - 1)
+        start_ns, end_ns = self.stamps_ns[[before, after]].tolist()
+        share = (stamp_ns - start_ns) / (end_ns - start_ns) if end_ns > start_ns else 0.0
+        points = (1.0 - share) * self.world_points[before] + share * self.world_points[after]
+        return LandmarkTruth(self.ids, points if share else self.world_points[before])
+
+    def flattened(self, height_m: float) -> LandmarkTracks:
+        """Return it with all landmarks at one height."""
+        points = self.world_points.copy()
+        points[..., 2] = height_m
+        return replace(self, world_points=points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What the estimate is compared with, in the axes of the recording's world frame.
+
+    Attributes
+    ----------
+    stamps_ns : IntArray
+        (k,) strictly increasing stamps of the true poses, nanoseconds.
+    poses : FloatArray
+        (k, 4, 4) true poses, body to world; k is 0 if the recording has none.
+    tracks : LandmarkTracks or None
+        Where the landmarks truly were; None if the recording doesn't tell.
+
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+    tracks: LandmarkTracks | None
+
+    @property
+    def landmarks(self) -> LandmarkTruth | None:
+        """True landmark positions at the end; None if the recording has none."""
+        return None if self.tracks is None else self.tracks.at(int(self.tracks.stamps_ns[-1]))
+
+    @classmethod
+    def from_messages(
+        cls,
+        poses: Sequence[PoseMessage],
+        base_in: Mapping[str, FloatArray],
+        landmarks: Iterable[Measurement[ObservationEvent]],
+    ) -> Truth:
+        """Gather poses and landmarks of any order.
+
+        ``base_in`` has the pose (4, 4) of the robot's base in each other frame whose poses these
+        are.
+        """
+        stamps_ns = np.array([message.stamp_ns for message in poses], dtype=np.int64)
+        stamps_ns, order = np.unique(stamps_ns, return_index=True)
+        bases = np.array([base_in.get(message.child_frame_id, _AT_BASE) for message in poses])
+        world_poses = pose_stack(poses) @ bases.reshape(-1, 4, 4)
+        return cls(stamps_ns, world_poses[order], LandmarkTracks.from_messages(landmarks))
+
+    def flattened(self) -> Truth:
+        """Return it with the landmarks at the robot's height, where a planar map has them."""
+        if self.tracks is None:
+            return self
+        height_m = float(np.median(self.poses[:, 2, 3])) if len(self.poses) else 0.0
+        return replace(self, tracks=self.tracks.flattened(height_m))
+
+
+def _told_at(
+    messages: Iterable[Measurement[ObservationEvent]],
+) -> Iterator[tuple[int, _Positions]]:
+    """Yield what all messages of a stamp tell together, in the order of the stamps."""
+    by_stamp = attrgetter('stamp_ns')
+    events = sorted((message.event for message in messages), key=by_stamp)
+    for stamp_ns, together in groupby(events, key=by_stamp):
+        told: _Positions = {}
+        for event in together:
+            points = map(tuple, event.points.tolist())
+            told |= zip(event.ids.tolist(), points, strict=True)
+        told.pop(UNKNOWN_ID, None)
+        yield stamp_ns, told
+
+
+def frames_beside(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
+    """Return the frames of poses that say whose they are, and are not those of the base."""
+    known = ('', base_frame.lstrip('/'))
+    frames = {message.child_frame_id for message in poses}
+    return {frame for frame in frames if base_frame and frame.lstrip('/') not in known}
+
+
+def base_in_frames(
+    frames: Collection[str], base_frame: str, transforms: TransformSource
+) -> dict[str, FloatArray]:
+    """Return the pose (4, 4) of the base frame in each of ``frames``, by name.
+
+    Identity, with a warning, where ``transforms`` don't have both.
+    """
+    base_in = dict.fromkeys(frames, np.eye(4))
+    for frame in frames:
+        try:
+            base_in[frame] = transforms.lookup(frame, base_frame, 0)
+        except TransformError as error:
+            logger.warning(
+                "The true poses are of '%s', and the estimated ones of '%s': they are compared "
+                'as if that were one place (%s).',
+                frame,
+                base_frame,
+                error,
+            )
+    return base_in

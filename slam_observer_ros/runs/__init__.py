@@ -1,0 +1,1 @@
+"""Recordings and simulations through the estimator, and how accurate they were."""

@@ -1,0 +1,123 @@
+"""How accurate the outcome of a replay is, where the truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import logging
+
+from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.evaluation.consistency import anchored_average_nees
+from slam_observer_ros.evaluation.metrics import (
+    landmark_errors,
+    trajectory_errors,
+    TrajectoryErrors,
+)
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import is_automatic
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.runs.replay import Replay
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accuracy:
+    """Errors of a replay; None where the truth that it takes is not in the recording.
+
+    Attributes
+    ----------
+    pose_errors : TrajectoryErrors or None
+        Of the online trajectory, after one rigid alignment.
+    dead_reckoning_errors : TrajectoryErrors or None
+        The same of the velocities alone.
+    landmark_rmse_m : float or None
+        Of the final map, after a rigid alignment of its own, metres.
+    configuration_rmse_m : float or None
+        See :class:`ConfigurationError`, metres.
+    anees : float or None
+        Of the pose, per degree of freedom; None where the gains know no covariance, too, and
+        where no pose is certain to which the truth could be moved: in a known map, or if the
+        truth begins too late.
+    configuration_anees : float or None
+        Of the map as the robot sees it, jointly, per degree of freedom: it needs no pose that is
+        certain. None where the gains know no joint covariance.
+
+    """
+
+    pose_errors: TrajectoryErrors | None
+    dead_reckoning_errors: TrajectoryErrors | None
+    landmark_rmse_m: float | None
+    configuration_rmse_m: float | None
+    anees: float | None
+    configuration_anees: float | None
+
+
+def measure(result: Replay, truth: Truth) -> Accuracy:
+    """Compare a replay with the truth."""
+    pose_truth = Trajectory(truth.stamps_ns, truth.poses)
+    return Accuracy(
+        _pose_errors('trajectory', result.trajectory, pose_truth),
+        _pose_errors('dead reckoning', result.dead_reckoning, pose_truth),
+        _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
+        result.configuration.rmse_m,
+        _anees(result, pose_truth),
+        result.configuration.anees,
+    )
+
+
+def measure_smoothed(
+    smoothed: Smoothed, truth: Truth
+) -> tuple[TrajectoryErrors | None, float | None]:
+    """Compare what was smoothed with the truth.
+
+    Returns
+    -------
+    pose_errors : TrajectoryErrors or None
+        Of the poses at the observations, after one rigid alignment.
+    landmark_rmse_m : float or None
+        Of the map, after a rigid alignment of its own, metres.
+
+    """
+    pose_truth = Trajectory(truth.stamps_ns, truth.poses)
+    return (
+        _pose_errors('smoothed trajectory', trajectory_of(smoothed), pose_truth),
+        _landmark_rmse_m(smoothed.ids, smoothed.world_points, truth),
+    )
+
+
+def trajectory_of(smoothed: Smoothed) -> Trajectory:
+    """Return the smoothed poses as a trajectory."""
+    return Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
+
+
+def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:
+    if not len(truth):
+        return None
+    try:
+        return trajectory_errors(estimate, truth)
+    except EvaluationError as error:
+        logger.warning('The %s is not compared with the truth: %s', name, error)
+        return None
+
+
+def _anees(result: Replay, truth: Trajectory) -> float | None:
+    if result.pose_covariances is None or result.in_known_map:
+        return None
+    try:
+        return anchored_average_nees(result.trajectory, result.pose_covariances, truth)
+    except EvaluationError as error:
+        logger.warning('No ANEES is told: %s', error)
+        return None
+
+
+def _landmark_rmse_m(ids: IntArray, world_points: FloatArray, truth: Truth) -> float | None:
+    if truth.landmarks is None or (len(ids) and is_automatic(ids).all()):
+        return None  # landmarks without ids of their own have no counterpart
+    try:
+        errors = landmark_errors(ids, world_points, truth.landmarks)
+    except EvaluationError as error:
+        logger.warning('The map is not compared with the truth: %s', error)
+        return None
+    return errors.rmse_m

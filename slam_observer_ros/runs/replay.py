@@ -1,0 +1,246 @@
+"""Events of a recording through the estimator.
+
+What is measured is the *online* estimate: the pose as it was known at each moment, from the events
+received until then, never corrected in hindsight. The trajectory is sampled at the stamps of
+velocities and observations alike, so that stretches in which nothing is seen count too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+import time
+from typing import ParamSpec
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.counts import used_points
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.events import AngularVelocityEvent, Event
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.settings.estimator_settings import Settings
+
+P = ParamSpec('P')
+
+NEES_PERIOD_NS = 5_000_000_000
+"""Time between two covariances of the configuration, nanoseconds: they cost O(n³)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What came of a replay; since its last start, if the clock jumped and all started again.
+
+    Attributes
+    ----------
+    estimator : Estimator
+        In its final state, with the map and the events dropped.
+    trajectory : Trajectory
+        (k) poses of the online estimate.
+    pose_covariances : FloatArray or None
+        (k, 6, 6) their covariances, as :attr:`Estimator.pose_covariance` gives them; None
+        without truth to compare their errors with.
+    dead_reckoning : Trajectory
+        What the velocities alone give, from the identity pose.
+    configuration : ConfigurationError
+        Gauge-free error after each observation; empty without truth.
+    residual_stamps_ns : IntArray
+        (m,) stamp of each residual, nanoseconds.
+    residuals : FloatArray
+        (m, 3) residuals of the landmarks seen, metres.
+    rejected : BoolArray
+        (m,) which of them were too large to be used.
+    events : int
+        Events taken in, dropped ones included.
+    seconds : float
+        CPU time of the estimator alone, without reading and measuring.
+    in_known_map : bool
+        Whether the poses are in the frame of a map that was known in advance.
+    start_ns : int
+        Stamp of the first event that was used, nanoseconds; 0 if none was.
+    observations : int
+        Observations of which points were used, also before the last start.
+    angular_velocities : int
+        Angular velocities of an Imu that were taken in, also before the last start.
+
+    """
+
+    estimator: Estimator
+    trajectory: Trajectory
+    pose_covariances: FloatArray | None
+    dead_reckoning: Trajectory
+    configuration: ConfigurationError
+    residual_stamps_ns: IntArray
+    residuals: FloatArray
+    rejected: BoolArray
+    events: int
+    seconds: float
+    in_known_map: bool
+    start_ns: int
+    observations: int
+    angular_velocities: int
+
+    @property
+    def restarts(self) -> int:
+        """How often all started again after a jump of the clock."""
+        resets = self.estimator.settings.on_time_jump == 'reset'
+        return self.estimator.jumps if resets else 0
+
+    def seconds_until(self, stamp_ns: int) -> float:
+        """Return the time from the first event to a stamp, seconds."""
+        return to_s(stamp_ns - self.start_ns)
+
+
+def replay(
+    events: Iterable[Event],
+    settings: Settings,
+    truth: Truth | None = None,
+    landmark_map: LandmarkMap | None = None,
+) -> Replay:
+    """Run events through an estimator, from where the settings say or anywhere in a known map.
+
+    Parameters
+    ----------
+    events : iterable of Event
+        In the order in which they were received.
+    settings : Settings
+        Settings of the estimator.
+    truth : Truth, optional
+        What the configuration error is measured against.
+    landmark_map : LandmarkMap, optional
+        Landmarks known in advance.
+
+    """
+    run = _Run(settings, truth, landmark_map)
+    for event in events:
+        run.add(event)
+    return run.finish()
+
+
+class _Run:
+    """A replay under way: keeps what the metrics need, and the estimator's time apart from it."""
+
+    def __init__(
+        self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
+    ) -> None:
+        self._settings = settings
+        self._estimator = Estimator(
+            settings,
+            on_update=self._untimed(self._on_update),
+            on_stamp=self._untimed(self._on_stamp),
+            on_motion=self._untimed(self._on_motion),
+            on_jump=self._untimed(self._on_jump),
+        )
+        self._in_known_map = landmark_map is not None
+        self._in_fixed_map = self._in_known_map and settings.localization_mode == 'fixed'
+        if landmark_map is not None:
+            self._estimator.load_map(landmark_map)
+        self._landmark_tracks = truth.tracks if truth else None
+        self._pose_truth = Trajectory(truth.stamps_ns, truth.poses) if truth else None
+        self._observations = self._used_points = self._angular_velocities = 0
+        self._events = 0
+        self._seconds = 0.0
+        self._start()
+
+    def _start(self) -> None:
+        has_truth = self._pose_truth is not None and len(self._pose_truth.poses) > 0
+        self._sampler = TrajectorySampler(self._estimator, with_covariances=has_truth)
+        self._dead_reckoning = DeadReckoning()
+        self._configuration = ConfigurationError()
+        self._updates: list[Update] = []
+        self._start_ns: int | None = None
+        self._next_nees_ns = 0
+
+    def add(self, event: Event) -> None:
+        self._events += 1
+        start_s = time.thread_time()
+        is_taken = self._estimator.add(event)
+        self._seconds += time.thread_time() - start_s
+        self._angular_velocities += is_taken and isinstance(event, AngularVelocityEvent)
+
+    def finish(self) -> Replay:
+        start_s = time.thread_time()
+        self._estimator.flush()
+        self._seconds += time.thread_time() - start_s
+        updates = self._updates
+        counts = np.array([len(update.residuals) for update in updates], dtype=np.int64)
+        stamps_ns = np.array([update.stamp_ns for update in updates], dtype=np.int64)
+        no_points, none = np.empty((0, 3)), np.empty(0, dtype=np.bool_)
+        return Replay(
+            estimator=self._estimator,
+            trajectory=self._sampler.trajectory,
+            pose_covariances=self._sampler.covariances,
+            dead_reckoning=self._dead_reckoning.trajectory,
+            configuration=self._configuration,
+            residual_stamps_ns=np.repeat(stamps_ns, counts),
+            residuals=np.concatenate([no_points, *(update.residuals for update in updates)]),
+            rejected=np.concatenate([none, *(update.rejected for update in updates)]),
+            events=self._events,
+            seconds=self._seconds,
+            in_known_map=self._in_known_map,
+            start_ns=self._start_ns or 0,
+            observations=self._observations,
+            angular_velocities=self._angular_velocities,
+        )
+
+    def _untimed(self, callback: Callable[P, None]) -> Callable[P, None]:
+        """Return what the estimator may call without its time being the estimator's."""
+
+        def call(*args: P.args, **kwargs: P.kwargs) -> None:
+            start_s = time.thread_time()
+            callback(*args, **kwargs)
+            self._seconds -= time.thread_time() - start_s
+
+        return call
+
+    def _on_stamp(self) -> None:
+        if self._start_ns is None:
+            self._start_ns = self._estimator.stamp_ns
+        self._sampler.sample()
+
+    def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
+        self._dead_reckoning.advance(velocities, start_ns, end_ns)
+
+    def _on_update(self, update: Update) -> None:
+        self._updates.append(update)
+        self._note_observation()
+        self._compare(update)
+
+    def _on_jump(self) -> None:
+        self._next_nees_ns = 0
+        if self._settings.on_time_jump == 'reset':
+            self._start()
+
+    def _note_observation(self) -> None:
+        """Count an observation, if points of it were used."""
+        used = used_points(self._estimator.counts)
+        self._observations += used > self._used_points
+        self._used_points = used
+
+    def _compare(self, update: Update) -> None:
+        if self._pose_truth is None or self._landmark_tracks is None:
+            return
+        true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
+        if covered[0]:
+            ids = self._estimator.landmark_ids
+            has_errors = len(ids) > 0 and not self._in_fixed_map
+            is_due = has_errors and update.stamp_ns >= self._next_nees_ns
+            if is_due:
+                self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
+            self._configuration.add(
+                update.stamp_ns,
+                update.pose,
+                ids,
+                self._estimator.world_points,
+                true_poses[0],
+                self._landmark_tracks.at(update.stamp_ns),
+                self._estimator.configuration_covariance if is_due else None,
+                update.ids[~update.rejected],
+            )

@@ -1,0 +1,110 @@
+"""Trajectories of a run, sampled at the stamps of its events, at most at 20 Hz."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.geometry import paths, se3, so3
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+
+SAMPLE_PERIOD_NS = 50_000_000
+"""Least time between two poses of a sampled trajectory: 20 Hz at most."""
+
+
+class Samples:
+    """Poses with their stamps, none less than a period after the one before."""
+
+    def __init__(self) -> None:
+        self.stamps_ns: list[int] = []
+        self._poses: list[FloatArray] = []
+
+    def lack(self, stamp_ns: int) -> bool:
+        """Return whether a pose of that stamp is to be added."""
+        return not self.stamps_ns or not 0 <= stamp_ns - self.stamps_ns[-1] < SAMPLE_PERIOD_NS
+
+    def add(self, stamp_ns: int, pose: FloatArray) -> None:
+        """Append a pose (4, 4)."""
+        self.stamps_ns.append(stamp_ns)
+        self._poses.append(pose)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses in stamp order."""
+        return Trajectory.from_samples(self.stamps_ns, self._poses)
+
+
+class TrajectorySampler:
+    """Collects the poses that an estimator passes through.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        What is watched.
+    with_covariances : bool
+        Whether to collect their covariances, too, which take longer to compute.
+
+    """
+
+    def __init__(self, estimator: Estimator, with_covariances: bool) -> None:
+        self._estimator = estimator
+        self._with_covariances = with_covariances
+        self._samples = Samples()
+        self._covariances: list[FloatArray] = []
+
+    def sample(self) -> None:
+        """Keep the present pose, unless the one kept last is less than a period older.
+
+        Poses that are not yet in the frame of a map that was loaded are not kept.
+        """
+        stamp_ns = self._estimator.stamp_ns
+        if stamp_ns is None or not self._estimator.is_localised:
+            return
+        if not self._samples.lack(stamp_ns):
+            return
+        self._samples.add(stamp_ns, self._estimator.pose)
+        covariance = self._estimator.pose_covariance if self._with_covariances else None
+        if covariance is not None:
+            self._covariances.append(covariance)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses kept, in stamp order."""
+        return self._samples.trajectory
+
+    @property
+    def covariances(self) -> FloatArray | None:
+        """(k, 6, 6) covariance of each pose of the trajectory; None where they are not known."""
+        if not self._covariances:
+            return None
+        latest = dict(zip(self._samples.stamps_ns, self._covariances, strict=True))
+        return np.array([latest[stamp_ns] for stamp_ns in sorted(latest)])
+
+
+class DeadReckoning:
+    """Collects the poses that the velocities alone lead through, from the first one on."""
+
+    def __init__(self) -> None:
+        self._pose = np.eye(4)
+        self._samples = Samples()
+
+    def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
+        """Move on from stamp to stamp, nanoseconds."""
+        held = velocities.held(start_ns, end_ns)
+        if not (self._samples.stamps_ns or held.dt_s.any()):
+            return
+        path = paths.path(self._pose, held.body_velocities * held.dt_s[:, None])
+        elapsed_s = np.append(0.0, np.cumsum(held.dt_s + held.gap_s))
+        stamps_ns = start_ns + np.rint(elapsed_s * NANOSECONDS_PER_SECOND).astype(np.int64)
+        for stamp_ns, pose in zip(stamps_ns.tolist(), path, strict=True):
+            if self._samples.lack(stamp_ns):
+                self._samples.add(stamp_ns, pose.copy())
+        self._pose = se3.pose(so3.normalise(path[-1, :3, :3]), path[-1, :3, 3])
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses kept, in stamp order."""
+        return self._samples.trajectory

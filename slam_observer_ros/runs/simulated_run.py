@@ -1,0 +1,150 @@
+"""The paper's simulation through the estimator, and how fast its Lyapunov function decreases."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.truth import PoseTruth
+from slam_observer_ros.observer.observer import lyapunov
+from slam_observer_ros.runs.sampling import SAMPLE_PERIOD_NS
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.simulation import SimulatedEvent, Simulation
+
+LYAPUNOV_FLOOR = 1e-40
+"""What log10 L is taken of where every residual is exactly zero, so that it stays finite."""
+
+ROUNDING_MARGIN = 1e6
+"""How far above the level of rounding L must be for the slope to be fitted to it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedRun:
+    """What came of a simulated run.
+
+    Attributes
+    ----------
+    times_s : FloatArray
+        (k,) times of the observations of known landmarks, seconds from the start.
+    lyapunov : FloatArray
+        (k,) L (34) at these times, before the correction.
+    slope_per_s : float or None
+        See :func:`fit_slope`.
+    estimate, truth : Trajectory
+        Poses at the same p stamps.
+    landmark_tracks : FloatArray
+        (p, n, 3) estimated landmarks at these stamps, metres; NaN before the first sighting.
+
+    """
+
+    times_s: FloatArray
+    lyapunov: FloatArray
+    slope_per_s: float | None
+    estimate: Trajectory
+    truth: Trajectory
+    landmark_tracks: FloatArray
+
+    @property
+    def log10_lyapunov(self) -> FloatArray:
+        """(k,) log10 L, of :data:`LYAPUNOV_FLOOR` where L is smaller than that."""
+        return np.log10(np.maximum(self.lyapunov, LYAPUNOV_FLOOR))
+
+
+def run_simulation(
+    simulation: Simulation, events: Iterable[SimulatedEvent], settings: Settings
+) -> SimulatedRun:
+    """Run a simulation's events through an estimator, from where the settings say.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        Where the events come from; it has the truth.
+    events : iterable of VelocityEvent, ObservationEvent or PoseTruth
+        What it delivers, in that order.
+    settings : Settings
+        Settings of the estimator.
+
+    """
+    run = _Run(simulation, settings)
+    for event in events:
+        if not isinstance(event, PoseTruth):
+            run.estimator.add(event)
+    run.estimator.flush()
+    return run.result()
+
+
+def fit_slope(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> float | None:
+    """Fit the slope of log10 L over time, after the transient and before rounding is felt.
+
+    What counts is the time until L first falls below ``floor``, or all of it; the transient is
+    taken to be over at half of that.
+
+    Parameters
+    ----------
+    times_s : FloatArray
+        (k,) times, seconds.
+    lyapunov : FloatArray
+        (k,) values of L.
+    floor : float
+        L below which rounding is felt.
+
+    Returns
+    -------
+    float or None
+        Decades per second; None if there are fewer than two values to fit.
+
+    """
+    below = np.flatnonzero(lyapunov <= floor)
+    end = int(below[0]) if len(below) else len(lyapunov)
+    if end - end // 2 < 2:
+        return None
+    fitted = slice(end // 2, end)
+    return float(np.polyfit(times_s[fitted], np.log10(lyapunov[fitted]), 1)[0])
+
+
+class _Run:
+    """Keeps L of every update and, at most 20 times a second, the configuration."""
+
+    def __init__(self, simulation: Simulation, settings: Settings) -> None:
+        self.estimator = Estimator(settings, on_update=self._on_update)
+        self._simulation = simulation
+        self._lyapunov: dict[int, float] = {}
+        self._poses: dict[int, FloatArray] = {}
+        self._points: list[FloatArray] = []
+        self._sampled_ns = -SAMPLE_PERIOD_NS
+
+    def _on_update(self, update: Update) -> None:
+        if len(update.ids):
+            self._lyapunov[update.stamp_ns] = update.lyapunov
+        if update.stamp_ns - self._sampled_ns < SAMPLE_PERIOD_NS:
+            return
+        self._sampled_ns = update.stamp_ns
+        points = np.full((len(self._simulation.landmark_ids), 3), np.nan)
+        points[self.estimator.landmark_ids] = self.estimator.world_points
+        self._poses[update.stamp_ns] = update.pose
+        self._points.append(points)
+
+    def result(self) -> SimulatedRun:
+        stamps_ns = np.array(list(self._poses), dtype=np.int64)
+        times_s = to_s(np.array(list(self._lyapunov)) - self._simulation.start_ns)
+        levels = np.array(list(self._lyapunov.values()))
+        return SimulatedRun(
+            times_s,
+            levels,
+            fit_slope(times_s, levels, ROUNDING_MARGIN * self._rounding()),
+            Trajectory(stamps_ns, np.array(list(self._poses.values()))),
+            Trajectory(stamps_ns, self._simulation.pose(stamps_ns)),
+            np.array(self._points),
+        )
+
+    def _rounding(self) -> float:
+        """Return L of residuals that are the rounding of the landmarks' coordinates."""
+        rounding = self.estimator.world_points * np.finfo(np.float64).eps
+        return lyapunov(self.estimator.settings.gain_k, rounding)

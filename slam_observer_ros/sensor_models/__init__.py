@@ -1,0 +1,1 @@
+"""Velocities, their calibration, and the noise of velocities and of observed points."""

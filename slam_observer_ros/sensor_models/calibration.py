@@ -1,0 +1,147 @@
+"""Calibration of the velocity as part of the state: V_true(t) = (1 + s) ∘ V(t − τ) + b, by axis.
+
+The delay τ is how much later than its stamp a velocity shows in what is observed: a command takes
+a while to be obeyed, and an image a while to be stamped.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.estimates import CalibrationEstimate
+from slam_observer_ros.geometry import paths
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
+
+NAMES = (
+    *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
+    *(f'{part}_bias_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
+    'velocity_delay',
+)
+"""Names of six scales, six biases and the delay τ."""
+
+DELAY = NAMES.index('velocity_delay')
+
+NOMINAL = np.repeat([1.0, 0.0], [6, 7])
+"""(13,) what they are where the velocity is right; scales as factors 1 + s."""
+
+MIN_DELAY_S = -0.2
+"""An odometry's velocity, averaged over the time before its stamp, shows in observations before
+that. How the robot moves so much later is not known yet when it is needed: without a limit the
+estimate, which can't make up for it, would stray ever further.
+"""
+
+UNITS = ('',) * 6 + ('rad/s',) * 3 + ('m/s',) * 3 + ('s',)
+
+
+class Calibration:
+    """Estimates of scale s, bias b and delay τ: of those whose uncertainty is not zero.
+
+    Parameters
+    ----------
+    settings : Settings
+        Uncertainties at the start and drifts.
+    axes : Axes
+        Axes of the pose that are estimated at all.
+
+    Attributes
+    ----------
+    count : int
+        c, how many entries of s, b and τ are estimated.
+    initial_variances : FloatArray
+        (c,) variances at the start.
+    drift_covariance : FloatArray
+        (c, c) by how much their covariance grows per second.
+    drifts : bool
+        Whether any of them grows.
+    delay_error_ns : int
+        Standard deviation of τ at the start, nanoseconds; 0 where it is not estimated.
+
+    """
+
+    def __init__(self, settings: Settings, axes: Axes) -> None:
+        scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
+        bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
+        errors = np.concatenate([scale, bias, [settings.velocity_delay_error]])
+        pose = np.arange(6)[axes.pose]
+        possible = np.concatenate([pose, 6 + pose, [DELAY]])
+        self._estimated: IntArray = possible[errors[possible] > 0.0]
+        self._scales = int(np.sum(self._estimated < 6))
+        self._calibrated = self._estimated[self._estimated < DELAY] % 6
+        self._all: FloatArray = NOMINAL.copy()
+        self.count = len(self._estimated)
+        self.delay_error_ns = to_ns(settings.velocity_delay_error)
+        self.initial_variances = errors[self._estimated] ** 2
+        self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
+        self.drifts = bool(self.drift_covariance.any())
+
+    @property
+    def values(self) -> FloatArray:
+        """(c,) estimates: scale factors 1 + s, then biases b, then the delay τ in seconds."""
+        values: FloatArray = self._all[self._estimated]
+        return values
+
+    def estimates(self, variances: FloatArray) -> list[CalibrationEstimate]:
+        """Return the estimates with what the gains know of them: ``variances`` (c,)."""
+        stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
+        return [
+            CalibrationEstimate(
+                NAMES[i],
+                float(self._all[i]),
+                float(np.sqrt(variance)),
+                UNITS[i],
+                nominal=float(NOMINAL[i]),
+                stated=float(error),
+            )
+            for i, variance, error in zip(self._estimated, variances, stated, strict=True)
+        ]
+
+    @property
+    def delay_ns(self) -> int:
+        """Delay τ, nanoseconds; where it is negative the latest velocity is held for longer.
+
+        From ``MIN_DELAY_S`` to ``MAX_DELAY_S``.
+        """
+        return to_ns(float(self._all[DELAY]))
+
+    def apply(self, body_velocities: FloatArray) -> FloatArray:
+        """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so.
+
+        Wheels that stand don't turn the robot, however unlike they are, and no gyroscope gives
+        zero on all axes.
+        """
+        biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
+        return body_velocities * self._all[:6] + biases
+
+    def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
+        """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
+
+        From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, so that velocities
+        were taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6) holds
+        the estimated rows of Ad_Â.
+        """
+        if not self.count:
+            return np.empty((Ad.shape[1], 0))
+        rates = motion.measured_velocities[:, self._calibrated]
+        rates[:, self._scales :] = _moves(motion.measured_velocities)[:, None]
+        shares = paths.at_poses(rates * motion.dt_s[:, None])
+        of_rates = Ad[:, :, self._calibrated] * shares[:, None, :]
+        F = np.zeros((Ad.shape[1], self.count))
+        F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
+        if len(self._calibrated) < self.count and motion.at_ends is not None:
+            first, last = self.apply(motion.at_ends)
+            F[:, -1] = Ad[0] @ first - Ad[-1] @ last
+        return F
+
+    def shift(self, change: FloatArray) -> None:
+        """Add ``change`` (c,) to the estimates."""
+        self._all[self._estimated] += change
+        self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)
+
+
+def _moves(body_velocities: FloatArray) -> BoolArray:
+    """Return whether velocities (…, 6) are not exactly zero (…)."""
+    return np.asarray(body_velocities.any(axis=-1))

@@ -1,0 +1,97 @@
+"""The motion between two stamps: velocities as the calibration has them, with their noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.geometry import paths, se3
+from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.motion_noise import MotionNoise
+from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+
+
+def transition(
+    velocities: VelocityHistory, calibration: Calibration, start_ns: int, end_ns: int
+) -> FloatArray:
+    """Return exp(V_1 dt_1) … exp(V_k dt_k) (4, 4), how the body moves from stamp to stamp."""
+    held = _held(velocities, calibration, start_ns, end_ns)
+    end: FloatArray = _path(np.eye(4), held, calibration)[-1]
+    return end
+
+
+def transition_covariance(
+    velocities: VelocityHistory,
+    calibration: Calibration,
+    noise: MotionNoise,
+    start_ns: int,
+    end_ns: int,
+) -> FloatArray:
+    """Return the covariance (6, 6) of w in exp(w) Φ, with Φ the :func:`transition`.
+
+    Along the body's axes at the start.
+    """
+    held = _held(velocities, calibration, start_ns, end_ns)
+    Ad = se3.adjoint(_path(np.eye(4), held, calibration))
+    return paths.summed_noise(Ad, noise.covariances(held))
+
+
+def integrate(
+    velocities: VelocityHistory,
+    calibration: Calibration,
+    noise: MotionNoise,
+    A: FloatArray,
+    start_ns: int,
+    end_ns: int,
+    at_start: FloatArray | None,
+) -> Motion:
+    """Return how Â, ``A`` (4, 4) at ``start_ns``, moves on to ``end_ns``.
+
+    ``at_start`` (6,) is the mean velocity around that stamp which the motion before this one
+    ended with, or None if there was none. As each motion begins like the last one ended, what the
+    delay's error does to all of them depends on their two ends alone.
+    """
+    held = _held(velocities, calibration, start_ns, end_ns)
+    at_ends = None
+    if calibration.delay_error_ns:
+        at_start = _around(velocities, calibration, start_ns) if at_start is None else at_start
+        at_ends = np.array([at_start, _around(velocities, calibration, end_ns)])
+    return Motion(
+        path=_path(A, held, calibration),
+        measured_velocities=held.body_velocities,
+        dt_s=held.dt_s,
+        covariances=noise.covariances(held),
+        duration_s=to_s(end_ns - start_ns),
+        at_ends=at_ends,
+    )
+
+
+def _held(
+    velocities: VelocityHistory, calibration: Calibration, start_ns: int, end_ns: int
+) -> HeldVelocities:
+    delay_ns = calibration.delay_ns
+    held = velocities.held(start_ns - delay_ns, end_ns - delay_ns)
+    if delay_ns >= 0:
+        return held
+    # The velocities of that time are yet to come: it is no sign that one was lost.
+    return replace(held, usual_s=held.usual_s + to_s(-delay_ns))
+
+
+def _path(start: FloatArray, held: HeldVelocities, calibration: Calibration) -> FloatArray:
+    """Return the poses (k + 1, 4, 4) that velocities lead to, from ``start`` (4, 4) on."""
+    return paths.path(start, calibration.apply(held.body_velocities) * held.dt_s[:, None])
+
+
+def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int) -> FloatArray:
+    """Return the mean velocity (6,) around a stamp, as far as its delay may reach.
+
+    The velocity at the very stamp would pass its own noise off as a turn to tell time by. In a
+    mean there is less noise. What is yet to come of it, the latest velocity stands in for.
+    """
+    reach_ns, centre_ns = calibration.delay_error_ns, stamp_ns - calibration.delay_ns
+    return velocities.mean(centre_ns - reach_ns, centre_ns + reach_ns)

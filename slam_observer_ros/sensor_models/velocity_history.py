@@ -1,0 +1,242 @@
+"""Velocities of the recent past, of one or two sensors, each held until the next one."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections import deque
+from dataclasses import dataclass, fields
+import math
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_s
+from slam_observer_ros.events import AngularVelocityEvent, flatten_velocities, VelocityEvent
+from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+
+NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
+"""Stamp of a velocity that timed out before time began, nanoseconds."""
+
+BLOCK, BLOCKS = 64, 16
+"""The last 16 times 64 periods of a sensor tell how long its messages are in force as a rule.
+
+So many that they have pauses in them where these are usual, as of commands.
+"""
+
+FIRST_CAPACITY = 64
+"""Velocities that there is room for at first."""
+
+
+class VelocityHistory:
+    """Velocity events in stamp order, joined with the angular velocities of another sensor.
+
+    Parameters
+    ----------
+    timeout_ns : int
+        How long a velocity is held at most, nanoseconds. Where the other sensor's angular one was
+        older when an event came, the velocity's own angular part counts.
+    is_planar : bool
+        Whether what leaves the plane z = 0 or turns out of it does not count.
+
+    """
+
+    def __init__(self, timeout_ns: int, is_planar: bool = False) -> None:
+        self._timeout_ns = timeout_ns
+        self._is_planar = is_planar
+        # In force from each stamp to the next; the first is what is known before any event.
+        self._stamps_ns = [NEVER_NS]
+        self._joined = _Joined.with_room_for(FIRST_CAPACITY)
+        # Those that nobody has asked for yet: many written at once cost less than one by one.
+        self._unwritten: list[tuple[VelocityEvent, AngularVelocityEvent | None]] = []
+        self._velocity: VelocityEvent | None = None
+        self._angular: AngularVelocityEvent | None = None
+        self._periods, self._angular_periods = _Periods(), _Periods()
+
+    def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
+        """Add an event that is not earlier than any other; return whether it leads on.
+
+        An angular velocity does not before the first linear one is known: it waits for that.
+        """
+        if isinstance(event, AngularVelocityEvent):
+            self._angular_periods.add(event.stamp_ns)
+            self._angular = event
+        else:
+            if not event.is_mean:  # else its error does not go on, however long it is held
+                self._periods.add(event.stamp_ns)
+            self._velocity = event
+        if self._velocity is None:
+            return False
+        angular = self._angular
+        if angular is not None and not 0 <= event.stamp_ns - angular.stamp_ns <= self._timeout_ns:
+            angular = None
+        self._unwritten.append((self._velocity, angular))
+        self._stamps_ns.append(event.stamp_ns)
+        return True
+
+    def latest(self, stamp_ns: int) -> FloatArray | None:
+        """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
+        place, joined = bisect_right(self._stamps_ns, stamp_ns) - 1, self._written()
+        if stamp_ns - joined.since_ns[place, 1] > self._timeout_ns:
+            return None
+        return self._counting(joined.body_velocities[place])
+
+    def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
+        """Return the velocities in force from ``start_ns`` to ``end_ns``."""
+        rows, begins, stops, ends = self._pieces(start_ns, end_ns)
+        joined = self._written()
+        held = HeldVelocities(
+            body_velocities=self._counting(joined.body_velocities[rows]),
+            covariances=joined.covariances[rows],
+            is_stated=joined.is_stated[rows],
+            dt_s=to_s(stops - begins),
+            gap_s=to_s(ends - stops),
+            before_s=to_s(begins[:, None] - joined.since_ns[rows]),
+            usual_s=self._usual_s(),
+        )
+        return held.with_gaps_apart() if held.gap_s.any() else held
+
+    def mean(self, start_ns: int, end_ns: int) -> FloatArray:
+        """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
+        rows, begins, stops, _ = self._pieces(start_ns, end_ns)
+        dt_s = to_s(stops - begins)
+        known_s = dt_s.sum()
+        if known_s == 0.0:
+            return np.zeros(6)
+        return self._counting(dt_s @ self._written().body_velocities[rows] / known_s)
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop velocities that were no longer in force at ``stamp_ns``."""
+        first, count = bisect_right(self._stamps_ns, stamp_ns) - 1, len(self._stamps_ns)
+        if first > count // 2:
+            kept, joined = np.append(0, np.arange(first, count)), self._written()
+            self._joined = joined.copied(kept, joined.capacity)
+            del self._stamps_ns[1:first]
+
+    def _pieces(self, start_ns: int, end_ns: int) -> tuple[slice, IntArray, IntArray, IntArray]:
+        """Return rows of the velocities in force, and when each begins, times out and ends, ns."""
+        first = bisect_right(self._stamps_ns, start_ns) - 1
+        last = bisect_left(self._stamps_ns, end_ns)
+        stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
+        begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
+        timed_out = self._written().since_ns[first:last, 1] + self._timeout_ns
+        return slice(first, last), begins, np.minimum(np.maximum(timed_out, begins), ends), ends
+
+    def _usual_s(self) -> FloatArray:
+        """Return for how long the angular and the linear part are held as a rule (2,)."""
+        linear_s = self._periods.usual_s
+        angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
+        return np.array([angular_s, linear_s])
+
+    def _written(self) -> _Joined:
+        """Return all velocities, those that have come since the last time among them."""
+        count = len(self._stamps_ns)
+        if count > self._joined.capacity:
+            self._joined = self._joined.copied(slice(None), 2 * count)
+        if self._unwritten:
+            self._joined.write(count - len(self._unwritten), self._unwritten)
+            self._unwritten = []
+        return self._joined
+
+    def _counting(self, body_velocities: FloatArray) -> FloatArray:
+        """Return what counts of velocities (…, 6), as a copy: for all of a step at once."""
+        if self._is_planar:
+            return flatten_velocities(body_velocities)
+        return np.array(body_velocities)
+
+
+class _Periods:
+    """For how long messages of one sensor are in force as a rule."""
+
+    def __init__(self) -> None:
+        self._block_ns: list[int] = []
+        # The two longest of each block before: no others are among the two longest of all.
+        self._longest_ns: deque[int] = deque(maxlen=2 * BLOCKS)
+        self._last_ns: int | None = None
+
+    def add(self, stamp_ns: int) -> None:
+        """Take the stamp of the next message."""
+        if self._last_ns is not None:
+            self._block_ns.append(stamp_ns - self._last_ns)
+        self._last_ns = stamp_ns
+        if len(self._block_ns) == BLOCK:
+            self._longest_ns.extend(sorted(self._block_ns)[-2:])
+            self._block_ns = []
+
+    @property
+    def usual_s(self) -> float:
+        """The longest period lately but one, seconds; infinite before there are two."""
+        longest_ns = sorted([*self._longest_ns, *self._block_ns])[-2:]
+        return math.inf if len(longest_ns) < 2 else to_s(longest_ns[0]) or math.inf
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Joined:
+    """Velocities in force from one event to the next, each of one message or two.
+
+    Attributes
+    ----------
+    body_velocities : FloatArray
+        (c, 6) the velocities, rad/s and m/s.
+    covariances : FloatArray
+        (c, 6, 6) their covariances, zero where unknown.
+    is_stated : BoolArray
+        (c, 2) whether the covariance of the angular and of the linear part is known.
+    since_ns : IntArray
+        (c, 2) stamps of the messages that the angular and the linear part are of, nanoseconds.
+
+    """
+
+    body_velocities: FloatArray
+    covariances: FloatArray
+    is_stated: BoolArray
+    since_ns: IntArray
+
+    @classmethod
+    def with_room_for(cls, capacity: int) -> _Joined:
+        """Return unknown velocities."""
+        return cls(
+            np.zeros((capacity, 6)),
+            np.zeros((capacity, 6, 6)),
+            np.zeros((capacity, 2), dtype=np.bool_),
+            np.full((capacity, 2), NEVER_NS, dtype=np.int64),
+        )
+
+    @property
+    def capacity(self) -> int:
+        """How many velocities there is room for."""
+        return len(self.since_ns)
+
+    def copied(self, rows: slice | IntArray, capacity: int) -> _Joined:
+        """Return some of the velocities, with room for ``capacity`` of them."""
+        roomy = _Joined.with_room_for(capacity)
+        for field in fields(_Joined):
+            kept = getattr(self, field.name)[rows]
+            getattr(roomy, field.name)[: len(kept)] = kept
+        return roomy
+
+    def write(
+        self, first: int, events: list[tuple[VelocityEvent, AngularVelocityEvent | None]]
+    ) -> None:
+        """Fill in rows from ``first`` on, which are zero: velocities, and what goes with them.
+
+        Rows that are filled in never change, so that others may look at them.
+        """
+        rows = slice(first, first + len(events))
+        self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
+        stamps_ns = np.array([velocity.stamp_ns for velocity, _ in events], dtype=np.int64)
+        self.since_ns[rows] = stamps_ns[:, None]
+        for row, (velocity, angular) in enumerate(events, first):
+            if (stated := velocity.covariance) is not None:
+                self.covariances[row] = stated
+                self.is_stated[row] = stated[:3, :3].any(), stated[3:, 3:].any()
+            if angular is not None:
+                self._write_angular(row, angular)
+
+    def _write_angular(self, row: int, angular: AngularVelocityEvent) -> None:
+        """Put the other sensor's angular velocity in place of the velocity's own."""
+        is_stated = angular.covariance is not None and bool(angular.covariance.any())
+        self.body_velocities[row, :3] = angular.angular_velocity
+        self.covariances[row, :3] = self.covariances[row, :, :3] = 0.0
+        self.covariances[row, :3, :3] = angular.covariance if is_stated else 0.0
+        self.is_stated[row, 0] = is_stated
+        self.since_ns[row, 0] = angular.stamp_ns

@@ -1,0 +1,1 @@
+"""Every parameter: the table, the file, and those of estimator, inputs and nodes."""

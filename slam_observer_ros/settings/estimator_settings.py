@@ -1,0 +1,308 @@
+"""The estimator's settings: one table for the node, YAML files, the command line and the docs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam_observer_ros.common.types import Immutable
+from slam_observer_ros.settings.parameter_table import parameter
+
+Vector3 = tuple[float, float, float]
+
+
+MAX_DELAY_S = 1.0
+"""Delay of velocities that is made up for at most."""
+
+
+@dataclass(frozen=True)
+class Settings(Immutable):
+    """Settings of the estimator; each field is a parameter."""
+
+    gains: str = parameter('riccati', 'Gain design', choices=('constant', 'scheduled', 'riccati'))
+    gain_k: float = parameter(
+        4.0,
+        "Constant gains: k of the paper's (30), with metres: how fast the pose follows the "
+        'residuals',
+        unit='1/s',
+        minimum=1e-6,
+        maximum=1e6,
+        read_only=False,
+    )
+    gain_l: float = parameter(
+        1.0,
+        "Constant gains: l of the paper's (31); a landmark's residual decays at the rate l/k",
+        unit='1/s²',
+        minimum=0.0,
+        maximum=1e6,
+        read_only=False,
+    )
+    step_mode: str = parameter(
+        'exponential',
+        "Constant gains: discrete step; 'paper' converges to the paper's equation for small steps",
+        choices=('exponential', 'paper'),
+        read_only=False,
+    )
+    max_innovation_time: float = parameter(
+        0.2,
+        'Constant gains: an observation acts for the time since its landmark was last seen, at '
+        'most this long',
+        unit='s',
+        minimum=1e-3,
+        read_only=False,
+    )
+    velocity_timeout: float = parameter(
+        1.0,
+        'How long a velocity is held; after that the pose is held and flagged as stale',
+        unit='s',
+        minimum=1e-3,
+        maximum=3600.0,
+    )
+    reorder_window: float = parameter(
+        0.05,
+        'How long events are held back to be put in stamp order',
+        unit='s',
+        minimum=0.0,
+        maximum=10.0,
+    )
+    late_limit: float = parameter(
+        2.0,
+        'How late an event may come after the reorder window: an observation is carried forward, '
+        'a velocity counts from then on, unless a newer one of its kind was used before it',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
+    )
+    max_stamp_jump: float = parameter(
+        10.0,
+        'A stamp further ahead of all others than this is refused until others confirm it',
+        unit='s',
+        minimum=0.1,
+        maximum=1e9,
+    )
+    on_time_jump: str = parameter(
+        'reset',
+        'What happens when the clock jumps, as in a recording that is looped: reset, the run '
+        'starts again; hold, pose and map are kept',
+        choices=('reset', 'hold'),
+    )
+    angular_velocity_noise: Vector3 = parameter(
+        (0.03, 0.03, 0.03),
+        'White noise of the angular velocity x y z: standard deviation of the angle after 1 s',
+        unit='rad/√s',
+        minimum=0.0,
+    )
+    linear_velocity_noise: Vector3 = parameter(
+        (0.02, 0.02, 0.02),
+        'White noise of the linear velocity x y z: standard deviation of the distance after 1 s',
+        unit='m/√s',
+        minimum=0.0,
+    )
+    angular_scale_noise: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'White noise of the angular velocity x y z in proportion to it, after 1 s',
+        unit='√s',
+        minimum=0.0,
+    )
+    linear_scale_noise: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'White noise of the linear velocity x y z in proportion to it, after 1 s',
+        unit='√s',
+        minimum=0.0,
+    )
+    unknown_angular_motion: float = parameter(
+        0.5,
+        'How much the robot may turn while no velocity is known, or its wheels slip: standard '
+        'deviation after 1 s',
+        unit='rad/√s',
+        minimum=0.0,
+        maximum=100.0,
+    )
+    unknown_linear_motion: float = parameter(
+        0.5,
+        'How far the robot may go while no velocity is known, or its wheels slip: standard '
+        'deviation after 1 s',
+        unit='m/√s',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    observation_model: str = parameter(
+        'range_bearing',
+        'Which noise figures apply to landmarks whose message has no covariance',
+        choices=('range_bearing', 'cartesian', 'stereo'),
+    )
+    range_noise: float = parameter(
+        0.1, 'Range and bearing: standard deviation of the range', unit='m', minimum=1e-4
+    )
+    range_scale_noise: float = parameter(
+        0.0,
+        'Range and bearing: part of the standard deviation of the range in proportion to it',
+        minimum=0.0,
+    )
+    bearing_noise: float = parameter(
+        0.03, 'Range and bearing: standard deviation of each angle', unit='rad', minimum=1e-6
+    )
+    point_noise: float = parameter(
+        0.05, 'Cartesian: standard deviation of each coordinate', unit='m', minimum=1e-4
+    )
+    stereo_focal_length: float = parameter(500.0, 'Stereo: focal length', unit='px', minimum=1.0)
+    stereo_baseline: float = parameter(0.2, 'Stereo: baseline', unit='m', minimum=1e-3)
+    pixel_noise: float = parameter(
+        1.0, 'Stereo: standard deviation across the line of sight', unit='px', minimum=1e-6
+    )
+    disparity_noise: float = parameter(
+        1.0, 'Stereo: standard deviation of the disparity', unit='px', minimum=1e-6
+    )
+    observation_error_time: float = parameter(
+        0.0,
+        'Scheduled and Riccati gains: correlation time of the error of an observed landmark, such '
+        'as that of a calibration, or of a tag seen from one side; 0 for errors that are '
+        'independent in each observation',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
+    )
+    angular_scale_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Scheduled and Riccati gains: scale error of the angular velocity x y z to be estimated: '
+        'its standard deviation',
+        minimum=0.0,
+    )
+    linear_scale_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Scheduled and Riccati gains: scale error of the linear velocity x y z to be estimated: '
+        'its standard deviation',
+        minimum=0.0,
+    )
+    angular_bias_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Scheduled and Riccati gains: bias of the angular velocity x y z to be estimated: its '
+        'standard deviation',
+        unit='rad/s',
+        minimum=0.0,
+    )
+    linear_bias_error: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Scheduled and Riccati gains: bias of the linear velocity x y z to be estimated: its '
+        'standard deviation',
+        unit='m/s',
+        minimum=0.0,
+    )
+    velocity_delay_error: float = parameter(
+        0.0,
+        'Scheduled and Riccati gains: delay from the stamp of a velocity to its effect in '
+        'observations, to be estimated: its standard deviation',
+        unit='s',
+        minimum=0.0,
+        maximum=MAX_DELAY_S,
+    )
+    calibration_drift: float = parameter(
+        0.0,
+        'Scheduled and Riccati gains: how fast scale, bias and delay of the velocity drift, as a '
+        'share of the standard deviation of each; above 0, where any of them is estimated, '
+        'Riccati gains do not relinearise',
+        unit='1/√s',
+        minimum=0.0,
+    )
+    landmark_velocity_error: float = parameter(
+        0.0,
+        'Riccati gains: spread of unknown constant landmark velocities to be estimated; 0: static',
+        unit='m/s',
+        minimum=0.0,
+    )
+    two_d_mode: bool = parameter(
+        False, 'Whether motion and map are planar: z, roll and pitch stay exactly zero'
+    )
+    huber_threshold: float = parameter(
+        1.345,
+        'Scheduled and Riccati gains: standard deviations of noise beyond which an observation '
+        'loses weight; 0 for never',
+        minimum=0.0,
+        read_only=False,
+    )
+    rejection_distance: float = parameter(
+        6.0,
+        'Scheduled and Riccati gains: standard deviations of the residual beyond which an '
+        'observation is rejected',
+        unit='σ',
+        minimum=1.0,
+        read_only=False,
+    )
+    confirmations: int = parameter(
+        3,
+        'Observations after which a landmark is in the map',
+        minimum=1,
+    )
+    max_rejections: int = parameter(
+        5,
+        'Scheduled and Riccati gains: rejections in a row, all at one place, after which a '
+        'landmark is taken to have moved; one more than it was seen, if that is fewer',
+        minimum=1,
+    )
+    max_landmarks: int = parameter(
+        0,
+        'Most landmarks kept; a new one then replaces the one seen least often; 0 for any number',
+        minimum=0,
+    )
+    min_support: int = parameter(
+        5,
+        'Riccati gains, points without id: how often a landmark must be seen to be in the map; it '
+        'is deleted if still not after four times as long in view as a typical one needs',
+        minimum=1,
+    )
+    max_hypotheses: int = parameter(
+        8,
+        'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
+        'have slipped: most hypotheses that are followed until it is clear which one is right',
+        minimum=1,
+    )
+    hindsight_interval: int = parameter(
+        20,
+        'Riccati gains: fewest new observations before relinearising; a tenth of all so far if '
+        'that is more, but at most 300; 0 for never',
+        minimum=0,
+    )
+    hindsight_turn: float = parameter(
+        0.2,
+        'Riccati gains: relinearise once attitude corrections have reached this as a root sum '
+        'square; after a single one of this size a tenth of the interval is enough',
+        unit='rad',
+        minimum=0.0,
+    )
+    hindsight_window: int = parameter(
+        3000,
+        'Riccati gains: observations after which smoothing restarts from the current estimate; '
+        '0 to smooth all of them, the default of replay --smooth',
+        minimum=0,
+    )
+    localization_mode: str = parameter(
+        'off',
+        'What a loaded map is: off, a start from which mapping goes on; uncertain, landmarks that '
+        'are refined within their covariance (constant gains know none), with no new ones added; '
+        'fixed, exact and at rest',
+        choices=('off', 'uncertain', 'fixed'),
+    )
+    set_initial_pose: bool = parameter(
+        False,
+        'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded '
+        'map within 0.5 m and 0.26 rad, instead of localising there by landmarks',
+    )
+    initial_position: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Where the robot starts, x y z, with set_initial_pose',
+        unit='m',
+        minimum=-1e7,
+        maximum=1e7,
+    )
+    initial_yaw: float = parameter(
+        0.0,
+        'How the robot is turned at the start, with set_initial_pose',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
+    )
+    map_noise: float = parameter(
+        0.05,
+        'Standard deviation of each coordinate of loaded landmarks whose file gives none',
+        unit='m',
+        minimum=0.0,
+    )

@@ -1,0 +1,103 @@
+"""What is used of the messages that come in, live or recorded, and in which frames it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TypeVar
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.settings.parameter_table import parameter
+
+AUTO = 'auto'
+"""Message type parameter: take the type that is found on the topic."""
+
+ON_TF = 'tf'
+"""Landmarks are fiducials whose positions, and ids in the names of frames, are on /tf."""
+
+Pose6 = tuple[float, float, float, float, float, float]
+
+POSE_DIFFERENCES = 'pose_differences'
+"""Velocity source: the differences of an odometry's poses."""
+
+InputSettingsT = TypeVar('InputSettingsT', bound='InputSettings')
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """How measurements become events; the node has these parameters, and so has a replay."""
+
+    velocity_source: str = parameter(
+        'twist',
+        'What of Odometry is used: its twist, or the differences of its poses',
+        choices=('twist', POSE_DIFFERENCES),
+    )
+    use_imu: bool = parameter(
+        False, 'Whether the angular velocity comes from the Imu on imu, the linear one from twist'
+    )
+    landmarks_type: str = parameter(
+        AUTO,
+        'Message type on landmarks; auto takes the type found on the topic, in the node only if '
+        'it is a cloud or PoseArray; tf takes fiducials that a detector publishes on /tf',
+        choices=(
+            AUTO,
+            'PointCloud',
+            'PointCloud2',
+            'PoseArray',
+            'Detection3DArray',
+            'AprilTagDetectionArray',
+            ON_TF,
+        ),
+    )
+    tag_frame_prefix: str = parameter(
+        'tag_', "Name of a fiducial's frame before its id; family:id, as of apriltag_ros, fits too"
+    )
+    map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks')
+    odom_frame: str = parameter(
+        'odom',
+        'Odometry frame: if /tf has odom_frame to base_frame, map_frame to odom_frame is '
+        'published; empty for never',
+    )
+    base_frame: str = parameter('base_link', 'Frame of the robot, whose pose is estimated')
+    sensor_frame: str = parameter(
+        '', "Frame of the landmarks; empty takes each message's own, base_frame needs no transform"
+    )
+    sensor_pose: Pose6 = parameter(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        "Pose of the landmarks' sensor in base_frame, x y z and roll pitch yaw, in place of /tf; "
+        'all zeros: from /tf',
+        unit='m, rad',
+    )
+    transform_timeout: float = parameter(
+        0.5, 'How long a message waits for a transform', unit='s', minimum=0.0, maximum=60.0
+    )
+
+    def with_plain_frames(self: InputSettingsT) -> InputSettingsT:
+        """Return the settings with frames as tf2 has them, without a leading slash.
+
+        Raises
+        ------
+        ParameterError
+            If the map's frame has no name.
+
+        """
+        names = ('map_frame', 'odom_frame', 'base_frame', 'sensor_frame')
+        plain = replace(self, **{name: getattr(self, name).lstrip('/') for name in names})
+        plain.check_named('map_frame')
+        return plain
+
+    def check_named(self, parameter_name: str) -> None:
+        """Raise a ParameterError, which says what to do, if the name of a frame is empty."""
+        if not getattr(self, parameter_name):
+            raise ParameterError(f"'{parameter_name}' is empty: give it the name of a frame")
+
+    def check_frames_differ(self) -> None:
+        """Raise a ParameterError if two of map, odometry and base have the same name."""
+        for one, other in combinations(('map_frame', 'odom_frame', 'base_frame'), 2):
+            frame = getattr(self, one)
+            if not frame or frame != getattr(self, other):
+                continue
+            advice = 'give each a name of its own'
+            if other == 'odom_frame':
+                advice += f", or set 'odom_frame' to '' to have '{frame}' to the base published"
+            raise ParameterError(f"'{one}' and '{other}' are both '{frame}': {advice}")

@@ -1,0 +1,113 @@
+"""Parameters that belong to the nodes themselves, not to the estimator or the simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam_observer_ros.settings.input_settings import AUTO, InputSettings
+from slam_observer_ros.settings.parameter_table import parameter
+
+
+@dataclass(frozen=True)
+class ObserverNodeSettings(InputSettings):
+    """What ``observer_node`` adds to the settings of the estimator and its inputs."""
+
+    velocity_type: str = parameter(
+        AUTO,
+        'Message type on twist; auto takes the type found on the topic',
+        choices=(AUTO, 'Twist', 'TwistStamped', 'TwistWithCovarianceStamped', 'Odometry'),
+    )
+    twist_qos: str = parameter(
+        'best_effort',
+        'Reliability requested of twist and imu; best_effort fits any publisher',
+        choices=('best_effort', 'reliable'),
+    )
+    landmarks_qos: str = parameter(
+        'best_effort',
+        'Reliability requested of landmarks; best_effort fits any publisher',
+        choices=('best_effort', 'reliable'),
+    )
+    queue_depth: int = parameter(
+        100, 'Messages of each input kept while the node is busy', minimum=1, maximum=10_000
+    )
+    transform_tolerance: float = parameter(
+        0.1,
+        'How far map_frame to odom_frame is post-dated beyond reorder_window, to hold until the '
+        'next one: three periods of twist',
+        unit='s',
+        minimum=0.0,
+        maximum=10.0,
+    )
+    max_clock_offset: float = parameter(
+        1.0,
+        'Stamps that are further than this from the time of reception come from another clock',
+        unit='s',
+        minimum=1e-3,
+    )
+    correct_clock_offset: bool = parameter(
+        False, "Whether stamps from another clock are moved to this machine's time"
+    )
+    publish_rate: float = parameter(
+        50.0,
+        'Highest rate of odometry, pose, lyapunov, landmark_estimates and /tf',
+        unit='Hz',
+        minimum=0.1,
+        maximum=1000.0,
+    )
+    publish_tf: bool = parameter(
+        True, 'Whether map_frame to odom_frame or base_frame is published on /tf'
+    )
+    invert_tf: bool = parameter(
+        False, 'Whether the transform on /tf is published as its inverse, with map_frame below'
+    )
+    path_length: int = parameter(
+        2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
+    )
+    map_file: str = parameter(
+        '', 'Map to load at the start: one saved earlier, or surveyed landmarks; empty for none'
+    )
+    map_path: str = parameter(
+        '', 'File of ~/save_map, ~/load_map and autosave_map', read_only=False
+    )
+    autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
+
+    def with_checked_frames(self) -> ObserverNodeSettings:
+        """Return the settings with plain frames that can be told apart.
+
+        Raises
+        ------
+        ParameterError
+            If map or base has no name, or two of map, odometry and base have the same; it says
+            what to do.
+
+        """
+        plain = self.with_plain_frames()
+        plain.check_named('base_frame')
+        plain.check_frames_differ()
+        return plain
+
+
+@dataclass(frozen=True)
+class SimulatorNodeSettings:
+    """What ``simulator_node`` adds to the scenario."""
+
+    stamped: bool = parameter(False, 'Whether twist carries TwistStamped in place of Twist')
+    landmarks_type: str = parameter(
+        'PointCloud', 'Message type on landmarks', choices=('PointCloud', 'PointCloud2')
+    )
+    real_time_factor: float = parameter(
+        1.0,
+        'Simulated seconds a second; other than 1 the node publishes /clock',
+        minimum=0.01,
+        maximum=1000.0,
+    )
+    wait_for_subscribers: int = parameter(
+        1,
+        'Subscribers that twist and landmarks must have before the robot starts',
+        minimum=0,
+    )
+    truth_frame: str = parameter('world', 'Frame of the true pose and landmarks')
+    map_frame: str = parameter(
+        'map', "Frame of the observer's estimate; /tf_static has its pose in truth_frame"
+    )
+    base_frame: str = parameter('base_link', 'Frame of the velocity and the observations')

@@ -1,0 +1,155 @@
+"""ROS 2 parameter files, read without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+import re
+
+import yaml
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.common.yaml_errors import reason_of, UniqueKeys
+from slam_observer_ros.settings.parameter_table import suggestion
+
+OBSERVER_NODE = 'observer_node'
+
+
+def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
+    """Return the names that are not ours: a parameter file may be shared with other nodes.
+
+    Raises
+    ------
+    ParameterError
+        If one is one of ours with a single mistake. With more of them it may well be another
+        node's: ``base_frame_id`` comes near, too.
+
+    """
+    others = [name for name in written if name not in ours]
+    for name in others:
+        if near := suggestion(name, [our for our in ours if _is_misspelt(name, our)]):
+            raise ParameterError(f"unknown parameter '{name}'{near}")
+    return others
+
+
+def read_parameter_file(path: Path) -> dict[str, object]:
+    """Return the name → value mapping of a ROS 2 parameter file.
+
+    The file has the usual form ``<node or /**>: ros__parameters: {name: value}``, the node maybe
+    below its namespaces; nested mappings become dotted names. Sections of other nodes are left
+    out. In the names of sections ``*`` stands for one name, and ``**`` for any number of them.
+
+    Raises
+    ------
+    ParameterError
+        If the file can't be read, is not YAML, has a key twice, or holds no parameters for this
+        package, or those of several robots.
+
+    """
+    sections = [(name, body) for name, body in _read_sections(path) if _fits(name, _node_of(name))]
+    if not sections:
+        raise ParameterError(
+            f"parameter file {path} has no '/**: ros__parameters:' or "
+            f"'{OBSERVER_NODE}: ros__parameters:' section"
+        )
+    node = _only_node(path, [name for name, _ in sections])
+    values: dict[str, object] = {}
+    for name, body in sections:
+        if _fits(name, node):
+            values.update(_flatten(body))
+    return values
+
+
+def mixed_lists(values: Mapping[str, object]) -> list[str]:
+    """Return the names of lists that ROS can't read: some numbers are integers, and some not."""
+    return [
+        name
+        for name, value in values.items()
+        if isinstance(value, list) and {int, float} <= {type(entry) for entry in value}
+    ]
+
+
+def _is_misspelt(name: str, ours: str) -> bool:
+    """Return whether a letter of ``ours`` is wrong, missing, too many or behind the next one."""
+    same = [one == other for one, other in zip(name, ours, strict=False)]
+    start = [*same, False].index(False)
+    rest, right = name[start:], ours[start:]
+    swapped = right[1:2] + right[:1] + right[2:]
+    return rest in (right[1:], swapped) or rest[1:] in (right, right[1:])
+
+
+class _RosLoader(UniqueKeys, yaml.SafeLoader):
+    """Reads numbers as ROS does: 1e-3 and 1.0e3, too, where YAML 1.1 wants 1.0e-3 and 1.0e+3."""
+
+
+_RosLoader.add_implicit_resolver(
+    'tag:yaml.org,2002:float',
+    re.compile(r'^[-+]?(\d+\.?\d*[eE][-+]?\d+|\.\d+([eE][-+]?\d+)?)$'),
+    list('-+.0123456789'),
+)
+
+
+def _read_sections(path: Path) -> list[tuple[str, dict[str, object]]]:
+    try:
+        content = yaml.load(path.read_bytes(), _RosLoader)
+        return list(_sections(content if isinstance(content, dict) else {}))
+    except OSError as error:
+        raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = reason_of(error)
+        raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
+
+
+def _sections(
+    tree: Mapping[object, object], namespace: str = ''
+) -> Iterator[tuple[str, dict[str, object]]]:
+    """Yield the nodes of a parameter file by their full names, and their parameters."""
+    for key, body in tree.items():
+        name = f'{namespace}/{str(key).lstrip("/")}'
+        if not isinstance(body, dict):
+            continue
+        if 'ros__parameters' not in body:  # the name is a namespace
+            yield from _sections(body, name)
+        elif isinstance(body['ros__parameters'], dict):
+            yield name, body['ros__parameters']
+
+
+def _fits(section: str, node: str) -> bool:
+    """Return whether a section is of the node with this full name, as ROS has it."""
+    wildcards = {'*': '/[^/]+', '**': '(/[^/]+)*'}
+    names = section.split('/')[1:]
+    pattern = ''.join(wildcards.get(name, '/' + re.escape(name)) for name in names)
+    return re.fullmatch(pattern, node) is not None
+
+
+def _node_of(section: str) -> str:
+    """Return the full name of the observer's node that a section is of, if it is of one."""
+    names = [name for name in section.split('/')[1:] if name != '**']
+    namespaces = names[:-1] if names and names[-1] in ('*', OBSERVER_NODE) else names
+    return '/'.join(['', *namespaces, OBSERVER_NODE])
+
+
+def _only_node(path: Path, sections: Sequence[str]) -> str:
+    """Return the full name of the observer's node that a file is of.
+
+    Where a section names it, those with wildcards may be of other nodes.
+    """
+    named = [section for section in sections if '*' not in section] or sections
+    node = max(map(_node_of, named), key=lambda name: (name.count('/'), '*' not in name))
+    for section in named:
+        if not _fits(section, node):
+            raise ParameterError(
+                f'parameter file {path} is of several robots: it has sections for {section} and '
+                f'{node}; leave one'
+            )
+    return node
+
+
+def _flatten(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:
+    flat: dict[str, object] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            flat.update(_flatten(value, f'{prefix}{name}.'))
+        else:
+            flat[f'{prefix}{name}'] = value
+    return flat

@@ -1,1 +1,0 @@
-"""One state that moves on: observer, gains, and which landmarks there are."""

@@ -1,0 +1,1 @@
+"""One hypothesis: the filter, its landmarks, and the step."""

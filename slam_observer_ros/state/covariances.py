@@ -1,0 +1,80 @@
+"""Covariances as users know them, in the world or as seen from the robot, from those of the gains.
+
+The gains know the error ε of Â = exp(ε) A and the errors ã_i of the landmarks, in the reference
+frame. Functions return None where they know none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.matrices import limited
+from slam_observer_ros.observer.filter import GainDesign
+from slam_observer_ros.observer.observer import Observer
+
+MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
+"""Standard deviations of a pose that is told, rad and m, beyond which it is only 'unknown'."""
+
+
+def of_landmarks(observer: Observer, covariances: FloatArray | None) -> FloatArray | None:
+    """Return those of landmarks along the world's axes, given ``covariances`` of ã_i (n, 3, 3)."""
+    if covariances is None:
+        return None
+    R = observer.reference_pose[:3, :3]
+    world: FloatArray = R @ covariances @ R.T
+    return world
+
+
+def of_configuration(
+    observer: Observer, gains: GainDesign, axes: Axes, rows: IntArray
+) -> FloatArray | None:
+    """Return the covariance (m k, m k) of where landmarks are seen from the robot, m².
+
+    Joint, along the axes of the body that are estimated. The choice of the world's frame has no
+    part in it.
+    """
+    P = gains.joint_covariance(rows)
+    if P is None:
+        return None
+    m, k, p = len(rows), axes.point, axes.p
+    points = observer.points + gains.postponed_shifts()
+    C = axes.output_matrix(points[rows]).reshape(-1, p)
+    CP = C @ P[:p] - P[p:]
+    blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
+    R = observer.A[:k, :k]
+    seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
+    return seen
+
+
+def of_pose(observer: Observer, covariance: FloatArray | None, A: FloatArray) -> FloatArray | None:
+    """Return the pose's covariance (6, 6) at Â = ``A`` (4, 4), given ``covariance`` of ε (6, 6).
+
+    Of its rotation vector and its position along the world's axes, rad² and m².
+    """
+    if covariance is None:
+        return None
+    turn = _turn_to_world(observer, A)
+    world: FloatArray = turn @ covariance @ turn.T
+    return world
+
+
+def of_pose_error(observer: Observer, world: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of ε, given that of the pose as :func:`of_pose` returns it.
+
+    What is beyond :data:`MAX_POSE_ERRORS` is made less.
+    """
+    back = np.linalg.inv(_turn_to_world(observer, observer.A))
+    covariance: FloatArray = back @ limited(world, MAX_POSE_ERRORS) @ back.T
+    return covariance
+
+
+def _turn_to_world(observer: Observer, A: FloatArray) -> FloatArray:
+    """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
+    R = observer.reference_pose[:3, :3]
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R
+    turn[3:, :3] = -R @ so3.hat(A[:3, 3])
+    return turn

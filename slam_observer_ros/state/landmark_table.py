@@ -1,0 +1,210 @@
+"""Which landmarks are known: ids, counts and stamps as a struct of arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.events import is_automatic
+
+PATIENCE = 4
+"""How many times as often others must have been seen before a landmark has had its chance.
+
+Some are seen more seldom than others: from afar, or from one side only.
+"""
+
+_COLUMNS = (
+    'ids',
+    'counts',
+    'rejections',
+    'rejected_at',
+    'rejected_last',
+    'last_seen_ns',
+    'seen_before_ns',
+    'tentative',
+    'in_view',
+    'missed',
+)
+
+
+class LandmarkTable:
+    """Book-keeping of n landmarks; row i belongs to the observer's landmark i.
+
+    Attributes
+    ----------
+    ids : IntArray
+        (n,) landmark ids, in the order in which they were first seen.
+    counts : IntArray
+        (n,) in how many observations each was seen and accepted.
+    rejections : IntArray
+        (n,) how many observations in a row were rejected at one place, up to now.
+    rejected_at : FloatArray
+        (n, 3) where each was at the first of these, metres, reference frame.
+    rejected_last : FloatArray
+        (n, 3) where each was at the last of them.
+    last_seen_ns : IntArray
+        (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
+    seen_before_ns : IntArray
+        (n,) stamp of the latest one before that, nanoseconds; −1 if there was none.
+    tentative : BoolArray
+        (n,) which have no id of their own, and have yet to be seen often enough to stay.
+    in_view : IntArray
+        (n,) in how many observations without ids each was in view.
+    missed : IntArray
+        (n,) in how many of these since the latest one that saw it.
+
+    """
+
+    def __init__(self) -> None:
+        self.ids: IntArray = np.empty(0, dtype=np.int64)
+        self.counts: IntArray = np.empty(0, dtype=np.int64)
+        self.rejections: IntArray = np.empty(0, dtype=np.int64)
+        self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
+        self.seen_before_ns: IntArray = np.empty(0, dtype=np.int64)
+        self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
+        self.in_view: IntArray = np.empty(0, dtype=np.int64)
+        self.missed: IntArray = np.empty(0, dtype=np.int64)
+        self.rejected_at: FloatArray = np.empty((0, 3))
+        self.rejected_last: FloatArray = np.empty((0, 3))
+        self._settled_in_view = 0
+        self._settled_seen = 0
+        self._order: IntArray = np.empty(0, dtype=np.int64)
+
+    def __len__(self) -> int:
+        """Return the number of landmarks."""
+        return len(self.ids)
+
+    def rows_of(self, ids: IntArray) -> IntArray:
+        """Return the row of each id (m,), −1 where it is unknown."""
+        if not len(self.ids):
+            return np.full(len(ids), -1)
+        place = self.ids.searchsorted(ids, sorter=self._order)
+        rows = self._order[np.minimum(place, len(self.ids) - 1)]
+        return np.where(self.ids[rows] == ids, rows, -1)
+
+    def add(self, ids: IntArray, stamp_ns: int) -> None:
+        """Append landmarks (m,) that are seen for the first time."""
+        first, m = len(self), len(ids)
+        for name in _COLUMNS:
+            column = getattr(self, name)
+            room = np.zeros((m, *column.shape[1:]), dtype=column.dtype)
+            setattr(self, name, np.concatenate([column, room]))
+        self.ids[first:] = ids
+        self.restart(np.arange(first, first + m), stamp_ns)
+        self._order = np.argsort(self.ids)
+
+    def add_known(self, ids: IntArray, counts: IntArray) -> None:
+        """Append landmarks (m,) that were seen ``counts`` (m,) times before this run."""
+        n = len(self)
+        self.add(ids, -1)
+        self.counts[n:] = counts
+        self.tentative[n:] = False
+
+    def restart_time(self) -> None:
+        """Take all landmarks as last seen before any stamp to come."""
+        self.last_seen_ns = np.full(len(self), -1)
+        self.seen_before_ns = np.full(len(self), -1)
+
+    def renumber(self, rows: IntArray, ids: IntArray) -> None:
+        """Give ``rows`` (m,) other ids (m,)."""
+        self.ids[rows] = ids
+        self.tentative[rows] &= is_automatic(ids)
+        self._order = np.argsort(self.ids)
+
+    def accept(self, rows: IntArray, stamp_ns: int) -> None:
+        """Count one more accepted observation of ``rows`` (m,)."""
+        self.counts[rows] += 1
+        self.rejections[rows] = 0
+        later = rows[self.last_seen_ns[rows] < stamp_ns]
+        self.seen_before_ns[later] = self.last_seen_ns[later]
+        self.last_seen_ns[later] = stamp_ns
+
+    def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
+        """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
+
+        What is seen again at the stamp at which it was seen is so by another sensor: that has
+        not seen it for as long as the first one had not.
+        """
+        last_ns = self.last_seen_ns[rows]
+        since_ns = np.where(last_ns == stamp_ns, self.seen_before_ns[rows], last_ns)
+        unseen_s: FloatArray = np.where(since_ns < 0, np.inf, to_s(stamp_ns - since_ns))
+        return unseen_s
+
+    def reject(self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray) -> None:
+        """Count one more rejected observation of ``rows`` (m,).
+
+        Only rejections in a row and at one place add up: ``points`` (m, 3) within
+        ``tolerances_m`` (m,) of where the first of them was, metres.
+        """
+        same_place = self.are_rejected_again(rows, points, tolerances_m)
+        self.rejections[rows] = np.where(same_place, self.rejections[rows] + 1, 1)
+        self.rejected_at[rows[~same_place]] = points[~same_place]
+        self.rejected_last[rows] = points
+
+    def are_rejected_again(
+        self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray
+    ) -> BoolArray:
+        """Return which rows (m,) were rejected the last time, and at the same place."""
+        shifts_m = np.linalg.norm(points - self.rejected_at[rows], axis=1)
+        return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
+
+    def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
+        """Return which of the rows (m,) have been rejected too often to be trusted.
+
+        That is ``max_rejections`` times, or once more than they were seen: what contradicts a
+        landmark that was seen once or twice may itself be the outlier.
+        """
+        rejections = self.rejections[rows]
+        if not rejections.any():  # as nearly always
+            return np.zeros(len(rows), dtype=np.bool_)
+        needed = np.minimum(self.counts[rows] + 1, max_rejections)
+        return np.asarray(rejections >= needed)
+
+    def note_in_view(self, rows: IntArray, seen: BoolArray) -> None:
+        """Count one more observation that had rows (m,) in view, and which of them it saw."""
+        settled = ~self.tentative[rows]
+        self._settled_in_view += int(np.sum(settled))
+        self._settled_seen += int(np.sum(settled & seen))
+        self.in_view[rows] += 1
+        self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
+
+    @property
+    def seen_share(self) -> float:
+        """How often a landmark without an id that has settled is seen while in view; else 0."""
+        return self._settled_seen / self._settled_in_view if self._settled_in_view else 0.0
+
+    def unsupported(self, min_support: int) -> IntArray:
+        """Return rows without an id that were seen too seldom to be landmarks.
+
+        That is less than ``min_support`` times by when a settled one, as often in view, would have
+        been seen :data:`PATIENCE` times as often. One that was seen so often has settled.
+        """
+        settling = self.tentative & (self.counts >= min_support)
+        self._settled_in_view += int(np.sum(self.in_view[settling]))
+        self._settled_seen += int(np.sum(self.counts[settling]))
+        self.tentative &= ~settling
+        # Before any has settled nobody knows how often one is seen.
+        expected = self.in_view * self.seen_share
+        return np.flatnonzero(self.tentative & (expected >= PATIENCE * min_support))
+
+    def unseen_since(self, stamp_ns: int) -> IntArray:
+        """Return rows not seen since a stamp: least often seen first, then longest ago."""
+        unseen = np.flatnonzero(self.last_seen_ns < stamp_ns)
+        return unseen[np.lexsort((self.last_seen_ns[unseen], self.counts[unseen]))]
+
+    def restart(self, rows: IntArray, stamp_ns: int) -> None:
+        """Take ``rows`` as seen for the first time, at a stamp."""
+        self.last_seen_ns[rows] = stamp_ns
+        self.seen_before_ns[rows] = -1
+        self.counts[rows] = 1
+        self.rejections[rows] = 0
+        self.tentative[rows] = is_automatic(self.ids[rows])
+        self.in_view[rows] = 0
+        self.missed[rows] = 0
+
+    def remove(self, rows: IntArray) -> None:
+        """Delete rows; those behind move up."""
+        for name in _COLUMNS:
+            setattr(self, name, np.delete(getattr(self, name), rows, axis=0))
+        self._order = np.argsort(self.ids)

@@ -1,0 +1,118 @@
+"""``slam-observer simulate`` shows the paper's exponential convergence at every step."""
+
+from __future__ import annotations
+
+from command_line import CommandLine
+import numpy as np
+import pytest
+
+from slam_observer_ros.runs.simulated_run import fit_slope, LYAPUNOV_FLOOR
+
+PAPER_SLOPE = -2.0 * (1.0 / 4.0) / np.log(10.0)
+
+
+@pytest.fixture
+def slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+def test_by_default_log_lyapunov_falls_at_the_rate_of_the_paper(slam_observer):
+    result = slam_observer.succeed('simulate', '--json').json
+    assert set(result) == {'time_s', 'log10_lyapunov', 'slope_per_s', 'step_s'}
+    assert result['step_s'] == 0.02
+    assert result['time_s'] == pytest.approx(np.arange(1, 4001) * 0.02)
+    assert len(result['log10_lyapunov']) == len(result['time_s'])
+    assert result['slope_per_s'] == pytest.approx(PAPER_SLOPE, abs=0.001)
+    assert result['log10_lyapunov'][-1] < -14.0
+
+
+@pytest.mark.parametrize(('step_s', 'duration_s'), [(0.001, 4.0), (0.2, 80.0), (2.0, 80.0)])
+def test_the_rate_does_not_depend_on_the_step(slam_observer, step_s, duration_s):
+    result = slam_observer.succeed(
+        'simulate', '--json', '--step', step_s, '--duration', duration_s
+    ).json
+    assert result['slope_per_s'] == pytest.approx(PAPER_SLOPE, abs=0.005)
+    assert result['log10_lyapunov'][-1] < 0.5 + 0.95 * PAPER_SLOPE * duration_s
+
+
+def test_many_far_landmarks(slam_observer):
+    result = slam_observer.succeed(
+        'simulate', '--json', '--landmarks', 100, '--distance', 50, '--duration', 15
+    ).json
+    assert result['slope_per_s'] == pytest.approx(PAPER_SLOPE, abs=0.005)
+    assert np.diff(result['log10_lyapunov']).max() < 0.0
+
+
+def test_rounding_neither_spoils_the_slope_nor_the_json(slam_observer):
+    result = slam_observer.succeed('simulate', '--json', '--step', 0.2, '--duration', 300).json
+    assert result['slope_per_s'] == pytest.approx(PAPER_SLOPE, abs=0.001)
+    assert result['log10_lyapunov'][-1] < -24.0
+
+
+def test_without_bias_there_is_nothing_to_converge(slam_observer):
+    result = slam_observer.succeed('simulate', '--json', '--bias', 0, '--duration', 1).json
+    assert result['slope_per_s'] is None
+    assert min(result['log10_lyapunov']) >= np.log10(LYAPUNOV_FLOOR)
+    assert 'none' in slam_observer.succeed('simulate', '--bias', 0, '--duration', 1).output
+
+
+def test_gains_are_the_papers_unless_others_are_asked_for(slam_observer, tmp_path):
+    faster = slam_observer.succeed(
+        'simulate', '--json', '--step', 0.1, '--duration', 20, '--set', 'gain_l=2'
+    ).json
+    assert faster['slope_per_s'] == pytest.approx(2.0 * PAPER_SLOPE, abs=0.005)
+    config = tmp_path / 'slow.yaml'
+    config.write_text('/**: {ros__parameters: {gain_l: 0.5, publish_rate: 20.0}}')
+    slower = slam_observer.succeed(
+        'simulate', '--json', '--step', 0.1, '--duration', 40, '--config', config
+    ).json
+    assert slower['slope_per_s'] == pytest.approx(0.5 * PAPER_SLOPE, abs=0.005)
+
+
+def test_one_seed_one_run(slam_observer):
+    first, again, other = (
+        slam_observer.succeed('simulate', '--json', '--duration', 1, '--seed', seed).output
+        for seed in (1, 1, 2)
+    )
+    assert first == again != other
+
+
+def test_summary_names_the_slope(slam_observer):
+    output = slam_observer.succeed('simulate', '--step', 0.1, '--duration', 40).output
+    assert '-0.217' in output
+
+
+def test_recording_converges_as_the_simulation_did(slam_observer, tmp_path):
+    recording = tmp_path / 'run.mcap'
+    slam_observer.succeed('simulate', '--step', 0.05, '--duration', 40, '--output', recording)
+    report = slam_observer.succeed('replay', recording, '--gains', 'constant', '--json').json
+    assert report['events'] == 2 * 801
+    assert report['landmarks'] == 4
+    assert report['duration_s'] == pytest.approx(40.0)
+    assert report['landmark_rmse_m'] < 1e-3
+    assert [path.name for path in tmp_path.iterdir()] == ['run.mcap']
+
+
+def test_figures(slam_observer, tmp_path):
+    figures = tmp_path / 'figures'
+    slam_observer.succeed('simulate', '--step', 0.1, '--duration', 20, '--plot', figures)
+    assert {path.name for path in figures.iterdir()} == {'lyapunov.png', 'configuration.png'}
+    for path in figures.iterdir():
+        assert path.read_bytes().startswith(b'\x89PNG')
+
+
+class TestSlope:
+    TIMES = np.arange(0.0, 100.0)
+
+    def test_only_what_is_above_rounding_counts(self):
+        level = np.maximum(10.0 ** (-0.5 * self.TIMES), 1e-20)
+        assert fit_slope(self.TIMES, level, 1e-19) == pytest.approx(-0.5)
+
+    def test_transient_does_not_count(self):
+        level = 10.0 ** (-0.5 * self.TIMES)
+        level[:40] *= 1e9
+        assert fit_slope(self.TIMES, level, 0.0) == pytest.approx(-0.5)
+
+    def test_nothing_to_fit(self):
+        assert fit_slope(self.TIMES[:0], self.TIMES[:0], 0.0) is None
+        assert fit_slope(self.TIMES, np.zeros(100), 0.0) is None

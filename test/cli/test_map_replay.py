@@ -1,0 +1,356 @@
+"""``slam-observer replay --map`` and ``--load-map``: one file, from one recording to the next."""
+
+from __future__ import annotations
+
+import re
+
+from command_line import CommandLine
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from tum_files import read_tum
+
+from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_file import read_map, write_map
+from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.settings.estimator_settings import Settings
+
+BODY_VELOCITY = np.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
+LANDMARKS = np.random.default_rng(0).uniform([-8, -8, -1], [8, 8, 3], (50, 3))
+POINT_NOISE_M = 0.02
+SETTINGS = ('--set', 'observation_model=cartesian', '--set', f'point_noise={POINT_NOISE_M}')
+
+
+@pytest.fixture
+def slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+def record(
+    path,
+    start,
+    seed,
+    first_id=lambda s: 0,
+    stamp_ns=lambda s: s * 10**8,
+    scale=lambda s: 1.0,
+    has_ids=True,
+    receive_ns=lambda s: s * 10**8,
+    truth=None,
+    speed_factor=1.0,
+):
+    """Write a noisy drive of 8 s that begins at ``start`` (4, 4), among 50 landmarks.
+
+    At each step ids go up from ``first_id``, and the landmarks' world is ``scale`` times as large.
+    Velocities are reported ``speed_factor`` times as large as they are.
+    Messages are received every 0.1 s, whatever their stamps, unless ``receive_ns`` says when.
+    """
+    random = np.random.default_rng(seed)
+    with RecordingWriter(path) as writer:
+        if truth is not None:
+            writer.write_landmarks(stamp_ns(0), truth)
+        for step in range(80):
+            noise = random.normal(scale=0.01, size=6)
+            velocity = VelocityEvent(stamp_ns(step), speed_factor * BODY_VELOCITY + noise)
+            writer.write_velocity(velocity, receive_stamp_ns=receive_ns(step))
+            pose = start @ se3.exp(BODY_VELOCITY * 0.1 * step)
+            writer.write_pose(PoseTruth(stamp_ns(step), pose))
+            near = np.linalg.norm(LANDMARKS - pose[:3, 3], axis=1) < 6.0
+            seen, points = np.flatnonzero(near), scale(step) * LANDMARKS
+            points = se3.transform(se3.inverse(pose), points)
+            points = points[seen] + random.normal(scale=POINT_NOISE_M, size=(len(seen), 3))
+            ids = first_id(step) + seen if has_ids else np.full(len(seen), UNKNOWN_ID)
+            observation = ObservationEvent(stamp_ns(step), ids, points)
+            writer.write_observation(observation, receive_stamp_ns=receive_ns(step))
+    return path
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path, mode):
+    first = record(tmp_path / 'first.mcap', np.eye(4), seed=1)
+    start = se3.exp(np.array([0.0, 0.1, 2.0, 1.0, -2.0, 0.5]))
+    second = record(tmp_path / 'second.mcap', start, seed=2)
+    saved, again, poses = (tmp_path / name for name in ('map.yaml', 'again.yaml', 'poses.tum'))
+    slam_observer.succeed('replay', first, '--map', saved, *SETTINGS)
+    slam_observer(
+        'replay', second, '--load-map', saved, '--map', again, '--tum', poses, *SETTINGS,
+        '--set', f'localization_mode={mode}',
+    )  # fmt: skip
+    estimate = read_tum(poses)
+    true = start @ se3.exp(BODY_VELOCITY * (estimate.stamps_ns * 1e-9)[:, None])
+    distance = np.linalg.norm(estimate.poses[:, :3, 3] - true[:, :3, 3], axis=1)
+    assert len(distance) > 70
+    assert np.median(distance) < 0.1
+    report = slam_observer('replay', second, '--load-map', saved, *SETTINGS, '--json').json
+    assert report['ate_rmse_m'] < report['unaligned_rmse_m'] < 0.15
+    known, after = read_map(saved), read_map(again)
+    assert set(known.ids) <= set(after.ids)
+    assert (len(after.ids) > len(known.ids)) == (mode == 'off')
+
+
+def test_a_mode_of_localising_without_a_map_is_told_to_have_no_effect(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    ended = slam_observer('replay', path, '--set', 'localization_mode=fixed', *SETTINGS)
+    assert ended.code == 0
+    assert "No map is loaded, so localization_mode 'fixed' has no effect" in ended.errors
+    assert '--load-map' in ended.errors
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati --smooth'])
+def test_a_mode_of_localising_has_no_effect_without_a_map(slam_observer, tmp_path, gains):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    options = (path, *SETTINGS, '--json', '--gains', *gains.split())
+    plain = slam_observer('replay', *options).json
+    fixed = slam_observer('replay', *options, '--set', 'localization_mode=fixed').json
+    assert fixed['ate_rmse_m'] == plain['ate_rmse_m']
+    assert fixed['landmark_rmse_m'] == plain['landmark_rmse_m']
+
+
+def test_a_map_keeps_the_name_of_its_frame(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    first, again = tmp_path / 'first.yaml', tmp_path / 'again.yaml'
+    slam_observer.succeed('replay', path, '--map', first, '--set', 'map_frame=hall', *SETTINGS)
+    ended = slam_observer('replay', path, '--load-map', first, '--map', again, *SETTINGS)
+    assert 'the node takes it with map_frame: hall only' in ended.errors
+    assert [read_map(file).frame_id for file in (first, again)] == ['hall', 'hall']
+
+
+def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
+    slam_observer, tmp_path
+):
+    path, saved = record(tmp_path / 'run.mcap', np.eye(4), seed=1), tmp_path / 'map.yaml'
+    report = slam_observer.succeed('replay', path, '--map', saved, '--json', *SETTINGS).json
+    assert report['unaligned_rmse_m'] is None
+    assert 0.2 < report['anees'] < 5.0
+    arguments = ('replay', path, '--load-map', saved, *SETTINGS)
+    again = slam_observer(*arguments, '--json').json
+    assert again['anees'] is None
+    assert again['ate_rmse_m'] is not None
+    assert 'ANEES' not in slam_observer(*arguments).output
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_no_anees_of_the_configuration_is_told_in_a_map_that_is_exact(
+    slam_observer, tmp_path, gains
+):
+    path, saved = tmp_path / 'run.mcap', tmp_path / 'map.yaml'
+    record(path, np.eye(4), seed=1, truth=LandmarkTruth(np.arange(50), LANDMARKS))
+    slam_observer.succeed('replay', path, '--map', saved, *SETTINGS)
+    arguments = ('replay', path, '--load-map', saved, '--gains', gains, '--json', *SETTINGS)
+    uncertain = slam_observer(*arguments, '--set', 'localization_mode=uncertain').json
+    assert uncertain['configuration_anees'] is not None
+    fixed = slam_observer(*arguments, '--set', 'localization_mode=fixed').json
+    assert fixed['configuration_anees'] is None
+    assert fixed['configuration_rmse_m'] is not None
+
+
+def test_covariances_of_a_smoothed_map_are_those_in_hindsight(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    smoothed, looked_back = tmp_path / 'smoothed.yaml', tmp_path / 'looked_back.yaml'
+    slam_observer.succeed('replay', path, '--smooth', '--map', smoothed, *SETTINGS)
+    at_the_end = ('--set', 'hindsight_interval=80', '--set', 'hindsight_turn=0')
+    slam_observer.succeed('replay', path, '--map', looked_back, *SETTINGS, *at_the_end)
+    online, exact = read_map(smoothed), read_map(looked_back)
+    np.testing.assert_array_equal(online.ids, exact.ids)
+    assert_allclose(
+        np.trace(online.covariances, axis1=1, axis2=2),
+        np.trace(exact.covariances, axis1=1, axis2=2),
+        rtol=0.15,
+    )
+
+
+def test_a_map_that_cannot_be_read_is_refused_before_anything_is_done(slam_observer, tmp_path):
+    recording = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    missing = tmp_path / 'no.yaml'
+    error = slam_observer.fail('replay', recording, '--load-map', missing)
+    assert f"can't read map {missing}: No such file or directory" in error
+
+
+class TestPlaceNotKnown:
+    """In a map of the landmarks, which have other ids some of the time."""
+
+    @pytest.fixture
+    def saved(self, tmp_path):
+        covariances = np.tile(1e-4 * np.eye(3), (50, 1, 1))
+        surveyed = LandmarkMap(np.arange(50), LANDMARKS, covariances, np.zeros(50, dtype=np.int64))
+        write_map(tmp_path / 'map.yaml', surveyed, Settings())
+        return tmp_path / 'map.yaml'
+
+    @pytest.mark.parametrize('more', [(), ('--smooth',)])
+    def test_a_place_never_found_leaves_nothing_but_the_reason(
+        self, slam_observer, tmp_path, saved, more
+    ):
+        other = record(tmp_path / 'other.mcap', np.eye(4), seed=2, first_id=lambda step: 100)
+        poses, figures, before = tmp_path / 'poses.tum', tmp_path / 'figures', saved.read_bytes()
+        error = slam_observer.fail(
+            'replay', other, '--load-map', saved, '--map', saved, '--tum', poses, '--force',
+            '--plot', figures, *SETTINGS, *more,
+        )  # fmt: skip
+        for text in (str(saved), 'not found', 'three of its landmarks', '0 of its 50'):
+            assert text in error
+        assert saved.read_bytes() == before
+        assert not poses.exists()
+        assert not figures.exists()
+
+    def test_a_start_that_is_told_takes_no_ids(self, slam_observer, tmp_path, saved):
+        start = se3.exp(np.array([0.0, 0.0, 1.0, 1.0, -2.0, 0.0]))
+        path = record(tmp_path / 'run.mcap', start, seed=2, has_ids=False)
+        poses = tmp_path / 'poses.tum'
+        arguments = (
+            'replay', path, '--load-map', saved, '--tum', poses, '--force', *SETTINGS,
+            '--set', 'localization_mode=fixed',
+        )  # fmt: skip
+        assert '--set set_initial_pose=true' in slam_observer.fail(*arguments)
+        x, y, z = (start[:3, 3] + [0.2, -0.1, 0.0]).tolist()
+        told = ('--set', f'initial_position=[{x},{y},{z}]', '--set', 'initial_yaw=0.9')
+        arguments += ('--set', 'set_initial_pose=true', *told)
+        assert slam_observer(*arguments, '--json').json['localised_after_s'] == 0.0
+        assert 'given at the start' in slam_observer(*arguments).output
+        estimate = read_tum(poses)
+        true = start @ se3.exp(BODY_VELOCITY * (estimate.stamps_ns * 1e-9)[:, None])
+        assert_allclose(estimate.poses[1:], true[1:], atol=0.1)
+
+    def test_a_start_that_is_told_is_of_no_use_without_points(
+        self, slam_observer, tmp_path, saved
+    ):
+        path = record(tmp_path / 'run.mcap', np.eye(4), seed=2, has_ids=False)
+        again = tmp_path / 'again.yaml'
+        arguments = (
+            'replay', path, '--load-map', saved, '--map', again, *SETTINGS, '--gains', 'constant'
+        )  # fmt: skip
+        ended = slam_observer(*arguments)
+        assert ended.code == 2
+        assert 'points without id take --gains riccati' in ended.errors
+        ended = slam_observer(*arguments, '--set', 'set_initial_pose=true')
+        assert ended.code == 2
+        assert 'no observation was used' in ended.errors
+        assert 'points without id' in ended.errors
+        assert not again.exists()
+
+    def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
+        late = record(tmp_path / 'late.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s < 40))
+        poses = tmp_path / 'poses.tum'
+        arguments = ('replay', late, '--load-map', saved, '--force', '--tum', poses, *SETTINGS)
+        report = slam_observer(*arguments, '--json').json
+        assert report['localised_after_s'] == pytest.approx(4.0, abs=0.3)
+        assert read_tum(poses).stamps_ns[0] * 1e-9 == report['localised_after_s']
+        assert (
+            f'found after {report["localised_after_s"]:.1f} s' in slam_observer(*arguments).output
+        )
+
+    def test_more_rejections_than_a_sensor_has_outliers_are_told(
+        self, slam_observer, tmp_path, saved
+    ):
+        growing = record(
+            tmp_path / 'run.mcap', np.eye(4), seed=2, scale=lambda s: 3.0 if s % 4 else 1.0
+        )
+        ended = slam_observer('replay', growing, *SETTINGS)
+        assert re.search('[0-9]+ % of the points were rejected: look at the signs', ended.errors)
+
+    def test_a_scale_that_nobody_can_mean_is_told(self, slam_observer, tmp_path, saved):
+        twice = record(tmp_path / 'run.mcap', np.eye(4), seed=2, speed_factor=2.0)
+        stated = '--set', 'linear_scale_error=[0.05,0.0,0.0]'
+        ended = slam_observer('replay', twice, *SETTINGS, *stated)
+        assert re.search(r'linear_scale_x is [\d.]+, \d+ times its stated error', ended.errors)
+
+    def test_a_place_lost_at_the_end_gives_poses_but_no_map(self, slam_observer, tmp_path, saved):
+        misled = record(
+            tmp_path / 'misled.mcap', np.eye(4), seed=2, scale=lambda s: 10.0 if s >= 40 else 1.0
+        )
+        poses, again = tmp_path / 'poses.tum', tmp_path / 'again.yaml'
+        arguments = (
+            'replay', misled, '--load-map', saved, '--tum', poses, *SETTINGS,
+            '--set', 'localization_mode=uncertain',
+        )  # fmt: skip
+        refused = slam_observer(*arguments, '--map', again)
+        assert refused.code == 2
+        assert ', and not found again' in refused.errors
+        assert not again.exists()
+        ended = slam_observer(*arguments, '--force')
+        assert ended.code == 0
+        assert ', and not found again' in ended.errors
+        assert 40 <= len(read_tum(poses)) < 50
+
+
+def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
+    path = record(
+        tmp_path / 'run.mcap', np.eye(4), seed=1,
+        stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 40),
+    )  # fmt: skip
+    saved = tmp_path / 'map.yaml'
+    hold = ('--smooth', '--set', 'on_time_jump=hold', *SETTINGS)
+    jumped = slam_observer('replay', path, '--map', saved, *hold)
+    assert 'those since the clock jumped' in jumped.errors
+    loaded = slam_observer('replay', path, '--load-map', saved, '--smooth', *SETTINGS)
+    assert 'those since the place in the loaded map was found' in loaded.errors
+    assert 'hindsight_window' not in jumped.errors + loaded.errors
+
+
+@pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+def test_points_of_no_landmark_of_a_map_that_does_not_grow_are_told(slam_observer, tmp_path, mode):
+    """The map is of some twenty landmarks, whose ids are shared; of others they go up from 100."""
+    first = record(tmp_path / 'first.mcap', np.eye(4), seed=1)
+    second = record(tmp_path / 'second.mcap', np.eye(4), 2, lambda s: 0 if s < 10 else 100)
+    saved = tmp_path / 'map.yaml'
+    slam_observer.succeed('replay', first, '--map', saved, *SETTINGS)
+    told = slam_observer(
+        'replay', second, '--load-map', saved, *SETTINGS,
+        '--set', f'localization_mode={mode}', '--set', 'set_initial_pose=true',
+    ).errors  # fmt: skip
+    is_told = 'of the points are of no landmark of the map: is it the map of this place' in told
+    assert is_told == (mode != 'off')
+    assert ('did the robot start where it was said to' in told) == is_told
+
+
+def test_smoothing_tells_that_landmarks_had_to_make_room(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    limited = ('--smooth', '--set', 'max_landmarks=30', *SETTINGS)
+    told = slam_observer('replay', path, *limited).errors
+    assert 'those since landmarks had to make room (max_landmarks)' in told
+    window = ('--set', 'hindsight_window=10', '--set', 'hindsight_interval=1')
+    told = slam_observer('replay', path, *limited, *window).errors
+    assert 'those since the history was cut (hindsight_window=0 keeps all of it)' in told
+
+
+def test_nothing_to_smooth_is_an_error_and_writes_nothing(slam_observer, tmp_path):
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
+    window = ('--set', 'hindsight_window=1', '--set', 'hindsight_interval=1')
+    outputs = ('--smooth', '--tum', tmp_path / 'smoothed.tum')
+    told = slam_observer.fail('replay', path, *outputs, *window, *SETTINGS)
+    assert 'nothing to smooth: no observation since the history was cut' in told
+    assert not (tmp_path / 'smoothed.tum').exists()
+
+
+def test_a_silence_of_the_sensors_is_no_jump_of_the_clock(slam_observer, tmp_path):
+    def late(step):
+        return 10**8 * step + 12 * 10**9 * (step >= 50)
+
+    path = record(tmp_path / 'run.mcap', np.eye(4), seed=1, stamp_ns=late, receive_ns=late)
+    ended = slam_observer('replay', path, '--tum', tmp_path / 'poses.tum', *SETTINGS)
+    assert ended.code == 0
+    assert 'The clock has jumped' not in ended.errors
+    assert read_tum(tmp_path / 'poses.tum').stamps_ns[0] < 10**9
+
+
+@pytest.mark.parametrize('resets', [True, False])
+def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_told(
+    slam_observer, tmp_path, resets
+):
+    path = record(
+        tmp_path / 'run.mcap', np.eye(4), seed=1, stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 50)
+    )
+    poses = tmp_path / 'poses.tum'
+    jump = 'reset' if resets else 'hold'
+    ended = slam_observer(
+        'replay', path, '--tum', poses, '--json', '--set', f'on_time_jump={jump}', *SETTINGS
+    )
+    assert ended.errors.count('The clock has jumped after 4.900 s') == 1
+    assert ('on_time_jump: hold' in ended.errors) == resets
+    assert ('after the last jump of the clock (1 in all)' in ended.errors) == resets
+    assert (read_tum(poses).stamps_ns[0] > 10**12) == resets
+    if resets:
+        assert ended.json['ate_rmse_m'] < 0.05
+        assert ended.json['dead_reckoning_ate_rmse_m'] < 0.2
+        assert ended.json['anees'] < 5.0

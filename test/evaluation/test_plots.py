@@ -1,0 +1,373 @@
+"""Figures are written, show something, and change no setting of matplotlib's."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+import numpy as np
+import pytest
+
+from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.plots import map_plot, replay_plots, simulation_plots
+from slam_observer_ros.evaluation.plots.drawing import BLUE, GREEN, GREY, RED
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.evaluation.truth import LandmarkTruth
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID
+from slam_observer_ros.geometry import se3
+
+LANDMARKS = np.array([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, -4.0, 0.0]])
+IDS = np.arange(4)
+SECONDS = np.linspace(0.0, 30.0, 200)
+
+
+@pytest.fixture(params=[0.0, 2.0], ids=['flat', 'space'])
+def truth(request: pytest.FixtureRequest) -> Trajectory:
+    twist = np.array([0.0, 0.0, 0.2, 1.0, 0.0, request.param / 30.0])
+    return Trajectory((SECONDS * 1e9).astype(np.int64), se3.exp(SECONDS[:, None] * twist))
+
+
+@pytest.fixture
+def estimate(truth: Trajectory) -> Trajectory:
+    bias = np.exp(-0.3 * SECONDS)[:, None] * [0.0, 0.0, 0.2, 0.5, 0.3, 0.0]
+    return Trajectory(truth.stamps_ns, truth.poses @ se3.exp(bias))
+
+
+def pixels_of(path: Path) -> Any:
+    """Return the colours (height, width) of a picture, 0xRRGGBB."""
+    return (imread(path)[..., :3] * 255.0).round().astype(np.int64) @ [1 << 16, 1 << 8, 1]
+
+
+def colours(path: Path) -> set[int]:
+    """Colours (0xRRGGBB) that cover a visible part of a picture."""
+    values, counts = np.unique(pixels_of(path), return_counts=True)
+    return set(values[counts > 20].tolist())
+
+
+def rgb(colour: str) -> int:
+    return int(colour.removeprefix('#'), 16)
+
+
+def test_lyapunov_function(tmp_path: Path) -> None:
+    values = np.append(-0.2 * SECONDS[:-1], -np.inf)
+    path = simulation_plots.plot_lyapunov(
+        tmp_path / 'lyapunov.png', SECONDS, values, slope_per_s=-0.2
+    )
+    assert {rgb(BLUE), rgb(GREY)} <= colours(path)
+
+
+def test_lyapunov_function_that_is_zero_throughout(tmp_path: Path) -> None:
+    path = simulation_plots.plot_lyapunov(
+        tmp_path / 'zero.png', SECONDS, np.full(200, -np.inf), -0.2
+    )
+    assert path.stat().st_size > 0
+
+
+def test_configuration(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
+    tracks = LANDMARKS + np.exp(-0.3 * SECONDS)[:, None, None]
+    tracks[:20, 1] = np.nan
+    path = simulation_plots.plot_configuration(
+        tmp_path / 'paths.png', estimate, truth, tracks, LANDMARKS
+    )
+    assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
+
+
+@pytest.mark.parametrize('height_m', [0.0, 3.0], ids=['flat', 'space'])
+def test_legend_of_a_configuration_covers_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, height_m: float
+) -> None:
+    saved: list[Figure] = []
+    monkeypatch.setattr(simulation_plots, 'save', lambda figure, _path: saved.append(figure))
+    poses = se3.exp(SECONDS[:, None] * np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0]))
+    circle = Trajectory((SECONDS * 1e9).astype(np.int64), poses)
+    points = LANDMARKS + np.array([0.0, 0.0, height_m]) * np.array([[1.0], [-1.0], [1.0], [-1.0]])
+    tracks = np.tile(points, (200, 1, 1))
+    simulation_plots.plot_configuration(tmp_path / 'a.png', circle, circle, tracks, points)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    (axes,) = figure.axes
+    drawn = axes.get_tightbbox()
+    assert drawn is not None
+    assert not legend.get_window_extent().overlaps(drawn)
+
+
+def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -> None:
+    crowded = np.linspace(0.0, 2.0, 30)[:, None] * np.array([1.0, 0.2, 0.0])
+    numbers = np.arange(30) + 12345
+    labelled = map_plot.plot_map(tmp_path / 'a.png', estimate, numbers, crowded)
+    unnamed = numbers + FIRST_AUTOMATIC_ID
+    bare = map_plot.plot_map(tmp_path / 'b.png', estimate, unnamed, crowded)
+    green, bare_green = (int(np.sum(pixels_of(path) == rgb(GREEN))) for path in (labelled, bare))
+    # Where edges of markers overlap, what is below them may change a pixel's last bit.
+    assert green == pytest.approx(bare_green, rel=2e-3)
+    assert np.any(pixels_of(labelled) != pixels_of(bare))
+
+
+@pytest.fixture
+def saved(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Figures of a replay, which are kept here and not written."""
+    figures: list[Figure] = []
+    for module in (map_plot, replay_plots):
+        monkeypatch.setattr(module, 'save', lambda figure, _path: figures.append(figure))
+    return figures
+
+
+def corridor() -> tuple[Trajectory, FloatArray]:
+    """A path along 100 m, and 60 landmarks no more than 2 m beside it."""
+    generator = np.random.default_rng(1)
+    spread = generator.uniform([0.0, -2.0, 0.0], [100.0, 2.0, 0.0], (60, 3))
+    along = SECONDS[:, None] * np.array([0.0, 0.0, 0.0, 100.0 / 30.0, 0.0, 0.0])
+    return Trajectory((SECONDS * 1e9).astype(np.int64), se3.exp(along)), spread
+
+
+@pytest.mark.parametrize('height_m', [0.0, 40.0], ids=['flat', 'space'])
+def test_labels_of_a_map_hit_nothing(tmp_path: Path, saved: list[Figure], height_m: float) -> None:
+    path, points = corridor()
+    poses = path.poses.copy()
+    poses[:, 2, 3] = np.linspace(0.0, height_m, len(poses))
+    estimate = Trajectory(path.stamps_ns, poses)
+    known = LandmarkTruth(np.arange(60) + 100, points + [1.0, 0.3, 0.0])
+    map_plot.plot_map(tmp_path / 'a.png', estimate, known.ids, points, estimate, known)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    boxes = [label.get_window_extent() for label in axes.texts]
+    assert len(boxes) > 15
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    assert all(
+        axes.bbox.containsx(x) and axes.bbox.containsy(y) for a in boxes for x, y in a.corners()
+    )
+    markers = axes.transData.transform(np.concatenate([points, known.world_points])[:, :2])
+    radius = 4.5 * figure.dpi / 72.0
+    for box in boxes:
+        nearest = np.clip(markers, box.min, box.max)
+        assert np.linalg.norm(markers - nearest, axis=1).min() > radius
+
+
+def test_labels_of_a_map_stand_beside_their_landmarks(
+    tmp_path: Path, saved: list[Figure], estimate: Trajectory
+) -> None:
+    map_plot.plot_map(tmp_path / 'a.png', estimate, IDS, LANDMARKS)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    labels = {int(label.get_text()): label for label in figure.axes[0].texts}
+    assert sorted(labels) == IDS.tolist()
+    for number, point in zip(IDS.tolist(), LANDMARKS, strict=True):
+        box = labels[number].get_window_extent()
+        place = figure.axes[0].transData.transform(point[:2])
+        apart = np.linalg.norm(place - np.clip(place, box.min, box.max))
+        assert apart < 10.0 * figure.dpi / 72.0
+
+
+def test_a_line_leads_from_each_landmark_to_its_truth(
+    tmp_path: Path, saved: list[Figure], estimate: Trajectory
+) -> None:
+    ids, points = np.array([7, 3, 5]), LANDMARKS[:3] + 0.2
+    known = LandmarkTruth(np.array([5, 6, 7]), LANDMARKS[[2, 3, 0]])
+    map_plot.plot_map(tmp_path / 'a.png', estimate, ids, points, estimate, known)
+    for axes in saved[0].axes:
+        lines = np.concatenate([np.empty((0, 2)), *(line.get_xydata() for line in axes.lines)])
+        both = [np.r_[a, b] for a, b in pairwise(lines)]
+        columns = ['xyz'.index(label[0]) for label in (axes.get_xlabel(), axes.get_ylabel())]
+        for row, true_row, is_joined in [(0, 0, True), (2, 2, True), (1, 3, False)]:
+            wanted = np.r_[points[row, columns], LANDMARKS[true_row, columns]]
+            assert any(np.allclose(pair, wanted) for pair in both) is is_joined
+
+
+def legend_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_legend_of_a_map_names_what_there_is(
+    tmp_path: Path, saved: list[Figure], estimate: Trajectory, truth: Trajectory
+) -> None:
+    nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    map_plot.plot_map(tmp_path / 'a.png', estimate, *nothing, truth, LandmarkTruth(*nothing))
+    map_plot.plot_map(tmp_path / 'a.png', estimate, IDS, LANDMARKS)
+    path = ['estimated path', 'start', 'end']
+    assert legend_of(saved[0]) == ['true path', *path]
+    assert legend_of(saved[1]) == [*path, 'estimated landmarks']
+
+
+@pytest.mark.parametrize('in_hindsight', [False, True])
+def test_a_title_tells_what_is_in_hindsight(
+    tmp_path: Path,
+    saved: list[Figure],
+    estimate: Trajectory,
+    truth: Trajectory,
+    in_hindsight: bool,
+) -> None:
+    errors = trajectory_errors(estimate, truth)
+    plot: Any = map_plot.plot_map
+    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, in_hindsight=in_hindsight)
+    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, truth, in_hindsight=in_hindsight)
+    replay_plots.plot_errors(tmp_path / 'a.png', errors, in_hindsight=in_hindsight)
+    titles = [figure.texts[0].get_text() for figure in saved[:2]]
+    titles.append(saved[2].axes[0].get_title('left'))
+    assert [('in hindsight' in title) for title in titles] == [in_hindsight] * 3
+    assert [('after rigid alignment' in title) for title in titles] == [False, True, True]
+
+
+def test_map_with_truth(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
+    known = LandmarkTruth(IDS, LANDMARKS)
+    path = map_plot.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS + 0.2, truth, known)
+    assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
+
+
+def test_map_without_truth(tmp_path: Path, estimate: Trajectory) -> None:
+    path = map_plot.plot_map(tmp_path / 'map.png', estimate, IDS, LANDMARKS)
+    assert rgb(BLUE) not in colours(path)
+    assert {rgb(RED), rgb(GREEN)} <= colours(path)
+
+
+def test_map_of_a_robot_that_saw_and_did_nothing(tmp_path: Path) -> None:
+    standing = Trajectory(np.array([0]), np.eye(4)[None])
+    empty = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    assert rgb(RED) in colours(map_plot.plot_map(tmp_path / 'map.png', standing, *empty))
+
+
+@pytest.mark.parametrize('landmarks', [0, 4])
+def test_map_without_a_path(tmp_path: Path, landmarks: int) -> None:
+    nowhere = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)))
+    ids, points = IDS[:landmarks], LANDMARKS[:landmarks]
+    assert map_plot.plot_map(tmp_path / 'map.png', nowhere, ids, points).exists()
+
+
+def test_errors(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None:
+    errors = trajectory_errors(estimate, truth)
+    path = replay_plots.plot_errors(tmp_path / 'errors.png', errors)
+    assert rgb(RED) in colours(path)
+    assert rgb(GREEN) not in colours(path)
+    configuration = ConfigurationError([0, 10**9], [0.1, 0.2])
+    covariances = np.tile(0.01 * np.eye(6), (200, 1, 1))
+    path = replay_plots.plot_errors(tmp_path / 'bands.png', errors, covariances, configuration)
+    assert {rgb(RED), rgb(GREEN)} <= colours(path)
+
+
+@pytest.mark.parametrize('in_known_map', [False, True])
+def test_a_wide_band_does_not_hide_the_errors(
+    tmp_path: Path,
+    saved: list[Figure],
+    estimate: Trajectory,
+    truth: Trajectory,
+    in_known_map: bool,
+) -> None:
+    errors = trajectory_errors(estimate, truth)
+    covariances = np.tile(100.0 * np.eye(6), (200, 1, 1))
+    name = tmp_path / 'a.png'
+    replay_plots.plot_errors(name, errors, covariances, in_known_map=in_known_map)
+    largest = np.abs(errors.errors).max(axis=0)
+    x, y, *_, heading = saved[0].axes
+    for axes, size in ((x, largest[3]), (y, largest[4]), (heading, np.degrees(largest[2]))):
+        low, high = axes.get_ylim()
+        assert low == -high
+        assert size < high < 3.0 * size
+    legend = x.get_legend()
+    assert legend is not None
+    frame = 'in the frame of the map' if in_known_map else 'relative to the first pose'
+    assert frame in legend.get_texts()[0].get_text()
+
+
+def test_errors_are_not_joined_across_a_time_without_any(
+    tmp_path: Path, estimate: Trajectory, truth: Trajectory
+) -> None:
+    whole = replay_plots.plot_errors(tmp_path / 'whole.png', trajectory_errors(estimate, truth))
+    ends = np.r_[0:20, 180:200]
+    seen = Trajectory(estimate.stamps_ns[ends], estimate.poses[ends])
+    gap = replay_plots.plot_errors(tmp_path / 'gap.png', trajectory_errors(seen, truth))
+
+    def drawn_in_the_middle(path: Path) -> bool:
+        pixels = pixels_of(path)
+        width = pixels.shape[1]
+        return bool(np.any(pixels[:, width // 2 - 20 : width // 2 + 20] == rgb(RED)))
+
+    assert drawn_in_the_middle(whole)
+    assert not drawn_in_the_middle(gap)
+
+
+@pytest.mark.parametrize('dropped', [{}, {'not_finite': 3, 'duplicate': 40}])
+def test_residuals(tmp_path: Path, dropped: dict[str, int]) -> None:
+    residuals = np.random.default_rng(0).normal(size=(500, 3))
+    stamps_ns = np.arange(500) * 10**8
+    rejected = np.zeros(500, dtype=bool)
+    drawn = tmp_path / 'residuals.png'
+    replay_plots.plot_residuals(drawn, stamps_ns, residuals, rejected, dropped, 1_000)
+    assert rgb(RED) not in colours(drawn)
+    assert (rgb(BLUE) in colours(drawn)) is bool(dropped)
+    rejected[::50] = True
+    replay_plots.plot_residuals(drawn, stamps_ns, residuals, rejected, dropped, 1_000)
+    assert rgb(RED) in colours(drawn)
+
+
+@pytest.mark.parametrize('are_there', [False, True])
+def test_bars_of_dropped_events_are_thin(
+    tmp_path: Path, saved: list[Figure], are_there: bool
+) -> None:
+    number = 500 if are_there else 0
+    stamps_ns, rejected = np.arange(number) * 10**8, np.zeros(number, dtype=bool)
+    reasons = {f'reason_{i}': 10 + i for i in range(9)}
+    for dropped in ({'no_transform': 31}, reasons):
+        name = tmp_path / 'a.png'
+        replay_plots.plot_residuals(name, stamps_ns, np.ones((number, 3)), rejected, dropped, 900)
+        figure = saved[-1]
+        figure.draw_without_rendering()
+        assert len(figure.axes) == 1 + are_there
+        bars = figure.axes[-1].patches
+        assert len(bars) == len(dropped)
+        heights_in = [bar.get_window_extent().height / figure.dpi for bar in bars]
+        assert heights_in == pytest.approx([0.15] * len(bars), abs=0.05)
+
+
+def test_legend_of_residuals_is_one_row_beside_the_title(
+    tmp_path: Path, saved: list[Figure]
+) -> None:
+    residuals, rejected = np.ones((500, 3)), np.arange(500) % 10 == 0
+    stamps_ns = np.arange(500) * 10**8
+    replay_plots.plot_residuals(tmp_path / 'a.png', stamps_ns, residuals, rejected, {}, 123_456)
+    (figure,) = saved
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    legend = axes.get_legend()
+    assert legend is not None
+    crosses, median = legend.get_texts()
+    assert crosses.get_text() == '50 rejected by the gate'
+    assert crosses.get_window_extent().y0 == pytest.approx(median.get_window_extent().y0, abs=3.0)
+    title = next(child for child in axes.get_children() if 'none of' in str(child))
+    assert not legend.get_window_extent().overlaps(title.get_window_extent())
+
+
+def test_residuals_of_a_run_without_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved: list[Figure] = []
+    monkeypatch.setattr(replay_plots, 'save', lambda figure, _path: saved.append(figure))
+    empty = np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=bool)
+    replay_plots.plot_residuals(tmp_path / 'none.png', *empty, {}, 0)
+    (axes,) = saved[0].axes
+    assert [text.get_text() for text in axes.texts] == ['no residuals']
+    assert len(axes.get_xticks()) == len(axes.get_yticks()) == 0
+
+
+def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match='absent'):
+        simulation_plots.plot_lyapunov(tmp_path / 'absent' / 'a.png', SECONDS, -SECONDS)
+
+
+def test_matplotlibs_settings_and_backend_stay_as_they_were(tmp_path: Path) -> None:
+    before = dict(mpl.rcParams)
+    simulation_plots.plot_lyapunov(tmp_path / 'lyapunov.png', SECONDS, -SECONDS)
+    assert dict(mpl.rcParams) == before
+    module = 'slam_observer_ros.evaluation.plots.replay_plots'
+    program = f"import sys, {module}; print('matplotlib.pyplot' in sys.modules)"
+    result = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert result.stdout.strip() == 'False'

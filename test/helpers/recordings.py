@@ -1,0 +1,131 @@
+"""One small run, written in every format that recordings come in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import ros_messages as ros
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.typesys import get_typestore, Stores
+
+from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
+from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.recording.writer import RecordingWriter
+
+STEP_NS = 20_000_000
+LANDMARKS = LandmarkTruth(np.array([3, 5, 9]), np.arange(9.0).reshape(3, 3))
+MESSAGE_COUNT = 100
+
+
+def stamps_ns() -> range:
+    """Stamps of the run's velocities, every other one with an observation."""
+    return range(ros.STAMP_NS, ros.STAMP_NS + MESSAGE_COUNT * STEP_NS, STEP_NS)
+
+
+def events() -> list[Event]:
+    """Drive straight on at 1/8 m a step, past the landmarks: numbers that float32 holds."""
+    made: list[Event] = []
+    for index, stamp_ns in enumerate(stamps_ns()):
+        made.append(VelocityEvent(stamp_ns, np.array([0.0, 0.0, 0.0, 6.25, 0.0, 0.0])))
+        if index % 2 == 0:
+            points = LANDMARKS.world_points - np.array([index / 8, 0.0, 0.0])
+            made.append(ObservationEvent(stamp_ns, LANDMARKS.ids, points))
+    return made
+
+
+def true_poses() -> list[PoseTruth]:
+    """The run's true poses."""
+    return [
+        PoseTruth(stamp_ns, se3.exp(np.array([0.0, 0.0, 0.0, 0.125, 0.0, 0.0]) * index))
+        for index, stamp_ns in enumerate(stamps_ns())
+    ]
+
+
+def write_mcap(path: Path) -> Path:
+    """Write the run as the package does."""
+    with RecordingWriter(path) as writer:
+        writer.write_landmarks(ros.STAMP_NS, LANDMARKS)
+        for event in events():
+            if isinstance(event, VelocityEvent):
+                writer.write_velocity(event)
+            else:
+                writer.write_observation(event)
+        for truth in true_poses():
+            writer.write_pose(truth)
+    return path
+
+
+def messages() -> Iterator[tuple[str, int, object]]:
+    """Topic, receive time and message of the run, with a PointCloud and unstamped Twists."""
+    cloud = ros.point_cloud(LANDMARKS.world_points, {'id': LANDMARKS.ids})
+    yield '/ground_truth/landmarks', ros.STAMP_NS, cloud
+    for event in events():
+        if isinstance(event, VelocityEvent):
+            yield '/twist', event.stamp_ns, ros.twist(event.body_velocity.tolist())
+        else:
+            cloud = ros.point_cloud(event.points, {'id': event.ids})
+            cloud.header.stamp.sec, cloud.header.stamp.nanosec = divmod(
+                event.stamp_ns, 1_000_000_000
+            )
+            yield '/landmarks', event.stamp_ns, cloud
+
+
+def write_rosbag2(
+    directory: Path, storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE
+) -> Path:
+    """Write the run as a rosbag2 directory."""
+    bag = rosbag2.Writer(directory, version=9, storage_plugin=storage)
+    bag.set_compression(compression, CompressionFormat.ZSTD)
+    with bag:
+        connections = {}
+        for topic, stamp_ns, message in messages():
+            if topic not in connections:
+                connections[topic] = bag.add_connection(
+                    topic, message.__msgtype__, typestore=ros.TYPESTORE
+                )
+            bag.write(connections[topic], stamp_ns, ros.serialise(message))
+    return directory
+
+
+def write_rosbag1(path: Path) -> Path:
+    """Write the run as a ROS 1 .bag, which begins with a message of a type that ROS 2 lacks."""
+    typestore = get_typestore(Stores.ROS1_NOETIC)
+    with rosbag1.Writer(path) as bag:
+        log_type = 'rosgraph_msgs/msg/Log'
+        rosout = bag.add_connection('/rosout', log_type, typestore=typestore)
+        bag.write(rosout, ros.STAMP_NS, b'')
+        connections = {}
+        for topic, stamp_ns, message in messages():
+            if topic not in connections:
+                connections[topic] = bag.add_connection(
+                    topic, message.__msgtype__, typestore=typestore
+                )
+            if hasattr(message, 'header'):
+                stamped = typestore.types['std_msgs/msg/Header']
+                message.header = stamped(
+                    seq=0, stamp=message.header.stamp, frame_id=message.header.frame_id
+                )
+            bag.write(
+                connections[topic],
+                stamp_ns,
+                typestore.serialize_ros1(message, message.__msgtype__),
+            )
+    return path
+
+
+def write_all_formats(directory: Path) -> dict[str, Path]:
+    """Write the run in each format; return the paths by format."""
+    sqlite = write_rosbag2(directory / 'sqlite', StoragePlugin.SQLITE3)
+    mcap = write_rosbag2(directory / 'mcap', StoragePlugin.MCAP)
+    return {
+        'mcap file': mcap / 'mcap.mcap',
+        'mcap directory': mcap,
+        'sqlite3 file': next(sqlite.glob('*.db3')),
+        'sqlite3 directory': sqlite,
+        'ROS 1 bag': write_rosbag1(directory / 'run.bag'),
+        'own mcap': write_mcap(directory / 'own.mcap'),
+    }

@@ -1,0 +1,175 @@
+"""Velocities whose frame /tf does not know yet, and what waits for its transform."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+
+from slam_observer_ros.common.errors import TransformError
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.inputs.event_builder import drop_reason, EventBuilder, MAX_WAITING
+from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.detections import TagDetections
+from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
+from slam_observer_ros.sensor_models.extrinsics import move_velocity
+from slam_observer_ros.settings.input_settings import InputSettings
+
+MS = 1_000_000
+V = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])
+WHEEL = se3.from_rpy((0.3, 0.1, 0.0, 0.0, 0.0, np.pi))
+
+
+class Wheel:
+    """Sends a velocity every 20 ms; its transform goes into ``transforms``."""
+
+    def __init__(self, transform_timeout):
+        self.transforms = TransformBuffer()
+        frame = BaseFrame(InputSettings(), self.transforms)
+        self.builder = EventBuilder(frame, transform_timeout, 0.5, on_drop=None)
+        self.now_ns = 0
+
+    def send(self, count):
+        """Return the events of the next messages."""
+        events = []
+        for _ in range(count):
+            self.now_ns += 20 * MS
+            events += self.builder.retry(self.now_ns)
+            message = Measurement('wheel', VelocityEvent(self.now_ns, V))
+            events += self.builder.add(message, self.now_ns)
+        return events
+
+    def place(self, stamp_ns):
+        self.transforms.insert('base_link', 'wheel', stamp_ns, WHEEL)
+
+
+def of_base(stamp_ns):
+    return move_velocity(VelocityEvent(stamp_ns, V), WHEEL).body_velocity
+
+
+@pytest.fixture
+def log(caplog):
+    caplog.set_level(logging.INFO, 'slam_observer_ros')
+    return caplog
+
+
+@pytest.mark.parametrize('timeout_s', [0.0, 0.1])
+def test_a_velocitys_frame_that_was_taken_for_the_base_is_used_once_tf_has_it(timeout_s, log):
+    wheel = Wheel(timeout_s)
+    events = wheel.send(20)
+    assert len(events) == 20
+    assert_array_equal([event.body_velocity for event in events], [V] * 20)
+    wheel.transforms.insert('base_link', 'wheel', 0, WHEEL, is_static=True)
+    events = wheel.send(3)
+    assert [event.stamp_ns for event in events] == [420 * MS, 440 * MS, 460 * MS]
+    assert_array_equal(events[0].body_velocity, of_base(420 * MS))
+    assert_array_equal([event.body_velocity for event in events], [of_base(0)] * 3)
+    assert [record.levelname for record in log.records] == ['WARNING', 'INFO']
+    assert "frame 'wheel' are brought into 'base_link' from now on" in log.text
+
+
+def test_velocities_wait_again_for_a_late_transform_that_has_begun_to_come(log):
+    wheel = Wheel(0.1)
+    events = wheel.send(20)
+    for _ in range(20):
+        wheel.place(wheel.now_ns - 30 * MS)
+        events += wheel.send(1)
+    stamps_ns = [event.stamp_ns for event in events]
+    assert stamps_ns == list(range(20 * MS, 20 * MS * (len(events) + 1), 20 * MS))
+    assert len(events) >= 37
+    assert_array_equal(events[20].body_velocity, V)
+    assert_array_equal(events[-1].body_velocity, of_base(0))
+    assert [record.levelname for record in log.records] == ['WARNING', 'INFO']
+
+
+def test_a_transform_that_always_comes_too_late_changes_nothing(log):
+    wheel = Wheel(0.1)
+    events = []
+    for _ in range(40):
+        wheel.place(wheel.now_ns - 150 * MS)
+        events += wheel.send(1)
+    assert_array_equal([event.body_velocity for event in events], [V] * len(events))
+    assert [record.levelname for record in log.records] == ['WARNING']
+
+
+def test_what_too_many_wait_behind_is_dropped_and_told():
+    drops = []
+    transforms = TransformBuffer()
+    builder = EventBuilder(BaseFrame(InputSettings(), transforms), 10.0, 0.5, drops.append)
+    for k in range(MAX_WAITING + 3):
+        observation = ObservationEvent(k * MS, np.array([1]), np.ones((1, 3)))
+        frame = 'lidar' if k == MAX_WAITING else 'camera'
+        assert not builder.add(Measurement(frame, observation), k * MS)
+    assert not builder.retry(MAX_WAITING * MS)
+    assert len(drops) == 3
+    assert f'more than {MAX_WAITING} measurements wait' in str(drops[0])
+    assert "'camera' and 'base_link' are not connected" in str(drops[0])
+    for frame in ('camera', 'lidar'):
+        transforms.insert('base_link', frame, 0, WHEEL, is_static=True)
+    events = builder.finish()
+    assert [event.stamp_ns for event in events] == [k * MS for k in range(3, MAX_WAITING + 3)]
+    assert len(drops) == 3
+
+
+def everything_placed():
+    """A map in which odometry, the robot, its camera and a tag are placed."""
+    transforms = TransformBuffer()
+    for parent, child in (('map', 'odom'), ('odom', 'base_link'), ('base_link', 'camera')):
+        transforms.insert(parent, child, 0, WHEEL, is_static=True)
+    transforms.insert('map', 'tag_3', 0, WHEEL, is_static=True)
+    return transforms
+
+
+@pytest.mark.parametrize('frame', ['map', '/map'])
+def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
+    event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
+    reason = "told in 'map', which is estimated from these very landmarks: publish them in the"
+    base_frame = BaseFrame(InputSettings(), everything_placed())
+    with pytest.raises(TransformError, match=reason):
+        base_frame.observation(event, frame)
+    with pytest.raises(TransformError, match=reason):
+        base_frame.tags(TagDetections(0, frame, (3,), ('tag36h11',)))
+    with pytest.raises(TransformError, match=reason):
+        settings = InputSettings(sensor_frame=frame)
+        BaseFrame(settings, everything_placed()).observation(event, 'camera')
+
+
+def test_tags_are_those_of_the_sensor_that_a_parameter_names():
+    camera, other = (TagDetections(0, frame, (3,), ('tag36h11',)) for frame in ('camera', 'lens'))
+    expected = BaseFrame(InputSettings(), everything_placed()).tags(camera)
+    base_frame = BaseFrame(InputSettings(sensor_frame='camera'), everything_placed())
+    assert_allclose(base_frame.tags(other).points, expected.points)
+
+
+def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used():
+    event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
+    base_frame = BaseFrame(InputSettings(), everything_placed())
+    moved = base_frame.observation(event, 'odom')
+    assert_allclose(moved.points, se3.transform(se3.inverse(WHEEL), event.points))
+    settings = InputSettings(sensor_pose=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    placed = BaseFrame(settings, TransformBuffer()).observation(event, 'map')
+    assert_allclose(placed.points, [[1.0, 1.0, 2.0]])
+
+
+def test_without_an_odometry_frame_velocities_may_name_none():
+    event = VelocityEvent(0, V)
+    assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(event, '')
+
+
+def test_a_jump_of_the_odometrys_pose_is_dropped_by_a_reason_of_its_own():
+    drops = []
+    builder = EventBuilder(BaseFrame(InputSettings(), TransformBuffer()), 0.1, 0.5, drops.append)
+    no_turn = np.array([0.0, 0.0, 0.0, 1.0])
+    events = []
+    for step, x in enumerate([5.0, 5.02, 0.0, 0.02]):
+        stamp_ns = step * 20 * MS
+        pose = PoseMessage(stamp_ns, 'odom', 'base_link', np.array([x, 0.0, 0.0]), no_turn)
+        events += builder.add(pose, stamp_ns)
+    assert [event.stamp_ns for event in events] == [0, 40 * MS]
+    assert_allclose([event.body_velocity[3] for event in events], [1.0, 1.0])
+    assert [drop_reason(error) for error in drops] == ['pose_jump']

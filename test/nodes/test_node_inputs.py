@@ -1,0 +1,454 @@
+"""Every kind of input over real DDS; missing packages and deaf subscriptions are told."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+import importlib.util
+import time
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+from geometry_msgs.msg import Pose, PoseArray, Twist, TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from node_processes import NodeProcess, running
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from robots import own_topics, Robot, stamp_ns, TransformSender
+import ros_messages
+from sensor_msgs.msg import Imu, PointCloud2
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.messages.message_types import IMU
+from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.messages.poses_and_velocities import decode_twist
+from slam_observer_ros.nodes.intake.input_topics import open_inputs
+from slam_observer_ros.nodes.intake.intake import decoders
+from slam_observer_ros.nodes.intake.intake import subscriptions as inputs
+from slam_observer_ros.nodes.intake.subscriptions import Input
+from slam_observer_ros.nodes.publishing.conversions import (
+    header_message,
+    point_message,
+    pose_message,
+    twist_message,
+    vector_message,
+)
+from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+pytestmark = pytest.mark.ros
+
+SECOND = 1_000_000_000
+STEP_NS = SECOND // 20
+STEPS = 30
+V = np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0])
+WRONG_TURN = np.array([0.0, 0.0, -0.8, 1.0, 0.0, 0.0])
+
+
+def true_pose(stamp_ns, start_ns):
+    return se3.exp(V * (stamp_ns - start_ns) * 1e-9)
+
+
+def odometry(stamp, start_ns, velocity=V):
+    message = Odometry(header=header_message(stamp, 'odom'), child_frame_id='base_link')
+    message.pose.pose = pose_message(true_pose(stamp, start_ns))
+    message.twist.twist = twist_message(velocity)
+    return message
+
+
+def twist_with_covariance(stamp, _start_ns):
+    message = TwistWithCovarianceStamped(header=header_message(stamp, 'base_link'))
+    message.twist.twist = twist_message(V)
+    message.twist.covariance = (np.eye(6) * 1e-4).ravel()
+    return message
+
+
+def imu(stamp, _start_ns):
+    message = Imu(header=header_message(stamp, 'base_link'))
+    message.angular_velocity = vector_message(V[:3])
+    return message
+
+
+# For each way of knowing the velocity: parameters, and what is published where.
+VELOCITY_INPUTS = {
+    '/twist_with_covariance': ({}, {'twist': (TwistWithCovarianceStamped, twist_with_covariance)}),
+    '/odometry_twist': ({}, {'twist': (Odometry, odometry)}),
+    '/pose_differences': (
+        {'velocity_source': 'pose_differences', 'reorder_window': 0.1},
+        {'twist': (Odometry, lambda stamp, start: odometry(stamp, start, np.zeros(6)))},
+    ),
+    '/wheels_and_imu': (
+        {'use_imu': True},
+        {
+            'imu': (Imu, imu),
+            'twist': (Odometry, lambda stamp, start: odometry(stamp, start, WRONG_TURN)),
+        },
+    ),
+}
+
+
+class FakeClock:
+    """The system clock 10 s ahead, which is then the ROS clock's; or a simulated one."""
+
+    def __init__(self, is_simulated=False):
+        self.ros_time_is_active = is_simulated
+
+    def now(self):
+        return SimpleNamespace(nanoseconds=time.time_ns() + 10 * SECOND)
+
+
+def unstamped_input(node, received, is_simulated=False):
+    """Return an input of Twist, and what its subscription calls with bytes and their info."""
+    node.get_clock.return_value = FakeClock(is_simulated)
+    node.resolve_topic_name.side_effect = lambda name: f'/{name}'
+    decoders = {'geometry_msgs/msg/Twist': decode_twist}
+    source = Input(node, 'twist', decoders, lambda *taken: received.append(taken), QOS)
+    return source, node.create_subscription.call_args.args[2]
+
+
+QOS = QoSProfile(depth=1)
+TWIST = serialize_message(Twist())
+NOW_NS = 1_700_000_000 * SECOND
+
+
+@pytest.mark.parametrize('is_simulated', [False, True])
+def test_a_message_that_had_to_wait_was_received_when_the_middleware_had_it(
+    monkeypatch, is_simulated
+):
+    monkeypatch.setattr(time, 'time_ns', lambda: NOW_NS)
+    received = []
+    _, receive = unstamped_input(Mock(), received, is_simulated)
+    waited_since_ns = NOW_NS - 3 * SECOND
+    receive(TWIST, {'received_timestamp': waited_since_ns})
+    receive(TWIST, {'received_timestamp': 0})  # as where the middleware does not tell
+    (first, first_ns), (last, last_ns) = received
+    assert (first.event.stamp_ns, last.event.stamp_ns) == (first_ns, last_ns)
+    assert last_ns == NOW_NS + 10 * SECOND
+    assert first_ns == (last_ns if is_simulated else waited_since_ns)
+
+
+def test_a_first_message_ends_the_report_that_there_is_none():
+    node = Mock()
+    source, receive = unstamped_input(node, [])
+    publisher = Mock(topic_type='geometry_msgs/msg/Twist', qos_profile=QOS)
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    source.look()
+    assert source.trouble == "no message yet on '/twist' (geometry_msgs/msg/Twist)"
+    receive(TWIST, {'received_timestamp': time.time_ns()})
+    assert not source.trouble
+
+
+def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
+    node = Mock()
+    source, receive = unstamped_input(node, [])
+    steady_s = time.monotonic()
+    monkeypatch.setattr(time, 'time_ns', lambda: NOW_NS)
+    publisher = Mock(topic_type='geometry_msgs/msg/Twist', qos_profile=QOS)
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    troubles = []
+
+    def at(step):
+        monkeypatch.setattr(time, 'monotonic', lambda: steady_s + 0.1 * step)
+        source.look()
+        return source.trouble
+
+    for step, wait_s in enumerate([0.0, *[1.5] * 30, 0.0, *[1.5] * 30]):
+        at(step)
+        receive(TWIST, {'received_timestamp': NOW_NS - round(wait_s * SECOND)})
+        troubles.append(at(step))
+    assert troubles[:20] == [''] * 20, 'it may only have been busy for a moment'
+    assert troubles[30].startswith("the node does not keep up: messages on '/twist' wait 1.5 s")
+    assert troubles[31] == ''
+    assert troubles[-1]
+    assert at(step + 30) == '', 'no message comes any more'
+    for step in (2000, 4000):
+        at(step)
+        receive(TWIST, {'received_timestamp': NOW_NS - SECOND})
+        assert at(step) == '', 'single messages say nothing of the time between'
+
+
+@pytest.mark.parametrize(
+    ('message_type', 'name', 'found'),
+    [
+        ('sensor_msgs/msg/PointCloud2', 'ID', 'fields x y z ID'),
+        ('sensor_msgs/msg/PointCloud', 'landmark_id', 'channels landmark_id'),
+        ('sensor_msgs/msg/PointCloud2', 'id', None),
+        ('sensor_msgs/msg/PointCloud', 'id', None),
+    ],
+)
+def test_points_whose_ids_are_named_otherwise_are_told_once(message_type, name, found):
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    if message_type.endswith('2'):
+        dtype = [('x', '<f4'), ('y', '<f4'), ('z', '<f4'), (name, '<u4')]
+        clouds = [ros_messages.point_cloud2(np.ones((1, count), dtype)) for count in (0, 2, 2)]
+    else:
+        clouds = [
+            ros_messages.point_cloud(np.ones((count, 3)), {name: np.ones(count)})
+            for count in (0, 2, 2)
+        ]
+    decode = decoders.CloudDecoder(node, message_type)
+    decoded = [decode(ros_messages.serialise(cloud), 0) for cloud in clouds]
+    assert [len(message.event.ids) for message in decoded] == [0, 2, 2]
+    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    start = f"points on '/robot/landmarks' come without ids; {found}: they are told apart"
+    assert [text.startswith(start) for text in told] == ([] if found is None else [True])
+    assert all(text.endswith("name these 'id'") for text in told)
+
+
+@pytest.mark.parametrize(
+    ('velocity', 'speed', 'is_told'),
+    [(np.zeros(6), 0.5, True), (V, 0.5, False), (np.zeros(6), 0.001, False)],
+    ids=['poses alone', 'both', 'at rest'],
+)
+def test_an_odometry_with_poses_alone_is_told_once(velocity, speed, is_told):
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    decode = decoders.OdometryDecoder(node)
+    for step in range(20):
+        message = odometry(round(speed * step * SECOND), 0, velocity)
+        assert_allclose(decode(serialize_message(message), 0).event.body_velocity, velocity)
+    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    assert len(told) == is_told
+    assert all("all velocities on '/robot/twist' are zero" in text for text in told)
+    assert all("velocity_source to 'pose_differences'" in text for text in told)
+
+
+def test_an_odometry_without_an_attitude_has_a_velocity():
+    message = odometry(0, 0, np.zeros(6))
+    message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
+    decode = decoders.OdometryDecoder(Mock())
+    assert_allclose(decode(serialize_message(message), 0).event.body_velocity, 0.0)
+
+
+def test_a_velocity_without_poses_has_no_pose_differences():
+    settings = ObserverNodeSettings(velocity_source='pose_differences', velocity_type='Twist')
+    with pytest.raises(ParameterError, match="'Twist' has no poses"):
+        open_inputs(Mock(), settings, Mock())
+
+
+@pytest.mark.parametrize('is_seen', [False, True])
+def test_fiducials_on_tf_by_another_name_are_told_once(monkeypatch, is_seen):
+    node, now = Mock(), [0.0]
+    monkeypatch.setattr(decoders, 'time', Mock(monotonic=lambda: now[0]))
+    decode = decoders.TagDecoder(node, 'dock')
+    for name in ('dock7' if is_seen else 'fiducial_7', 'wheel', 'wheel'):
+        names, position, quaternion = ('camera', name), (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)
+        sent = [ros_messages.transform_stamped(names, position, quaternion)]
+        decode(ros_messages.serialise(ros_messages.make('tf2_msgs/msg/TFMessage', sent)), 0)
+        now[0] += decoders.WITHOUT_TAG_S
+    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    assert len(told) == (not is_seen)
+    assert all("named 'dock<id>'" in text for text in told)
+    assert all('(there are fiducial_7, wheel)' in text for text in told)
+
+
+def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):
+    with ExitStack() as stack:
+        received, publishers = {}, []
+        for namespace, (parameters, topics) in VELOCITY_INPUTS.items():
+            log = tmp_path / namespace.strip('/')
+            arguments = own_topics(namespace)
+            stack.enter_context(running('observer_node', log, *arguments, **parameters))
+            received[namespace] = ros.collect(Odometry, f'{namespace}/odometry')
+            publishers += [
+                (ros.node.create_publisher(message_class, f'{namespace}/{topic}', 100), make)
+                for topic, (message_class, make) in topics.items()
+            ]
+        ros.wait_for_subscriber(*(publisher for publisher, _ in publishers))
+        start_ns = time.time_ns()
+        for step in range(STEPS):
+            stamp = start_ns + step * STEP_NS
+            for publisher, make in publishers:
+                publisher.publish(make(stamp, start_ns))
+                ros.spin_for(0.005)
+        last_ns = start_ns + (STEPS - 5) * STEP_NS
+        ros.spin_until(
+            lambda: all(m and stamp_ns(m[-1]) >= last_ns for m in received.values()), 'the end'
+        )
+    for namespace, messages in received.items():
+        pose = messages[-1].pose.pose.position
+        truth = true_pose(stamp_ns(messages[-1]), start_ns)
+        assert_allclose([pose.x, pose.y, pose.z], truth[:3, 3], atol=1e-6, err_msg=namespace)
+        assert_allclose(messages[-1].twist.twist.angular.z, V[2], atol=1e-6, err_msg=namespace)
+
+
+def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
+    if TFMessage is None:
+        pytest.skip('tf2_msgs is not installed')
+    maps = ros.collect(PointCloud2, '/tags/map', LATCHED_QOS)
+    nameless_maps = ros.collect(PointCloud2, '/nameless/map', LATCHED_QOS)
+    poses = ros.node.create_publisher(PoseArray, '/nameless/landmarks', 10)
+    sender = TransformSender(ros, '/tags')
+    tagged = {'landmarks_type': 'tf', 'tag_frame_prefix': 'dock', 'odom_frame': "''"}
+    with (
+        running('observer_node', tmp_path / 'tags', *own_topics('/tags'), **tagged),
+        running('observer_node', tmp_path / 'nameless', *own_topics('/nameless')),
+        Robot(ros, namespace='/tags', subscribers=False) as robot,
+    ):
+        sender.send(('base_link', 'camera', se3.pose(np.eye(3), np.array([0.0, 0.0, 1.0]))))
+        ros.wait_for_subscriber(sender.dynamic, robot.twist, poses)
+        start_ns = time.time_ns()
+        for step in range(10):
+            stamp = start_ns + step * STEP_NS
+            robot.send(VelocityEvent(stamp, np.zeros(6)))
+            sender.send(
+                ('camera', 'tag36h11:3', se3.pose(np.eye(3), np.array([2.0, 0.0, 0.0]))),
+                ('camera', 'dock11', se3.pose(np.eye(3), np.array([0.0, 3.0, 0.0]))),
+                ('odom', 'base_link', np.eye(4)),
+                stamp_ns=stamp,
+            )
+            point = Pose(position=point_message(np.ones(3)))
+            header = header_message(stamp, 'base_link')
+            poses.publish(PoseArray(header=header, poses=[point]))
+            ros.spin_for(0.03)
+        ros.spin_until(lambda: len(seen(maps)) == 2, 'two fiducials')
+        ros.spin_until(lambda: len(seen(nameless_maps)) == 1, 'a landmark without id')
+    assert set(seen(maps)) == {3, 11}
+    assert_allclose(seen(maps)[3], [2.0, 0.0, 1.0], atol=1e-6)
+    assert_allclose(seen(maps)[11], [0.0, 3.0, 1.0], atol=1e-6)
+    assert_allclose(seen(nameless_maps)[FIRST_AUTOMATIC_ID], [1.0, 1.0, 1.0], atol=1e-6)
+
+
+def test_the_map_tells_the_velocities_that_landmarks_came_with(ros, tmp_path):
+    maps = ros.collect(PointCloud2, '/moving/map', LATCHED_QOS)
+    points, speed = np.array([[2.0, 0, 0], [0, 3.0, 1.0]]), np.array([[0, 0.5, 0], [0, 0, 0]])
+    with (
+        running('observer_node', tmp_path / 'log', *own_topics('/moving'), odom_frame="''"),
+        Robot(ros, namespace='/moving') as robot,
+    ):
+        start_ns = time.time_ns()
+        for step in range(20):
+            stamp = start_ns + step * STEP_NS
+            robot.send(VelocityEvent(stamp, np.zeros(6)))
+            moved = points + speed * step * STEP_NS * 1e-9
+            robot.send(ObservationEvent(stamp, np.array([3, 4]), moved, None, speed))
+            ros.spin_for(0.05)
+        ros.spin_until(lambda: len(seen(maps)) == 2, 'two landmarks')
+        ros.spin_until(
+            lambda: stamp_ns(maps[-1]) >= start_ns + 15 * STEP_NS, 'a map of the last stamps'
+        )
+    event = decode_point_cloud2(serialize_message(maps[-1])).event
+    assert_allclose(event.velocities, speed, atol=1e-6)
+    elapsed_s = (stamp_ns(maps[-1]) - start_ns) * 1e-9
+    assert_allclose(event.points, points + speed * elapsed_s, atol=1e-3)
+
+
+def seen(maps):
+    if not maps:
+        return {}
+    event = decode_point_cloud2(serialize_message(maps[-1])).event
+    return dict(zip(event.ids.tolist(), event.points, strict=True))
+
+
+def test_optional_packages_are_named_when_they_are_missing(tmp_path):
+    packages = {'Detection3DArray': 'vision_msgs', 'AprilTagDetectionArray': 'apriltag_msgs'}
+    nodes = {
+        package: NodeProcess('observer_node', tmp_path / package, landmarks_type=landmarks_type)
+        for landmarks_type, package in packages.items()
+        if importlib.util.find_spec(package) is None
+    }
+    for package, node in nodes.items():
+        assert node.wait() == 2
+        assert f'apt install ros-jazzy-{package.replace("_", "-")}' in node.output
+        assert 'Traceback' not in node.output
+
+
+def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatch):
+    clock = SimpleNamespace(now_s=1000.0)
+    monkeypatch.setattr(inputs, 'time', SimpleNamespace(monotonic=lambda: clock.now_s))
+    node, qos = Mock(), QoSProfile(depth=1)
+    node.resolve_topic_name.return_value = '/twist'
+    node.get_clock.return_value.now.return_value.nanoseconds = 0
+    publisher = SimpleNamespace(topic_type=IMU, qos_profile=qos, node_name='driver')
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    source = inputs.Input(node, 'twist', {IMU: lambda raw, receive_ns: raw}, Mock(), qos)
+    receive = node.create_subscription.call_args.args[2]
+    warning = node.get_logger.return_value.warning
+
+    def look_for(duration_s):
+        for _ in range(duration_s):
+            clock.now_s += 1.0
+            source.look()
+        return [call.args[0] for call in warning.call_args_list]
+
+    for _ in range(20):
+        receive(b'', {'received_timestamp': 0})
+        assert not look_for(1)
+    told = look_for(20)
+    assert told[0] == "no message on '/twist' for 6 s, though it has a publisher"
+    assert len(told) == 2, 'not throttled'
+    receive(b'', {'received_timestamp': 0})
+    assert len(look_for(4)) == 2
+    assert not source.trouble
+
+
+def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
+    """Its executor reads one of each topic in turn: landmarks would run ahead of velocities."""
+    qos, order = QoSProfile(depth=100), []
+    node = rclpy.create_node('busy', context=ros.node.context)
+
+    def take(kind, _receive_ns):
+        order.append(kind)
+
+    decoders = {'geometry_msgs/msg/Twist': lambda *_: 'velocity'}
+    velocities = Input(node, 'busy/twist', decoders, take, qos)
+    decoders = {'geometry_msgs/msg/PoseArray': lambda *_: 'landmarks'}
+    Input(node, 'busy/landmarks', decoders, take, qos).read_first = [velocities]
+    twists = ros.node.create_publisher(Twist, 'busy/twist', qos)
+    landmarks = ros.node.create_publisher(PoseArray, 'busy/landmarks', qos)
+    executor = SingleThreadedExecutor(context=ros.node.context)
+    executor.add_node(node)
+    try:
+        ros.wait_for_subscriber(twists)
+        ros.wait_for_subscriber(landmarks)
+        for _ in range(12):
+            for _ in range(5):
+                twists.publish(Twist())
+            landmarks.publish(PoseArray())
+        for publisher in (twists, landmarks):
+            assert publisher.wait_for_all_acked(Duration(seconds=10))
+        deadline_s = time.monotonic() + 10.0
+        while len(order) < 72 and time.monotonic() < deadline_s:
+            executor.spin_once(timeout_sec=0.1)
+        assert len(order) == 72
+        velocities_before = np.flatnonzero(np.array(order) == 'landmarks') - np.arange(12)
+        published_before = 5 * np.arange(1, 13)
+        # One more tells that there is none before, and one comes in turn.
+        assert set(velocities_before - published_before) <= {0, 1, 2}
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        for publisher in (twists, landmarks):
+            ros.node.destroy_publisher(publisher)
+
+
+def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_path):
+    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    maps = ros.collect(PointCloud2, '/picky/map', LATCHED_QOS)
+    with (
+        running(
+            'observer_node', tmp_path / 'log', *own_topics('/picky'), landmarks_qos='reliable'
+        ) as node,
+        Robot(ros, namespace='/picky', subscribers=False) as robot,
+    ):
+        ros.node.destroy_publisher(robot.landmarks)
+        robot.landmarks = ros.node.create_publisher(PointCloud2, '/picky/landmarks', best_effort)
+        node.wait_for_output(r"'test_client' can't be heard on '/picky/landmarks'.*[Rr]eliab")
+        ros.node.destroy_publisher(robot.landmarks)
+        robot.landmarks = ros.node.create_publisher(PointCloud2, '/picky/landmarks', 10)
+        ros.wait_for_subscriber(robot.twist, robot.landmarks)
+        ros.spin_until(lambda: send_landmark(robot) or set(seen(maps)) == {5}, 'the landmark')
+
+
+def send_landmark(robot):
+    robot.send(ObservationEvent(time.time_ns(), np.array([5]), np.ones((1, 3))))
+    robot.send_zeros()

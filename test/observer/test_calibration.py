@@ -1,0 +1,370 @@
+"""Scale, bias and delay of the velocity: found where looked for, left alone elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+
+from gain_worlds import configuration_error_m, drive, estimate, true_velocities
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from strategies import generators
+
+from slam_observer_ros.estimates import CalibrationEstimate
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.observer.prediction import initial_covariance, predict
+from slam_observer_ros.sensor_models.calibration import Calibration, MIN_DELAY_S
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
+
+EVERYTHING = Settings(
+    angular_scale_error=(0.1, 0.1, 0.1),
+    linear_scale_error=(0.1, 0.1, 0.1),
+    angular_bias_error=(0.01, 0.01, 0.01),
+    linear_bias_error=(0.1, 0.1, 0.1),
+    velocity_delay_error=0.1,
+)
+
+WHEELS = Settings(
+    two_d_mode=True,
+    angular_scale_error=(0.0, 0.0, 0.1),
+    linear_scale_error=(0.1, 0.0, 0.0),
+)
+WHEEL_SCALE = np.array([1.0, 1.0, 0.95, 1.05, 1.0, 1.0])
+
+DELAY_NS = 150_000_000
+
+GYROSCOPE = Settings(angular_bias_error=(0.05, 0.05, 0.05), angular_velocity_noise=(0.01,) * 3)
+GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
+
+
+def scale_and_bias(estimator):
+    """Estimated factors (6,) and biases (6,), as they are applied to a velocity."""
+    calibrated = estimator._slam.gains.calibration.apply
+    once, twice = calibrated(np.array([np.ones(6), 2.0 * np.ones(6)]))
+    return twice - once, 2.0 * once - twice
+
+
+def deviations(estimator, count):
+    """Standard deviations of the ``count`` estimated entries."""
+    return np.sqrt(estimator._slam.gains.calibration_variances[:count])
+
+
+def with_gains(settings, gains):
+    return Settings(**{**vars(settings), 'gains': gains})
+
+
+@pytest.mark.parametrize('hindsight_interval', [0, 20])
+def test_a_wheels_scale_is_found_as_well_as_its_covariance_says(hindsight_interval):
+    settings = Settings(**{**vars(WHEELS), 'hindsight_interval': hindsight_interval})
+    normalised_squared = []
+    for seed in range(3):
+        world = drive(settings, 60.0, seed, scale=WHEEL_SCALE)
+        estimator = estimate(world, settings)
+        found, bias = scale_and_bias(estimator)
+        sigma = deviations(estimator, 2)
+        normalised_squared.extend(((found - WHEEL_SCALE)[[2, 3]] / sigma) ** 2)
+        assert np.all(sigma < 0.03)
+        np.testing.assert_array_equal(np.delete(found, [2, 3]), 1.0)
+        np.testing.assert_array_equal(bias, 0.0)
+    assert np.sum(normalised_squared) < chi2.ppf(0.997, len(normalised_squared))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_gyroscopes_bias_is_found_within_three_sigma(seed):
+    world = drive(GYROSCOPE, 60.0, seed, bias=GYROSCOPE_BIAS)
+    estimator = estimate(world, GYROSCOPE)
+    scale, found = scale_and_bias(estimator)
+    sigma = deviations(estimator, 3)
+    assert np.all(np.abs(found - GYROSCOPE_BIAS)[:3] < 3.0 * sigma)
+    assert np.all(sigma < 0.01)
+    np.testing.assert_allclose(scale, 1.0)
+    np.testing.assert_array_equal(found[3:], 0.0)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_a_robot_whose_wheels_stand_does_not_turn_by_a_bias(gains):
+    world = drive(GYROSCOPE, 60.0, bias=GYROSCOPE_BIAS)
+    estimator = estimate(world, with_gains(GYROSCOPE, gains))
+    start_ns = estimator.stamp_ns
+    estimator.add(VelocityEvent(start_ns + 1, np.zeros(6)))
+    estimator.flush()
+    parked, variances = estimator.pose, estimator._slam.gains.calibration_variances.copy()
+    for n in range(1, 1000):
+        estimator.add(VelocityEvent(start_ns + n * 10**8, np.zeros(6)))
+    estimator.flush()
+    np.testing.assert_allclose(estimator.pose, parked, atol=1e-9)
+    np.testing.assert_array_equal(estimator.body_velocity, 0.0)
+    np.testing.assert_array_equal(estimator._slam.gains.calibration_variances, variances)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+@pytest.mark.parametrize('hindsight_interval', [0, 20])
+@pytest.mark.parametrize('delay_ns', [0, DELAY_NS])
+def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_interval, delay_ns):
+    """Where the velocity changes by far more than its noise."""
+    settings = Settings(
+        two_d_mode=two_d_mode,
+        angular_velocity_noise=(0.005, 0.005, 0.005),
+        velocity_delay_error=0.2,
+        hindsight_interval=hindsight_interval,
+    )
+    normalised_squared = []
+    for seed in range(3):
+        estimator = estimate(drive(settings, 60.0, seed, delay_ns=delay_ns), settings)
+        error_s = (estimator._slam.gains.calibration.delay_ns - delay_ns) * 1e-9
+        sigma_s = deviations(estimator, 1)[0]
+        normalised_squared.append((error_s / sigma_s) ** 2)
+        assert sigma_s < 0.03
+    assert np.sum(normalised_squared) < chi2.ppf(0.997, len(normalised_squared))
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_a_delay_that_is_made_up_for_does_no_harm(gains):
+    settings = Settings(gains=gains, two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.01))
+    estimating = Settings(**{**vars(settings), 'velocity_delay_error': 0.3})
+
+    def mean_error_m(settings, delay_ns):
+        worlds = [drive(settings, 30.0, seed, seen=2, delay_ns=delay_ns) for seed in range(4)]
+        return np.mean([configuration_error_m(estimate(w, settings), w) for w in worlds])
+
+    in_time = mean_error_m(settings, 0)
+    assert mean_error_m(estimating, 2 * DELAY_NS) < 1.2 * in_time
+    assert mean_error_m(settings, 2 * DELAY_NS) > 1.2 * in_time
+
+
+def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
+    """As an odometry's that is averaged over the time before its stamp."""
+    settings = Settings(
+        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_error=0.2
+    )
+    left_alone = Settings(**{**vars(settings), 'velocity_delay_error': 0.0})
+    errors_m, errors_left_m = [], []
+    for seed in range(4):
+        world = drive(settings, 60.0, seed, delay_ns=-DELAY_NS)
+        estimator = estimate(world, settings)
+        found_ns = estimator._slam.gains.calibration.delay_ns
+        assert found_ns == pytest.approx(-DELAY_NS, rel=0.3)
+        errors_m.append(configuration_error_m(estimator, world))
+        errors_left_m.append(configuration_error_m(estimate(world, left_alone), world))
+    assert np.mean(errors_m) < np.mean(errors_left_m)
+
+
+def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
+    settings = Settings(
+        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_error=0.2
+    )
+    for seed in range(4):
+        estimator = estimate(drive(settings, 60.0, seed, delay_ns=-200_000_000), settings)
+        (delay,) = estimator.calibration
+        assert delay.value == pytest.approx(-0.2, rel=0.15)
+
+
+def test_a_delay_stays_within_what_is_made_up_for():
+    calibration = Calibration(Settings(velocity_delay_error=0.1), PLANAR)
+    for change_s, limit_s in ((-5.0, MIN_DELAY_S), (10.0, MAX_DELAY_S)):
+        calibration.shift(np.array([change_s]))
+        assert calibration.delay_ns == round(limit_s * 1e9)
+
+
+def test_the_velocity_that_is_told_is_the_one_that_moves_the_pose():
+    step_ns = 10_000_000
+    for settings in (WHEELS, replace(EVERYTHING, velocity_delay_error=0.0)):
+        estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
+        after = estimator.pose_at(estimator.stamp_ns + step_ns)
+        moved = estimator.pose @ se3.exp(estimator.body_velocity * step_ns * 1e-9)
+        np.testing.assert_allclose(after, moved, atol=1e-9)
+
+
+def test_at_constant_velocity_nobody_can_tell_the_delay():
+    """Not even at the start, where no velocity is known yet."""
+    settings = Settings(two_d_mode=True, velocity_delay_error=0.2)
+    world = drive(settings, 5.0)
+    velocity = world.events[0].body_velocity
+    estimator = Estimator(settings)
+    for event in world.events:
+        is_velocity = isinstance(event, VelocityEvent)
+        estimator.add(replace(event, body_velocity=velocity) if is_velocity else event)
+    (delay,) = estimator.calibration
+    assert delay.deviation == pytest.approx(0.2, rel=1e-3)
+
+
+def test_a_robot_at_rest_again_is_where_its_velocities_say_whatever_their_delay():
+    """As each motion begins with the velocity that the one before it ended with."""
+    settings = Settings(
+        angular_velocity_noise=(0.0, 0.0, 0.0),
+        linear_velocity_noise=(0.0, 0.0, 0.0),
+        velocity_delay_error=0.2,
+        reorder_window=0.0,
+    )
+    rng = np.random.default_rng(0)
+    estimator = Estimator(settings)
+    for step in range(60):
+        moves = 10 <= step < 50
+        velocity = rng.normal(size=6) if moves else np.zeros(6)
+        estimator.add(VelocityEvent(step * DELAY_NS, velocity))
+        estimator.add(ObservationEvent(step * DELAY_NS, np.arange(0), np.empty((0, 3))))
+        deviation = np.sqrt(np.max(np.diagonal(estimator.pose_covariance)))
+        assert deviation > 0.01 or not 12 <= step < 48
+    assert deviation < 1e-6
+
+
+def test_scheduled_gains_find_them_too():
+    settings = with_gains(WHEELS, 'scheduled')
+    world = drive(settings, 60.0, scale=WHEEL_SCALE)
+    found, _ = scale_and_bias(estimate(world, settings))
+    np.testing.assert_allclose(found, WHEEL_SCALE, atol=0.025)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_calibration_makes_the_map_better_where_the_wheels_are_off(gains):
+    def mean_error_m(settings):
+        errors = []
+        for seed in range(4):
+            world = drive(settings, 30.0, seed, scale=WHEEL_SCALE, seen=2)
+            errors.append(configuration_error_m(estimate(world, settings), world))
+        return np.mean(errors)
+
+    off = Settings(gains=gains, two_d_mode=True)
+    assert mean_error_m(with_gains(WHEELS, gains)) < mean_error_m(off)
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
+    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+    estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
+    V = true_velocities(5, planar=False)
+    np.testing.assert_array_equal(estimator._slam.gains.calibration.apply(V), V)
+    assert estimator._slam.gains.calibration.delay_ns == 0
+
+
+@pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 13), (PLANAR, 7)])
+def test_only_axes_of_the_motion_are_calibrated(axes, count):
+    calibration = Calibration(EVERYTHING, axes)
+    assert calibration.count == count
+    calibration.shift(np.full(count, 0.5))
+    fixed = np.delete(np.arange(6), axes.pose)
+    V = np.ones((1, 6))
+    np.testing.assert_array_equal(calibration.apply(V)[0, fixed], 1.0)
+    np.testing.assert_array_equal(calibration.apply(V)[0, axes.pose], 2.0)
+
+
+@given(generators(), st.sampled_from([SPATIAL, PLANAR]))
+def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
+    calibration, pieces, dt_s = Calibration(EVERYTHING, axes), 5, 0.01
+    V = np.zeros((pieces, 6))
+    V[:, axes.pose] = rng.normal(size=(pieces, axes.p))
+    start = se3.exp(axes.full_pose(rng.normal(size=axes.p)))
+
+    def path(change):
+        calibration.shift(change)
+        held_s = np.full(pieces, dt_s)
+        held_s[[0, -1]] += change[-1] * np.array([1.0, -1.0])  # a longer delay: earlier velocities
+        steps = se3.exp(calibration.apply(V) * held_s[:, None])
+        calibration.shift(-change)
+        poses = [start]
+        for step in steps:
+            poses.append(poses[-1] @ step)
+        return np.array(poses)
+
+    nominal = path(np.zeros(calibration.count))
+    motion = Motion(
+        nominal, V, np.full(pieces, dt_s), np.zeros((pieces, 6, 6)), pieces * dt_s, V[[0, -1]]
+    )
+    Ad = se3.adjoint(nominal)[:, axes.pose]
+    F = calibration.sensitivity(Ad, motion)
+    h = 1e-6
+    for column, unit in enumerate(np.eye(calibration.count)):
+        error = se3.log(path(h * unit)[-1] @ se3.inverse(nominal[-1]))[axes.pose] / h
+        np.testing.assert_allclose(F[:, column], error, atol=1e-3 * dt_s * pieces)
+
+
+def test_drift_lets_the_uncertainty_grow_with_time():
+    settings = Settings(
+        angular_bias_error=(0.0, 0.0, 0.02),
+        linear_scale_error=(0.1, 0.0, 0.0),
+        calibration_drift=0.5,
+    )
+    calibration = Calibration(settings, SPATIAL)
+    P = initial_covariance(SPATIAL, calibration)
+    still = Motion(
+        np.tile(np.eye(4), (5, 1, 1)),
+        np.zeros((4, 6)),
+        np.array([1.0, 1.0, 0.5, 1.0]),
+        np.zeros((4, 6, 6)),
+        4.0,  # half a second of it without a velocity
+        np.zeros((2, 6)),
+    )
+    predict(P, SPATIAL, calibration, still)
+    # Four seconds at half the initial standard deviation per √s: σ² (1 + 4 · 0.25).
+    np.testing.assert_allclose(np.diag(P)[6:], np.array([0.1, 0.02]) ** 2 * 2.0)
+
+
+def test_a_bias_that_drifts_is_followed():
+    settings = Settings(**{**vars(GYROSCOPE), 'calibration_drift': 0.3})
+    ramp = np.linspace(0.0, 1.0, round(60.0 / 0.05))[:, None] * GYROSCOPE_BIAS
+    world = drive(settings, 60.0, bias=ramp)
+    _, found = scale_and_bias(estimate(world, settings))
+    np.testing.assert_allclose(found[:3], GYROSCOPE_BIAS[:3], atol=0.02)
+
+
+def test_looking_back_does_not_undo_that_a_scale_has_changed():
+    settings = Settings(
+        two_d_mode=True,
+        linear_scale_error=(0.1, 0.0, 0.0),
+        calibration_drift=0.2,
+        hindsight_interval=10,
+        hindsight_turn=0.0,
+    )
+    scale = np.where(np.arange(1200) < 600, 1.0, 1.15)[:, None]
+    world = drive(settings, 60.0, scale=scale)
+    np.testing.assert_allclose(scale_and_bias(estimate(world, settings))[0][3], 1.15, atol=0.03)
+
+
+def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
+    """As a robot that is carried; though its velocity has a bias, which is no motion either."""
+    calibration = Calibration(EVERYTHING, SPATIAL)
+    calibration.shift(np.full(calibration.count, 0.1))
+    path = np.array([np.eye(4), se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))])
+    zero = np.zeros(1)
+    carried = Motion(path, np.zeros((1, 6)), zero, np.zeros((1, 6, 6)), 0.0, None)
+    assert not calibration.sensitivity(se3.adjoint(path), carried).any()
+
+
+@pytest.mark.parametrize(
+    ('deviation', 'expected'),
+    [
+        (0.0123, '0.012 ± 0.012 rad/s'),
+        (0.000158, '0.01235 ± 0.00016 rad/s'),
+        (0.0, '0.012 ± 0.000 rad/s'),
+        (math.nan, '0.012 ± nan rad/s'),
+        (math.inf, '0.012 ± inf rad/s'),
+        (1e-30, '0.012345000 ± 0.000000000 rad/s'),
+    ],
+)
+def test_an_estimate_is_told_as_far_as_it_is_known(deviation, expected):
+    assert str(CalibrationEstimate('angular_bias_x', 0.012345, deviation, 'rad/s')) == expected
+
+
+def test_a_calibration_that_nobody_can_mean_is_told():
+    """Yaw rates with the wrong sign, for which the scale makes up; real wheels are not."""
+    wrong = drive(WHEELS, 60.0, scale=np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0]))
+    angular, linear = estimate(wrong, WHEELS).calibration
+    assert angular.trouble.startswith('angular_scale_z is -')
+    assert 'times its stated error (0.1) from 1: are signs' in angular.trouble
+    assert not linear.trouble
+    right = estimate(drive(WHEELS, 60.0, scale=WHEEL_SCALE), WHEELS)
+    assert not any(part.trouble for part in right.calibration)
+
+
+def test_a_bias_that_may_drift_is_plausible_wherever_it_is():
+    drifts = replace(GYROSCOPE, angular_bias_error=(0.002,) * 3, calibration_drift=1.0)
+    estimator = estimate(drive(drifts, 60.0, bias=5.0 * GYROSCOPE_BIAS), drifts)
+    assert not any(part.trouble for part in estimator.calibration)

@@ -1,0 +1,141 @@
+"""Errors of observations that last: a landmark seen again soon tells little more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.sensor_models.observation_noise import repetition_factors
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.state.landmark_table import LandmarkTable
+
+ERROR_TIME_S = 0.5
+RATE_HZ = 10
+POINTS = np.array([[3.0, 0.5, 0.2], [2.0, -2.0, 0.6], [4.0, 1.5, -0.5], [1.5, 2.5, 0.3]])
+SETTINGS = Settings(
+    reorder_window=0.0,
+    observation_model='cartesian',
+    point_noise=0.05,
+    observation_error_time=ERROR_TIME_S,
+    hindsight_turn=0.0,
+)
+
+
+@given(st.integers(1, 60), st.floats(0.01, 10.0), st.floats(0.01, 10.0))
+def test_observations_tell_together_what_their_joint_covariance_says(n, dt_s, error_time_s):
+    rho = np.exp(-dt_s / error_time_s)
+    joint = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    expected = np.linalg.solve(joint, np.ones(n)).sum()
+    since_s = np.array([np.inf, *[dt_s] * (n - 1)])
+    np.testing.assert_allclose(
+        (1.0 / repetition_factors(since_s, error_time_s)).sum(), expected, rtol=1e-9
+    )
+
+
+def test_errors_that_do_not_last_make_nothing_larger():
+    assert (repetition_factors(np.array([0.0, 1.0, np.inf]), 0.0) == 1.0).all()
+
+
+def standing(settings, seed, duration_s=20.0):
+    """An estimator whose robot stands, and whose observations err alike for half a second."""
+    rng, estimator = np.random.default_rng(seed), Estimator(settings)
+    rho = np.exp(-1.0 / (RATE_HZ * ERROR_TIME_S))
+    errors = rng.normal(size=POINTS.shape)
+    for step in range(round(duration_s * RATE_HZ)):
+        stamp_ns = step * 10**9 // RATE_HZ
+        estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
+        points = POINTS + settings.point_noise * errors
+        estimator.add(ObservationEvent(stamp_ns, np.arange(len(POINTS)), points))
+        errors = rho * errors + np.sqrt(1.0 - rho**2) * rng.normal(size=POINTS.shape)
+    return estimator
+
+
+def covariance_of(estimator):
+    return estimator.configuration_covariance(np.arange(len(POINTS)))
+
+
+def configuration_nees(estimator):
+    seen = (estimator.world_points - estimator.pose[:3, 3]) @ estimator.pose[:3, :3]
+    error = (seen - POINTS).ravel()
+    return error @ np.linalg.solve(covariance_of(estimator), error)
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_a_robot_that_stands_knows_how_well_it_sees(gains):
+    still = replace(
+        SETTINGS,
+        gains=gains,
+        angular_velocity_noise=(1e-4,) * 3,
+        linear_velocity_noise=(1e-4,) * 3,
+        huber_threshold=0.0,
+    )
+    told, untold = still, replace(still, observation_error_time=0.0)
+    band = chi2.ppf([0.005, 0.995], 12 * 20) / 20
+    nees = [
+        np.mean([configuration_nees(standing(settings, seed)) for seed in range(20)])
+        for settings in (told, untold)
+    ]
+    assert band[0] < nees[0] < band[1]
+    assert nees[1] > 5.0 * band[1]
+
+
+def test_hindsight_counts_an_observation_as_the_filter_did():
+    estimator = standing(SETTINGS, seed=0, duration_s=5.0)
+    smoothed = estimator.smooth()
+    np.testing.assert_allclose(smoothed.world_points, estimator.world_points, atol=2e-3)
+    again = standing(replace(SETTINGS, hindsight_turn=1e-9, hindsight_interval=5), 0, 5.0)
+    variances = np.diag(covariance_of(again))
+    np.testing.assert_allclose(variances, np.diag(covariance_of(estimator)), rtol=0.1)
+
+
+@pytest.mark.parametrize('stamp_ns', [0, 10**8, 10**12])
+def test_a_landmark_of_a_loaded_map_counts_fully_when_it_is_first_seen(stamp_ns):
+    covariances, counts = np.tile(1e-6 * np.eye(3), (4, 1, 1)), np.ones(4, dtype=np.int64)
+    known = LandmarkMap(np.arange(len(POINTS)), POINTS, covariances, counts)
+    estimator = Estimator(replace(SETTINGS, localization_mode='fixed'))
+    estimator.load_map(known, np.eye(4), np.eye(6))
+    estimator.add(ObservationEvent(stamp_ns, np.arange(len(POINTS)), POINTS))
+    assert np.sqrt(estimator.pose_covariance[3, 3]) < 0.6 * SETTINGS.point_noise
+
+
+def test_another_sensor_that_sees_at_the_same_instant_counts_like_the_first():
+    one, two = Estimator(SETTINGS), Estimator(SETTINGS)
+    for step in range(20):
+        first = ObservationEvent(step * 10**8, np.arange(len(POINTS)), POINTS)
+        shares = [*two._slam.landmarks.unseen_s(np.arange(len(two._slam.landmarks)), step * 10**8)]
+        assert all(share in (np.inf, 0.1) for share in shares)
+        for estimator in (one, two):
+            estimator.add(first)
+        two.add(replace(first, points=POINTS + 1e-3))
+    ratio = covariance_of(two).trace() / covariance_of(one).trace()
+    assert 0.4 < ratio < 0.8
+
+
+def test_a_landmark_that_was_placed_anew_has_not_been_seen_before():
+    landmarks, row = LandmarkTable(), np.array([0])
+    landmarks.add(np.array([7]), 0)
+    landmarks.accept(row, 10**9)
+    assert landmarks.unseen_s(row, 2 * 10**9) == 1.0
+    assert landmarks.unseen_s(row, 10**9) == 1.0, 'by another sensor'
+    landmarks.restart(row, 3 * 10**9)
+    assert landmarks.unseen_s(row, 3 * 10**9) == np.inf
+    assert landmarks.unseen_s(row, 4 * 10**9) == 1.0
+
+
+def test_where_a_landmark_was_rejected_is_still_known_when_another_one_was_removed():
+    landmarks, last = LandmarkTable(), np.array([2])
+    landmarks.add(np.array([7, 8, 9]), 0)
+    place, tolerance_m = np.array([[4.0, 5.0, 6.0]]), np.array([0.1])
+    landmarks.reject(last, place, tolerance_m)
+    landmarks.remove(np.array([0]))
+    assert landmarks.are_rejected_again(np.array([1]), place, tolerance_m).all()
+    landmarks.reject(np.array([1]), place, tolerance_m)
+    assert landmarks.rejections.tolist() == [0, 2]

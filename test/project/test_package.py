@@ -1,0 +1,67 @@
+"""What is installed is complete, and says the same everywhere."""
+
+from __future__ import annotations
+
+from distutils.core import run_setup  # setuptools' own where Python has none any more
+from importlib.metadata import distribution
+from pathlib import Path
+import re
+
+from catkin_pkg.package import parse_package
+import pytest
+import setuptools  # noqa: F401 (provides distutils)
+
+import slam_observer_ros
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+NAME = 'slam_observer_ros'
+DISTRIBUTION = distribution(NAME)
+SCRIPTS = [e for e in DISTRIBUTION.entry_points if e.group == 'console_scripts']
+MANIFEST = parse_package(CHECKOUT / 'package.xml')
+
+
+def test_versions_are_equal_everywhere():
+    changelog = (CHECKOUT / 'CHANGELOG.rst').read_text()
+    newest = re.search(r'^(\d+\.\d+\.\d+) \(', changelog, re.MULTILINE)
+    versions = {
+        '__version__': slam_observer_ros.__version__,
+        'setup.py': DISTRIBUTION.version,
+        'package.xml': MANIFEST.version,
+        'CHANGELOG.rst': newest[1],
+    }
+    assert set(versions.values()) == {slam_observer_ros.__version__}, versions
+
+
+def test_manifest_is_valid_and_agrees_with_setup():
+    MANIFEST.validate()
+    assert MANIFEST.name == NAME
+    assert MANIFEST.get_build_type() == 'ament_python'
+    assert MANIFEST.licenses == ['Apache-2.0']
+    assert DISTRIBUTION.metadata['Maintainer'] == MANIFEST.maintainers[0].name
+    assert DISTRIBUTION.metadata['Maintainer-email'] == MANIFEST.maintainers[0].email
+
+
+def test_manifest_names_all_message_packages_that_are_imported():
+    imports = re.compile(r'^(?:from|import) (\w+_(?:msgs|srvs|interfaces)|rclpy)\b', re.MULTILINE)
+    sources = (CHECKOUT / NAME).rglob('*.py')
+    imported = {name for source in sources for name in imports.findall(source.read_text())}
+    assert imported <= {dependency.name for dependency in MANIFEST.exec_depends}
+
+
+def test_launch_config_and_rviz_files_are_installed(monkeypatch):
+    monkeypatch.chdir(CHECKOUT)
+    data_files = dict(run_setup('setup.py', stop_after='init').data_files)
+    assert f'resource/{NAME}' in data_files['share/ament_index/resource_index/packages']
+    for folder in ('launch', 'config', 'rviz'):
+        written = {str(path) for path in Path(folder).iterdir() if path.is_file()}
+        assert set(data_files[f'share/{NAME}/{folder}']) == written
+
+
+def test_there_are_executables():
+    """Without the installed package the next test would have nothing to load."""
+    assert SCRIPTS
+
+
+@pytest.mark.parametrize('script', SCRIPTS, ids=lambda script: script.name)
+def test_executables_can_be_loaded(script):
+    assert callable(script.load())

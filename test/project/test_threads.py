@@ -1,0 +1,55 @@
+"""Programs compute in one thread, unless whoever starts them wants more."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from slam_observer_ros.common.threads import CHOICES
+
+NODE = """
+from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.nodes import observer_node
+from slam_observer_ros.nodes.runner import run
+def refuse():
+    raise SlamObserverError('this node does not start')
+run(refuse, [])
+"""
+COMMAND = """
+from slam_observer_ros.cli.main import main
+main(['replay', 'nothing.mcap'])
+"""
+LIBRARY = """
+import slam_observer_ros.estimator.estimator
+"""
+COUNT = """
+import json, threadpoolctl
+print(json.dumps([pool['num_threads'] for pool in threadpoolctl.threadpool_info()]))
+"""
+
+
+def threads_of(program, **choice):
+    environment = {name: value for name, value in os.environ.items() if name not in CHOICES}
+    done = subprocess.run(
+        [sys.executable, '-c', program + COUNT],
+        env={**environment, **choice},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize('program', [COMMAND, pytest.param(NODE, marks=pytest.mark.ros)])
+def test_programs_compute_in_one_thread(program):
+    assert set(threads_of(program)) == {1}
+
+
+@pytest.mark.parametrize('program', [COMMAND, pytest.param(NODE, marks=pytest.mark.ros)])
+def test_the_environment_has_the_last_word(program):
+    assert threads_of(program, OMP_NUM_THREADS='2') == threads_of(LIBRARY, OMP_NUM_THREADS='2')

@@ -1,0 +1,237 @@
+"""Public data sets become recordings whose measurements agree with their truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from slam_observer_ros.common.errors import DataSetError
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.recording.datasets.mrclam import load_mrclam
+from slam_observer_ros.recording.datasets.starry_night import (
+    EPOCH_NS,
+    load_starry_night,
+)
+from slam_observer_ros.recording.reader import Recording
+
+SECOND_NS = 1_000_000_000
+
+
+def point_errors(data_set: DataSet, poses: np.ndarray) -> np.ndarray:
+    """Distances of all observed points, moved by the true (n, 4, 4) poses, from their truth."""
+    place_of = {landmark_id: index for index, landmark_id in enumerate(data_set.landmarks.ids)}
+    errors = []
+    for event, pose in zip(data_set.observations, poses, strict=True):
+        places = [place_of[landmark_id] for landmark_id in event.ids.tolist()]
+        seen = se3.transform(pose, event.points)
+        errors.append(np.linalg.norm(seen - data_set.landmarks.world_points[places], axis=1))
+    return np.concatenate(errors)
+
+
+def write_mrclam(folder: Path) -> Path:
+    """Make a run of robot 2: commands, one landmark seen with a robot, a misread, another one."""
+    folder.mkdir()
+    files = {
+        'Barcodes.dat': [(1, 5), (2, 14), (6, 63), (7, 81)],
+        'Landmark_Groundtruth.dat': [(6, 1.0, 2.0, 0.0, 0.0), (7, 3.0, 4.0, 0.0, 0.0)],
+        'Robot2_Groundtruth.dat': [(1248444187.156, 1.0, 2.0, np.pi / 2)],
+        'Robot2_Odometry.dat': [(1248444187.156, 0.5, -0.25), (1248444187.166, 0.5, 0.0)],
+        'Robot2_Measurement.dat': [
+            (1248444187.157, 63, 2.0, np.pi / 2),
+            (1248444187.157, 5, 1.0, 0.0),
+            (1248444187.157, 81, 3.0, 0.0),
+            (1248444187.158, 99, 1.0, 0.0),
+            (1248444187.159, 81, 4.0, 0.0),
+        ],
+    }
+    for name, rows in files.items():
+        lines = ['# a header', *(' \t '.join(map(repr, map(float, row))) for row in rows)]
+        (folder / name).write_text('\n'.join(lines))
+    return folder
+
+
+def write_starry_night(file: Path, **changes: np.ndarray) -> Path:
+    """Make two frames of a stereo camera that looks along x; landmark 4 seen in the second."""
+    pixels = np.full((4, 2, 20), -1.0)
+    # 2 m ahead, 1 m to the left, 0.5 m up, with focal length 100 and a baseline of 0.5 m.
+    pixels[:, 1, 4] = [320.0 - 50, 240 - 25, 320 - 75, 240 - 25]
+    camera_axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    variables = {
+        't': np.array([[0.0, 0.25]]),
+        'v_vk_vk_i': np.array([[1.0, 4.0], [2.0, 5.0], [3.0, 6.0]]),
+        'w_vk_vk_i': np.array([[0.1, 0.4], [0.2, 0.5], [0.3, 0.6]]),
+        'y_k_j': pixels,
+        'r_i_vk_i': np.ones((3, 2)),
+        'theta_vk_i': np.array([[0.0, 0.0], [0.0, 0.0], [0.0, np.pi / 2]]),
+        'rho_i_pj_i': np.arange(60.0).reshape(3, 20),
+        'C_c_v': camera_axes,
+        'rho_v_c_v': np.array([[0.1], [0.0], [0.0]]),
+        'fu': 100.0,
+        'fv': 100.0,
+        'cu': 320.0,
+        'cv': 240.0,
+        'b': 0.5,
+    }
+    scipy.io.savemat(file, variables | changes)
+    return file
+
+
+class TestMrclam:
+    def test_rows_with_one_stamp_are_one_observation(self, tmp_path):
+        data_set = load_mrclam(write_mrclam(tmp_path / 'run'), 2)
+        assert [event.stamp_ns for event in data_set.observations] == [
+            1248444187157 * 10**6,
+            1248444187159 * 10**6,
+        ]
+        first, second = data_set.observations
+        assert first.ids.tolist() == [6, 7]
+        np.testing.assert_allclose(first.points, [[0.0, 2.0, 0.0], [3.0, 0.0, 0.0]], atol=1e-12)
+        assert second.ids.tolist() == [7]
+        assert data_set.left_out == {'robot': 1, 'misread': 1}
+
+    def test_commands_and_truth(self, tmp_path):
+        data_set = load_mrclam(write_mrclam(tmp_path / 'run'), 2)
+        assert data_set.velocity_stamps_ns[0] == 1248444187156 * 10**6
+        assert data_set.body_velocities[0].tolist() == [0, 0, -0.25, 0.5, 0, 0]
+        expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 0], [0, 0, 0, 1]]
+        np.testing.assert_allclose(data_set.true_poses[0], expected, atol=1e-12)
+        assert data_set.landmarks.ids.tolist() == [6, 7]
+        assert data_set.landmarks.world_points.tolist() == [[1, 2, 0], [3, 4, 0]]
+
+    def test_recording_holds_the_data_set_in_stamp_order(self, tmp_path):
+        out = tmp_path / 'out.mcap'
+        data_set = load_mrclam(write_mrclam(tmp_path / 'run'), 2)
+        write_data_set(data_set, out)
+        with Recording(out) as recording:
+            selected = recording.find_topics()
+            events = list(recording.events(selected))
+            truth = recording.truth(selected)
+        kinds = [VelocityEvent, ObservationEvent, ObservationEvent, VelocityEvent]
+        assert [type(event) for event in events] == kinds
+        np.testing.assert_array_equal(truth.stamps_ns, data_set.truth_stamps_ns)
+        np.testing.assert_allclose(truth.poses, data_set.true_poses, atol=1e-12)
+        np.testing.assert_array_equal(truth.landmarks.ids, [6, 7])
+
+    def test_what_is_missing_is_named(self, tmp_path):
+        with pytest.raises(DataSetError, match='no such directory'):
+            load_mrclam(tmp_path / 'nowhere', 1)
+        with pytest.raises(DataSetError, match='not an MRCLAM data set'):
+            load_mrclam(tmp_path, 1)
+        folder = write_mrclam(tmp_path / 'run')
+        with pytest.raises(DataSetError, match='no robot 7; there are 2'):
+            load_mrclam(folder, 7)
+        (folder / 'Barcodes.dat').unlink()
+        with pytest.raises(DataSetError, match=r'Barcodes\.dat: no such file'):
+            load_mrclam(folder, 2)
+
+    @pytest.mark.parametrize(
+        'content', ['', '# a header', '1 2', '1 2 3 4 5', 'a b c d', '1 2\n3']
+    )
+    @pytest.mark.filterwarnings('error')
+    def test_malformed_file_is_named(self, tmp_path, content):
+        folder = write_mrclam(tmp_path / 'run')
+        (folder / 'Robot2_Measurement.dat').write_text(content)
+        with pytest.raises(DataSetError, match=r'Robot2_Measurement\.dat') as raised:
+            load_mrclam(folder, 2)
+        assert 'usecols' not in str(raised.value)
+
+    @pytest.mark.parametrize('robot', [1, 2, 3, 4, 5])
+    def test_real_measurements_agree_with_the_truth(self, data_dir, robot):
+        data_set = load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', robot)
+        stamps_ns = np.array([event.stamp_ns for event in data_set.observations])
+        assert np.all(np.diff(stamps_ns) > 0)
+        nearest = np.searchsorted(data_set.truth_stamps_ns, stamps_ns).clip(
+            max=len(data_set.truth_stamps_ns) - 1
+        )
+        errors = point_errors(data_set, data_set.true_poses[nearest])
+        # Range noise of 0.12 m and bearing noise of 0.02 rad at 2 to 7 m.
+        assert np.median(errors) < 0.2
+        assert data_set.left_out['misread'] <= 3
+        assert data_set.left_out['robot'] > 300
+
+    def test_real_commands_say_how_the_robot_moves(self, data_dir):
+        data_set = load_mrclam(data_dir / 'mrclam' / 'MRCLAM_Dataset6', 1)
+        seconds = (data_set.velocity_stamps_ns - data_set.velocity_stamps_ns[0]) / SECOND_NS
+        path_length = np.sum(data_set.body_velocities[:-1, 3] * np.diff(seconds))
+        steps = np.diff(data_set.true_poses[::50, :3, 3], axis=0)
+        # Commands: true motion is 5 to 15 % less.
+        assert 1.0 < path_length / np.linalg.norm(steps, axis=1).sum() < 1.2
+
+
+class TestStarryNight:
+    def test_one_point_by_hand(self, tmp_path):
+        data_set = load_starry_night(write_starry_night(tmp_path / 'data.mat'))
+        [observation] = data_set.observations  # The first frame sees nothing.
+        assert observation.stamp_ns == EPOCH_NS + SECOND_NS // 4
+        assert observation.ids.tolist() == [4]
+        np.testing.assert_allclose(observation.points, [[2.1, 1.0, 0.5]], atol=1e-12)
+
+    def test_velocities_and_truth(self, tmp_path):
+        data_set = load_starry_night(write_starry_night(tmp_path / 'data.mat'))
+        assert data_set.body_velocities[1].tolist() == [-0.4, -0.5, -0.6, 4, 5, 6]
+        expected = [[0, -1, 0, 1], [1, 0, 0, 1], [0, 0, 1, 1], [0, 0, 0, 1]]
+        np.testing.assert_allclose(data_set.true_poses[1], expected, atol=1e-12)
+        assert data_set.landmarks.ids.tolist() == list(range(20))
+        assert data_set.landmarks.world_points[4].tolist() == [4, 24, 44]
+
+    def test_what_is_wrong_is_named(self, tmp_path):
+        file = tmp_path / 'data.mat'
+        with pytest.raises(DataSetError, match='no such file'):
+            load_starry_night(file)
+        file.write_text('no matrices at all' * 100)
+        with pytest.raises(DataSetError, match='not a MATLAB file'):
+            load_starry_night(file)
+        whole = write_starry_night(file).read_bytes()
+        file.write_bytes(whole[: len(whole) // 2])
+        with pytest.raises(DataSetError, match='or damaged'):
+            load_starry_night(file)
+        scipy.io.savemat(file, {'t': np.zeros((1, 2))})
+        with pytest.raises(DataSetError, match='it lacks v_vk_vk_i'):
+            load_starry_night(file)
+        write_starry_night(file, r_i_vk_i=np.zeros((3, 5)))
+        with pytest.raises(DataSetError, match=r'r_i_vk_i has shape \(3, 5\), not \(3, 2\)'):
+            load_starry_night(file)
+
+    def test_real_points_agree_with_the_truth(self, data_dir):
+        data_set = load_starry_night(data_dir / 'starry_night' / 'dataset3.mat')
+        seen = np.isin(
+            data_set.truth_stamps_ns, [event.stamp_ns for event in data_set.observations]
+        )
+        errors = point_errors(data_set, data_set.true_poses[seen])
+        assert np.median(errors) == pytest.approx(0.022, abs=0.001)
+        assert np.percentile(errors, 95) == pytest.approx(0.082, abs=0.001)
+        assert errors.max() == pytest.approx(0.91, abs=0.01)
+        assert len(errors) / len(data_set.truth_stamps_ns) == pytest.approx(4.95, abs=0.01)
+
+    def test_real_velocities_have_the_sign_of_the_true_motion(self, data_dir):
+        data_set = load_starry_night(data_dir / 'starry_night' / 'dataset3.mat')
+        seconds = np.diff(data_set.truth_stamps_ns) / SECOND_NS
+        motion = se3.inverse(data_set.true_poses[:-1]) @ data_set.true_poses[1:]
+        true_velocities = se3.log(motion) / seconds[:, None]
+        for axis, least in enumerate([0.8, 0.6, 0.25, 0.8, 0.8, 0.8]):
+            measured = data_set.body_velocities[:-1, axis]
+            assert np.corrcoef(measured, true_velocities[:, axis])[0, 1] > least
+
+    def test_real_recording_holds_every_event(self, data_dir, tmp_path):
+        out = tmp_path / 'starry.mcap'
+        data_set = load_starry_night(data_dir / 'starry_night' / 'dataset3.mat')
+        write_data_set(data_set, out)
+        with Recording(out) as recording:
+            selected = recording.find_topics()
+            events = list(recording.events(selected))
+            truth = recording.truth(selected)
+        velocities = [event for event in events if isinstance(event, VelocityEvent)]
+        observations = [event for event in events if isinstance(event, ObservationEvent)]
+        assert [event.stamp_ns for event in velocities] == data_set.velocity_stamps_ns.tolist()
+        for read, written in zip(observations, data_set.observations, strict=True):
+            assert read.stamp_ns == written.stamp_ns
+            np.testing.assert_array_equal(read.ids, written.ids)
+            np.testing.assert_allclose(read.points, written.points, rtol=1e-6)
+        np.testing.assert_allclose(truth.poses, data_set.true_poses, atol=1e-12)
+        rotations = truth.poses[:, :3, :3]
+        np.testing.assert_allclose(rotations, so3.normalise(rotations), atol=1e-12)

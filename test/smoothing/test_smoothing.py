@@ -1,0 +1,574 @@
+"""Smoothing: least squares over prior, motions and observations, and looking back by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from unittest.mock import Mock
+
+from gain_worlds import (
+    configuration_error_m,
+    drive,
+    estimate,
+    OBSERVED_EVERY,
+    START_NS,
+    STEP_NS,
+)
+from hypothesis import given
+import numpy as np
+import pytest
+from strategies import generators
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
+from slam_observer_ros.observer.filter import FrameObservation
+from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.prediction import initial_covariance, predict
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.smoothing.gauss_newton import Frames, Smoother, Solution
+from slam_observer_ros.smoothing.history import History
+from slam_observer_ros.smoothing.prior import Prior
+from slam_observer_ros.smoothing.relinearisation import Hindsight
+
+LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_distance=1e9)
+FRAMES, LANDMARKS = 5, 4
+
+
+def random_covariances(rng, count, size, scale):
+    roots = rng.normal(size=(count, size, size))
+    return scale**2 * (roots @ roots.swapaxes(1, 2) / size + 0.1 * np.eye(size))
+
+
+class Problem:
+    """A random smoothing problem whose residuals are far from zero, and its dense solution.
+
+    Its unknowns are x = (η_0 … η_S, dc, dp) as in the module's text.
+    """
+
+    def __init__(self, axes, calibrations, seed, is_relative=False, known_landmarks=2):
+        rng = np.random.default_rng(seed)
+        d, k, c = axes.p, axes.point, calibrations
+        self.axes, self.d, self.k, self.c = axes, d, k, c
+        motions = se3.exp(self._tangents(0.3 * rng.normal(size=(FRAMES, d))))
+        prior_size = d + c + k * known_landmarks
+        points = axes.full_points(rng.normal(scale=3.0, size=(LANDMARKS, k)))
+        self.prior = Prior(
+            se3.exp(self._tangents(rng.normal(size=(1, d))))[0],
+            0.1 * rng.normal(size=c),
+            points[:known_landmarks]
+            + 0.05 * axes.full_points(rng.normal(size=known_landmarks * k)),
+            random_covariances(rng, 1, prior_size, 0.1)[0],
+            is_relative,
+        )
+        frames = np.repeat(np.arange(FRAMES), 3)
+        landmarks = np.concatenate([rng.permutation(LANDMARKS)[:3] for _ in range(FRAMES)])
+        poses = np.array([self.prior.pose])
+        for motion in motions:
+            poses = np.concatenate([poses, poses[-1:] @ motion])
+        seen = se3.transform(se3.inverse(poses[frames + 1]), points[landmarks][:, None])[
+            :, 0
+        ] + 0.1 * axes.full_points(rng.normal(size=len(frames) * k))
+        self.frames = Frames(
+            motions,
+            random_covariances(rng, FRAMES, d, 0.1),
+            0.2 * rng.normal(size=(FRAMES, d, c)),
+            0.1 * rng.normal(size=(FRAMES, c)),
+            frames,
+            landmarks,
+            seen,
+            np.linalg.inv(random_covariances(rng, len(frames), k, 0.1)),
+            rng.uniform(0.1, 1.0, len(frames)),
+        )
+        eta = self._tangents(0.1 * rng.normal(size=(FRAMES + 1, d)))
+        self.start = Solution(poses @ se3.exp(eta), np.zeros(c), points)
+
+    def _tangents(self, coordinates):
+        full = np.zeros((len(coordinates), 6))
+        full[:, self.axes.pose] = coordinates
+        return full
+
+    def moved(self, solution, x):
+        poses = (FRAMES + 1) * self.d
+        eta = self._tangents(x[:poses].reshape(-1, self.d))
+        return Solution(
+            solution.poses @ se3.exp(eta),
+            solution.calibration + x[poses : poses + self.c],
+            solution.points + self.axes.full_points(x[poses + self.c :]),
+        )
+
+    def residuals(self, solution):
+        """All residuals, whitened: the cost is half the sum of their squares."""
+        pose, frames = self.axes.pose, self.frames
+        known, prior_points = solution.points[: len(self.prior.points)], self.prior.points
+        if self.prior.is_relative:
+            known = se3.transform(se3.inverse(solution.poses[0]), known)
+            prior_points = se3.transform(se3.inverse(self.prior.pose), prior_points)
+        off = [
+            se3.log(se3.inverse(self.prior.pose) @ solution.poses[0])[pose],
+            solution.calibration - self.prior.calibration,
+            (known - prior_points)[:, : self.k].ravel(),
+        ]
+        whitened = [whiten(np.linalg.inv(self.prior.covariance), np.concatenate(off))]
+        for s in range(FRAMES):
+            by_calibration = frames.sensitivities[s] @ (
+                solution.calibration - frames.calibrations[s]
+            )
+            motion = frames.motions[s] @ se3.exp(self._tangents(by_calibration[None])[0])
+            step = se3.inverse(solution.poses[s]) @ solution.poses[s + 1]
+            error = se3.log(se3.inverse(motion) @ step)[pose]
+            whitened.append(whiten(np.linalg.inv(frames.motion_covariances[s]), error))
+        counted = frames.information * frames.shares[:, None, None]
+        for frame, landmark, point, information in zip(
+            frames.frames, frames.landmarks, frames.points, counted, strict=True
+        ):
+            back = se3.inverse(solution.poses[frame + 1])
+            error = se3.transform(back, solution.points[None, landmark])[0] - point
+            whitened.append(whiten(information, error[: self.k]))
+        return np.concatenate(whitened)
+
+    def jacobian(self, solution, h=1e-6):
+        size = (FRAMES + 1) * self.d + self.c + self.k * LANDMARKS
+        columns = [
+            self.residuals(self.moved(solution, h * x))
+            - self.residuals(self.moved(solution, -h * x))
+            for x in np.eye(size)
+        ]
+        return np.array(columns).T / (2 * h)
+
+
+def whiten(information, error):
+    return np.linalg.cholesky(information).T @ error
+
+
+problems = pytest.mark.parametrize(
+    'problem',
+    [
+        Problem(axes, c, seed, is_relative)
+        for axes in (PLANAR, SPATIAL)
+        for c in (0, 2)
+        for seed in (0, 1)
+        for is_relative in (False, True)
+    ],
+)
+
+
+@problems
+def test_one_iteration_is_the_dense_gauss_newton_step(problem):
+    J, r = problem.jacobian(problem.start), problem.residuals(problem.start)
+    expected = problem.moved(problem.start, -np.linalg.solve(J.T @ J, J.T @ r))
+    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    solution = smoother.smooth(problem.start, 1, 0.0).end
+    np.testing.assert_allclose(solution.poses, expected.poses, atol=1e-6)
+    np.testing.assert_allclose(solution.calibration, expected.calibration, atol=1e-6)
+    np.testing.assert_allclose(solution.points, expected.points, atol=1e-6)
+
+
+@problems
+def test_the_solution_is_where_the_gradient_of_the_cost_vanishes(problem):
+    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    solution = smoother.smooth(problem.start, 200, 1e-10).end
+    gradient = problem.jacobian(solution).T @ problem.residuals(solution)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-5)
+
+
+@problems
+def test_marginal_is_that_of_the_dense_inverse(problem):
+    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    J = problem.jacobian(problem.start)
+    first = FRAMES * problem.d
+    np.testing.assert_allclose(
+        smoother.smooth(problem.start, 1, 0.0).marginal(),
+        np.linalg.inv(J.T @ J)[first:, first:],
+        rtol=1e-4,
+        atol=1e-7,
+    )
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+@pytest.mark.parametrize('forgotten', [[], [0], [0, 1]])
+def test_what_is_known_as_seen_from_the_pose_says_the_same_there(axes, forgotten):
+    prior = Problem(axes, 2, seed=5).prior
+    rows = np.array(forgotten, dtype=np.int64)
+    absolute = prior.without(axes, rows)
+    relative = prior.relative(axes).without(axes, rows)
+    at_it = absolute.pose, absolute.calibration, absolute.points
+    expected, _ = absolute.normal_equations(axes, np.linalg.inv(absolute.covariance), *at_it)
+    found, gradient = relative.normal_equations(axes, np.linalg.inv(relative.covariance), *at_it)
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+@pytest.mark.parametrize('turns_together', [True, False])
+def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_together):
+    d, points = axes.p, axes.full_points(np.arange(4.0 * axes.point))
+    together = np.concatenate([np.eye(d), axes.output_matrix(points).reshape(-1, d)])
+    turn, own = (
+        np.diag(0.1 * (np.arange(d) < d - axes.point)),
+        np.diag(np.full(len(together), 1e-3)),
+    )
+    covariance = together @ turn @ together.T + own
+    if not turns_together:
+        covariance[:d, d:] = covariance[d:, :d] = 0.0
+    prior, angle_rad = Prior(np.eye(4), np.empty(0), points, covariance).least_nonlinear(axes)
+    assert prior.is_relative == turns_together
+    assert angle_rad < 0.1
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
+    """A stretch without observations reaches the history in pieces."""
+    rng, d, k = np.random.default_rng(0), axes.p, 6
+    settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
+    V, dt_s = np.zeros((k, 6)), np.full(k, 0.2)
+    V[:, axes.pose] = rng.normal(size=(k, d))
+    path = [np.eye(4)]
+    for motion in se3.exp(V * dt_s[:, None]):
+        path.append(path[-1] @ motion)
+    path, covariances = np.array(path), random_covariances(rng, k, 6, 0.1)
+
+    def frames(*cuts):
+        calibration = Calibration(settings, axes)
+        count = d + calibration.count
+        start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
+        history = History(axes, ObservationNoise(settings), start, 'the start')
+        for a, b in pairwise((0, *cuts, k)):
+            at_ends, duration_s = np.zeros((2, 6)), float(dt_s[a:b].sum())
+            part = Motion(
+                path[a : b + 1], V[a:b], dt_s[a:b], covariances[a:b], duration_s, at_ends
+            )
+            P = initial_covariance(axes, calibration)
+            history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
+        nothing = FrameObservation(
+            0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+        )
+        history.see(nothing, path[-1])
+        return history.frames()
+
+    whole, parts = frames(), frames(1, 3)
+    np.testing.assert_allclose(parts.motions, whole.motions, atol=1e-12)
+    np.testing.assert_allclose(parts.motion_covariances, whole.motion_covariances, atol=1e-12)
+    np.testing.assert_allclose(parts.sensitivities, whole.sensitivities, atol=1e-12)
+    assert (np.abs(whole.sensitivities).max(axis=(0, 1)) > 0.01).all()
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+@given(rng=generators())
+def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
+    d = axes.p
+    settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
+    calibration = Calibration(settings, axes)
+    c = calibration.count
+    start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(d + c))
+    history = History(axes, ObservationNoise(settings), start, 'the start')
+    turn = np.zeros((3, 6))
+    turn[:, axes.pose] = rng.normal(size=(3, d))
+    poses = se3.exp(np.cumsum(turn, axis=0))
+    noises = random_covariances(rng, 3, d, 0.1)
+    sensitivities = rng.normal(size=(3, d, c))
+    path = np.concatenate([np.eye(4)[None], poses])
+    for part in range(3):
+        history.move(path[part : part + 2], noises[part], sensitivities[part], np.zeros(c))
+    nothing = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+    history.see(FrameObservation(0, *nothing), path[-1])
+    history.see(FrameObservation(1, *nothing), path[-1])  # nothing has moved since
+    frames = history.frames()
+    to_body = se3.adjoint(se3.inverse(path[-1]))[axes.pose, axes.pose]
+    np.testing.assert_allclose(
+        frames.sensitivities, [to_body @ sensitivities.sum(axis=0), np.zeros((d, c))], atol=1e-9
+    )
+    expected = to_body @ noises.sum(axis=0) @ to_body.T
+    np.testing.assert_allclose(frames.motion_covariances[0], expected, atol=1e-9)
+    np.testing.assert_array_equal(frames.motion_covariances[1], 0.0)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_smoothing_a_run_without_noise_returns_the_truth(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
+    world = drive(settings, 15.0, noise=0.0)
+    hindsight = estimate(world, settings).smooth()
+    assert len(hindsight.stamps_ns) == len(world.observations())
+    np.testing.assert_allclose(hindsight.poses, world.poses[::OBSERVED_EVERY], atol=1e-6)
+    np.testing.assert_allclose(
+        hindsight.world_points, world.world_points[hindsight.ids], atol=1e-6
+    )
+
+
+def test_in_hindsight_too_a_point_counts_as_its_message_says():
+    """Every second observation is a foot off, and says so."""
+    still = (1e-4,) * 3
+    settings = Settings(angular_velocity_noise=still, linear_velocity_noise=still)
+    estimator, points = Estimator(settings), 4.0 * np.vstack([np.eye(3), -np.eye(3)])
+    for step in range(20):
+        estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+        off_m, sigma_m = (0.3, 0.5) if step % 2 else (0.0, 0.01)
+        covariances = np.tile(sigma_m**2 * np.eye(3), (6, 1, 1))
+        seen = points + off_m * points / 4.0
+        estimator.add(ObservationEvent(step * 10**8, np.arange(6), seen, covariances))
+    estimator.flush()
+    np.testing.assert_allclose(estimator.smooth().world_points, points, atol=2e-3)
+
+
+def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkeypatch):
+    """A stereo camera that has turned further than it knew errs along where it looks now."""
+    noted, see = [], History.see
+
+    def note(history, seen, *rest):
+        noted.append(seen)
+        see(history, seen, *rest)
+
+    monkeypatch.setattr(History, 'see', note)
+    settings = Settings(observation_model='stereo', reorder_window=0.0)
+    settings = replace(settings, angular_velocity_noise=(0.3,) * 3)
+    estimator = Estimator(settings)
+    points = np.array([[4.0, 0.0, 0.0], [3.2, 2.4, 0.0], [3.2, 0.0, 2.4]])
+    turned = points @ so3.exp(np.array([0.0, 0.0, 0.2]))
+    for step, seen in enumerate([points, points, points, turned]):
+        estimator.add(VelocityEvent(step * 10**9, np.zeros(6)))
+        estimator.add(ObservationEvent(step * 10**9, np.arange(3), seen))
+    there = ObservationNoise(settings).covariances(ObservationEvent(0, np.arange(3), turned))
+    taken = ObservationNoise(settings).at(noted[-1].lines_of_sight)
+    np.testing.assert_allclose(taken, there, atol=0.1 * np.max(there))
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_in_hindsight_a_gross_outlier_counts_for_nothing(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
+    world = drive(settings, 10.0)
+
+    def throw(index, event):
+        is_off = (np.arange(len(event.ids)) == 1) & (index == 20)
+        return replace(event, points=event.points + is_off[:, None] * [30.0, -20.0, 0.0])
+
+    def omit(index, event):
+        kept = (np.arange(len(event.ids)) != 1) | (index != 20)
+        return replace(event, ids=event.ids[kept], points=event.points[kept])
+
+    thrown = estimate(world.with_observations(throw), settings).smooth()
+    omitted = estimate(world.with_observations(omit), settings).smooth()
+    np.testing.assert_allclose(thrown.poses, omitted.poses, atol=1e-3)
+    np.testing.assert_allclose(thrown.world_points, omitted.world_points, atol=1e-3)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_hindsight_beats_the_online_estimate(two_d_mode):
+    settings = Settings(two_d_mode=two_d_mode)
+    online, smoothed = [], []
+    for seed in range(4):
+        world = drive(settings, 20.0, seed)
+        poses = {}
+        estimator = estimate(
+            world,
+            settings,
+            lambda update, poses=poses: poses.update({update.stamp_ns: update.pose}),
+        )
+        hindsight = estimator.smooth()
+        stamps_ns = START_NS + STEP_NS * np.arange(len(world.poses))
+        truth = Trajectory(stamps_ns, world.poses)
+        online_run = Trajectory(np.array(list(poses)), np.array(list(poses.values())))
+        smoothed_run = Trajectory(hindsight.stamps_ns, hindsight.poses)
+        online.append(trajectory_errors(online_run, truth).ate_rmse_m)
+        smoothed.append(trajectory_errors(smoothed_run, truth).ate_rmse_m)
+    assert np.mean(smoothed) < 0.8 * np.mean(online)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+@pytest.mark.parametrize('calibrated', [False, True])
+def test_looking_back_a_piece_at_a_time_comes_to_what_all_of_it_tells(two_d_mode, calibrated):
+    settings = Settings(
+        two_d_mode=two_d_mode,
+        hindsight_interval=5,
+        hindsight_turn=0.0,
+        huber_threshold=0.0,
+        linear_scale_error=(0.3 * calibrated,) * 3,
+        angular_bias_error=(0.1 * calibrated,) * 3,
+    )
+    for seed in range(3):
+        world = drive(settings, 30.0, seed, scale=1.0 + 0.2 * calibrated)
+        estimator = estimate(world, settings)
+        deviations_m = np.sqrt(np.trace(estimator.landmark_covariances, axis1=1, axis2=2))
+        shifts = estimator.world_points - estimator.smooth().world_points
+        assert np.all(np.linalg.norm(shifts, axis=1) < 0.2 * deviations_m)
+
+
+@pytest.mark.parametrize('max_landmarks', [0, 7])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode, max_landmarks):
+    exact = Settings(
+        two_d_mode=two_d_mode,
+        angular_velocity_noise=(3e-4,) * 3,
+        linear_velocity_noise=(2e-4,) * 3,
+        range_noise=1e-3,
+        bearing_noise=3e-4,
+        huber_threshold=0.0,
+        hindsight_interval=0,
+        max_landmarks=max_landmarks,
+    )
+    world = drive(exact, 20.0)
+    plain = estimate(world, exact)
+    assert (plain.counts['forgotten_landmark'] > 0) == (max_landmarks > 0)
+    often = estimate(world, replace(exact, hindsight_interval=4, hindsight_turn=0.0))
+    sigma_m = np.sqrt(plain.pose_covariance.diagonal()[3:].max())
+    np.testing.assert_allclose(often.pose, plain.pose, atol=0.05 * sigma_m)
+    np.testing.assert_allclose(often.world_points, plain.world_points, atol=0.1 * sigma_m)
+    np.testing.assert_allclose(
+        often.pose_covariance,
+        plain.pose_covariance,
+        rtol=0.05,
+        atol=0.02 * np.abs(plain.pose_covariance).max(),
+    )
+
+
+@pytest.mark.parametrize(
+    ('turns_rad', 'due_after'),
+    [
+        ([0.0] * 40, None),
+        ([0.15] + [0.0] * 39, None),  # not far
+        ([0.15, 0.15] + [0.0] * 38, 20),  # far enough together
+        ([0.25] + [0.0] * 39, 2),  # all that follows would be linearised in the wrong place
+    ],
+)
+def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
+    settings = Settings(hindsight_interval=20, hindsight_turn=0.2)
+    calibration = Calibration(settings, SPATIAL)
+    joint = JointCovariance(SPATIAL, calibration, 0.0)
+    hindsight, observer = Hindsight(SPATIAL, settings, calibration, joint), Observer(np.eye(4))
+    nothing = FrameObservation(
+        0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+    )
+    looked_back_at = []
+    for turn_rad in turns_rad:
+        hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))
+        hindsight.look_back(observer, nothing, in_doubt=False)
+        looked_back_at.append(hindsight.history.summarised)
+    assert max(looked_back_at) == (due_after or 0)
+
+
+def test_what_observations_leave_open_is_told_once_with_what_to_do(caplog, monkeypatch):
+    monkeypatch.setattr(Smoother, 'smooth', Mock(side_effect=np.linalg.LinAlgError))
+    settings = Settings(hindsight_turn=0.0)
+    estimate(drive(settings, 10.0), settings)
+    (warning,) = [text for text in caplog.messages if 'look back' in text]
+    assert warning.startswith('Could not look back')
+    assert warning.endswith('set two_d_mode: true for a robot on a floor.')
+
+
+def test_odometry_that_knows_nothing_of_height_roll_and_pitch_can_be_looked_back_at(caplog):
+    world = drive(Settings(two_d_mode=True), 10.0, seen=1)
+    covariance = np.diag([1e12, 1e12, 1e-3, 1e-3, 1e-3, 1e12])
+    estimator = Estimator(Settings(hindsight_turn=0.01))
+    for event in world.events:
+        is_velocity = isinstance(event, VelocityEvent)
+        estimator.add(replace(event, covariance=covariance) if is_velocity else event)
+    assert not caplog.messages
+    assert np.isfinite(estimator.pose_covariance).all()
+
+
+def test_observations_of_nothing_take_no_room_in_the_window_and_tell_nothing():
+    settings = Settings(hindsight_interval=10, hindsight_turn=0.0, hindsight_window=0)
+    world = drive(settings, 15.0)
+    nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    stamps_ns = range(START_NS + STEP_NS // 2, START_NS + 300 * STEP_NS, STEP_NS)
+    events = world.events + [ObservationEvent(stamp_ns, *nothing) for stamp_ns in stamps_ns]
+    events.sort(key=lambda event: event.stamp_ns)
+    without = estimate(world, settings)
+    estimator = estimate(replace(world, events=events), settings)
+    smoothed, expected = estimator.smooth(), without.smooth()
+    np.testing.assert_array_equal(smoothed.stamps_ns, expected.stamps_ns)
+    np.testing.assert_allclose(smoothed.poses, expected.poses, atol=5e-3)
+    np.testing.assert_allclose(estimator.pose, without.pose_at(estimator.stamp_ns), atol=5e-3)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_a_short_window_stays_close_to_an_unlimited_one(two_d_mode):
+    settings = Settings(
+        two_d_mode=two_d_mode, hindsight_interval=10, hindsight_turn=0.0, hindsight_window=0
+    )
+    world = drive(settings, 30.0)
+    unlimited = estimate(world, settings)
+    short = estimate(world, replace(settings, hindsight_window=20))
+    assert len(unlimited.smooth().stamps_ns) == len(world.observations())
+    assert len(short.smooth().stamps_ns) < 20
+    sigma_m = np.sqrt(unlimited.pose_covariance.diagonal()[3:])
+    shift_m = np.abs(short.pose[:3, 3] - unlimited.pose[:3, 3])
+    assert np.all(shift_m <= 0.5 * sigma_m)
+    assert configuration_error_m(short, world) < 1.2 * configuration_error_m(unlimited, world)
+
+
+def test_the_window_bounds_the_history_even_if_nothing_ever_turns():
+    settings = Settings(hindsight_window=20, hindsight_turn=1e9)
+    estimator = Estimator(settings)
+    longest = 0
+    for event in drive(settings, 15.0, noise=0.0).events:
+        estimator.add(event)
+        longest = max(longest, len(estimator.smooth().stamps_ns))
+    assert 10 < longest < 20
+
+
+@pytest.mark.parametrize('window', range(41, 48))
+def test_a_landmark_that_moves_as_the_window_closes_stays_where_it_went(window):
+    settings = Settings(
+        hindsight_window=window, hindsight_interval=5, hindsight_turn=0.0, confirmations=1
+    )
+    world = drive(settings, 15.0, landmarks=4)
+
+    def move(index, event):
+        """The landmark moves 6 m at frame 40 and is out of view from frame 46 on."""
+        if index < 40:
+            return event
+        is_mover = event.ids == 2
+        away = world.true_pose(event.stamp_ns)[:3, :3].T @ np.array([6.0, 0.0, 0.0])
+        points = event.points + is_mover[:, None] * away
+        kept = ~is_mover | (index < 45)
+        return replace(event, ids=event.ids[kept], points=points[kept])
+
+    estimator = estimate(world.with_observations(move), settings)
+    assert estimator.counts['moved_landmark'] == 1
+    point = estimator.world_points[list(estimator.landmark_ids).index(2)]
+    expected = world.world_points[2] + [6.0, 0.0, 0.0]
+    np.testing.assert_allclose(point, expected, atol=1.0)
+
+
+def test_an_estimator_that_has_seen_nothing_has_nothing_to_smooth():
+    hindsight = Estimator(Settings()).smooth()
+    assert hindsight.poses.shape == (0, 4, 4)
+    assert hindsight.world_points.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'gains': 'constant'},
+        {'gains': 'scheduled'},
+        {'hindsight_interval': 0},
+        {'landmark_velocity_error': 0.1},
+        {'linear_scale_error': (0.1, 0.0, 0.0), 'calibration_drift': 0.1},
+    ],
+)
+def test_designs_that_keep_no_history_say_that_they_cannot_smooth(changes):
+    settings = Settings(**changes)
+    estimator = estimate(drive(settings, 2.0), settings)
+    with pytest.raises(ParameterError, match='smooth'):
+        estimator.smooth()
+
+
+def test_forgotten_landmarks_leave_the_history_too():
+    settings = Settings(hindsight_interval=10, hindsight_turn=0.0, hindsight_window=30)
+    world = drive(settings, 15.0)
+    estimator = Estimator(settings)
+    for index, event in enumerate(world.events):
+        estimator.add(event)
+        if index in (100, 200, 250):
+            assert estimator.forget(int(estimator.landmark_ids[1]))
+    estimator.flush()
+    assert configuration_error_m(estimator, world) < 0.5
+    np.testing.assert_array_equal(estimator.smooth().ids, estimator.landmark_ids)
