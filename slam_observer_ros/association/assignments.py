@@ -23,6 +23,7 @@ from slam_observer_ros.association.joint_compatibility import (
     RESOLUTION,
     unpaired_cost,
 )
+from slam_observer_ros.association.landmark_index import LandmarkIndex
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
@@ -30,8 +31,7 @@ from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
 from slam_observer_ros.observer.filter import Residuals
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.riccati.riccati import RiccatiGains
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.state import State
 
 MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""
@@ -55,36 +55,29 @@ class Assignment:
 
 
 def find_assignments(
-    slam: Slam, gains: RiccatiGains, event: ObservationEvent, budget: float
+    state: State, index: LandmarkIndex, event: ObservationEvent, budget: float
 ) -> list[Assignment]:
-    """Return all assignments that put the robot at different places.
+    """Return all assignments that put the robot at different places, the most likely first.
 
     Parameters
     ----------
-    slam : Slam
-        The state at the observation's instant.
-    gains : RiccatiGains
-        Its gains.
+    state, index : State, LandmarkIndex
+        The state at the observation's instant, and the index of its landmarks.
     event : ObservationEvent
         The observation, of m points.
     budget : float
         What an assignment may cost at most.
 
-    Returns
-    -------
-    list of Assignment
-        The most likely first.
-
     """
-    axes, m = slam.axes, len(event.ids)
-    seen = _Points(slam, event)
-    at, rows = _candidates(slam, gains, seen)
-    residuals = _as_residuals(slam.observer, seen, at, rows)
-    PC, CPC = gains.predicted_with_pose(residuals)
+    axes, m = state.axes, len(event.ids)
+    seen = _Points(state, event)
+    at, rows = _candidates(state, index, seen)
+    residuals = _as_residuals(state.observer, seen, at, rows)
+    PC, CPC = state.filter.predicted(residuals)
     r, noise = residuals.on(axes)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
-    gate_cost = unpaired_cost(slam.settings.rejection_distance)
+    gate_cost = unpaired_cost(state.settings.rejection_distance)
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), gate_cost)
     # Beyond what is searched; a point of no landmark costs the same whatever it might have been.
     fixed_cost = m * gate_cost - float(unpaired_costs[np.unique(at)].sum())
@@ -120,42 +113,44 @@ class _Points:
 
     """
 
-    def __init__(self, slam: Slam, event: ObservationEvent) -> None:
-        self.points = se3.transform(slam.observer.A, event.points)
-        self.noise = slam.observer.turned(slam.observation_noise.covariances(event))
-        self.known_rows = slam.landmarks.rows_of(event.ids)
+    def __init__(self, state: State, event: ObservationEvent) -> None:
+        self.points = se3.transform(state.observer.A, event.points)
+        self.noise = state.observer.turned(state.observation_noise.covariances(event))
+        self.known_rows = state.landmarks.rows_of(event.ids)
         self.is_new_id = (event.ids != UNKNOWN_ID) & (self.known_rows < 0)
 
 
-def _candidates(slam: Slam, gains: RiccatiGains, seen: _Points) -> tuple[IntArray, IntArray]:
+def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate.
 
     Each passes it alone: those of one point are the :data:`MAX_CANDIDATES` nearest at most.
     """
-    at, rows = _pairs_near(slam, gains, seen)
-    allowed = _may_be(slam, seen, at, rows)
+    at, rows = _pairs_near(state, index, seen)
+    allowed = _may_be(state, seen, at, rows)
     at, rows = at[allowed], rows[allowed]
-    distances = gains.distances(_as_residuals(slam.observer, seen, at, rows))
+    distances = state.filter.distances(_as_residuals(state.observer, seen, at, rows))
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
-    passes = distances[order] <= slam.settings.rejection_distance
+    passes = distances[order] <= state.settings.rejection_distance
     near = order[(rank < MAX_CANDIDATES) & passes]
     return at[near], rows[near]
 
 
-def _pairs_near(slam: Slam, gains: RiccatiGains, seen: _Points) -> tuple[IntArray, IntArray]:
+def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
     """Return pairs (q,), (q,) of a point and a landmark, all that may pass the gate among them."""
+    of_pose, of_landmarks = state.filter.pose_covariance(), state.filter.landmark_covariances()
+    if of_pose is None or of_landmarks is None:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     C = SPATIAL.output_matrix(seen.points)
-    of_points = C @ gains.pose_error_covariance @ transpose(C) + seen.noise
-    of_landmarks = gains.landmark_error_covariances
+    of_points = C @ of_pose @ transpose(C) + seen.noise
     spread_m = _spread_m(of_points) + np.max(_spread_m(of_landmarks), initial=0.0)
-    reach_m = slam.settings.rejection_distance * spread_m
-    return slam.index.near(slam.observer.points, seen.points, reach_m)
+    reach_m = state.settings.rejection_distance * spread_m
+    return index.near(state.observer.points, seen.points, reach_m)
 
 
-def _may_be(slam: Slam, seen: _Points, at: IntArray, rows: IntArray) -> BoolArray:
+def _may_be(state: State, seen: _Points, at: IntArray, rows: IntArray) -> BoolArray:
     """Return which pairs (q,) of a point and a landmark the ids of the points allow."""
-    is_automatic_id = is_automatic(slam.landmarks.ids)
+    is_automatic_id = is_automatic(state.landmarks.ids)
     others = ~np.isin(rows, seen.known_rows) & (~seen.is_new_id[at] | is_automatic_id[rows])
     known_rows = seen.known_rows[at]
     return np.asarray(np.where(known_rows >= 0, rows == known_rows, others))

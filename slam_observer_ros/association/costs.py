@@ -17,11 +17,10 @@ from slam_observer_ros.association.joint_compatibility import (
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
 from slam_observer_ros.observer.filter import Residuals
-from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.observer.robust import gated
 from slam_observer_ros.state.map_management import rejected_before
 from slam_observer_ros.state.matching import MatchedObservation
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.state import State
 
 SLIP_COST = 20.0
 """What it costs to take a robot for slipped, at odds of e¹⁰, beside what it sees then."""
@@ -33,21 +32,21 @@ MAX_OF_ONE_CAUSE = 3
 """Points that cost this, at most: one garbled message is one, however much it tells."""
 
 
-def outlier_cost(slam: Slam) -> float:
+def outlier_cost(state: State) -> float:
     """Return what it costs that a point is of no landmark that is known."""
-    return unpaired_cost(slam.settings.rejection_distance)
+    return unpaired_cost(state.settings.rejection_distance)
 
 
-def pairing_cost(slam: Slam, gains: RiccatiGains, m: int, residuals: Residuals) -> float:
+def pairing_cost(state: State, m: int, residuals: Residuals) -> float:
     """Return what it costs to take some of m points for the landmarks whose ids they have."""
-    r, noise = residuals.on(slam.axes)
-    passed, predicted = gated(r, gains.predicted(residuals), noise, slam.settings)
+    r, noise = residuals.on(state.axes)
+    passed, predicted = gated(r, state.filter.predicted(residuals)[1], noise, state.settings)
     paired_cost = joint_cost(r[passed], with_blocks(predicted, noise[passed]), noise[passed])
-    return paired_cost + (m - int(np.sum(passed))) * outlier_cost(slam)
+    return paired_cost + (m - int(np.sum(passed))) * outlier_cost(state)
 
 
 def rejection_cost(
-    slam: Slam, matched: MatchedObservation, rejected: BoolArray
+    state: State, matched: MatchedObservation, rejected: BoolArray
 ) -> tuple[float, bool]:
     """Return what it costs to reject landmarks, and whether there is a new cause for it.
 
@@ -56,28 +55,28 @@ def rejection_cost(
     well it is seen where it was: landmarks that have moved must not throw the pose, however often
     they are seen.
     """
-    again, staying = cost_of_staying(slam, matched)
+    again, staying = cost_of_staying(state, matched)
     again &= rejected
-    is_second = again & (slam.landmarks.rejections[matched.residuals.rows] == 1)
+    is_second = again & (state.landmarks.rejections[matched.residuals.rows] == 1)
     new = int(np.sum(rejected & ~again))
-    causes = new if slam.was_contradicted else min(new, 1)
+    causes = new if state.was_contradicted else min(new, 1)
     same_cause = min(new - causes, MAX_OF_ONE_CAUSE) * SAME_CAUSE_COST
     # One of these may be of a garbled message once more: the one that is surest to have stayed.
     moved = np.sort(staying[is_second])[1:]
     causes += len(moved)
     stayed = float(staying[again].sum() - moved.sum())
-    return causes * outlier_cost(slam) + same_cause + stayed, causes > 0
+    return causes * outlier_cost(state) + same_cause + stayed, causes > 0
 
 
-def cost_of_staying(slam: Slam, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
+def cost_of_staying(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
     """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
 
     Where they were rejected last is known as well as the sensor tells: compared with the first
     place, one that goes on moving would pay for one and the same shift each time. No landmark
     costs more than another outlier.
     """
-    k, known = slam.axes.point, matched.known
-    noise = 2.0 * slam.observer.turned(slam.observation_noise.covariances(known))
-    again, shifts = rejected_before(slam, matched)
+    k, known = state.axes.point, matched.known
+    noise = 2.0 * state.observer.turned(state.observation_noise.covariances(known))
+    again, shifts = rejected_before(state, matched)
     costs = huber_loss(mahalanobis(shifts[:, :k], noise[:, :k, :k])) + k * math.log(2.0)
-    return again, np.minimum(costs, outlier_cost(slam))
+    return again, np.minimum(costs, outlier_cost(state))

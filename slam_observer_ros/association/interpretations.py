@@ -25,15 +25,15 @@ from slam_observer_ros.association.costs import (
     rejection_cost,
     SLIP_COST,
 )
+from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.observer.filter import Residuals
-from slam_observer_ros.observer.riccati.riccati import RiccatiGains
 from slam_observer_ros.observer.robust import are_far, far_from_the_others
-from slam_observer_ros.state.matching import MatchedObservation
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.matching import match, MatchedObservation
+from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import is_contradiction
 
 
@@ -51,8 +51,8 @@ class Interpretation:
         The observation with all ids filled in, without points that are taken for outliers.
     cost : float
         −2 ln of its likelihood, up to what all interpretations of the observation share.
-    slipped : Slam or None
-        The state if the robot may have moved in any way since the observation before; else None.
+    slipped : Hypothesis or None
+        The hypothesis if the robot may have moved in any way since the last observation.
     disbelieved : ObservationEvent or None
         Of the points that were left out though the gate lets them pass, those of landmarks that
         were seen so seldom that these may be the outliers; None or empty if there are none.
@@ -63,14 +63,14 @@ class Interpretation:
 
     event: ObservationEvent
     cost: float
-    slipped: Slam | None = None
+    slipped: Hypothesis | None = None
     disbelieved: ObservationEvent | None = None
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
 
 
 def interpretations(
-    slam: Slam,
+    hypothesis: Hypothesis,
     event: ObservationEvent,
     matched: MatchedObservation,
     new_ids: IntArray,
@@ -78,10 +78,12 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
+    As it came and at no cost, where there is no joint covariance to judge it by.
+
     Parameters
     ----------
-    slam : Slam
-        The state at the observation's instant.
+    hypothesis : Hypothesis
+        That of the observation's instant.
     event : ObservationEvent
         The observation, of m points.
     matched : MatchedObservation
@@ -91,37 +93,31 @@ def interpretations(
     budget : float
         Cost beyond which interpretations need not be returned.
 
-    Returns
-    -------
-    list of Interpretation
-        As it came and at no cost if the gains know no joint covariance to judge it by.
-
     """
-    gains = slam.gains
-    if not isinstance(gains, RiccatiGains):
+    state = hypothesis.state
+    if not state.filter.has_joint_covariance:
         return [Interpretation(event, 0.0)]
     residuals, m = matched.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
-    rejected = _are_rejected(slam, residuals)
+    rejected = _are_rejected(state, residuals)
     is_contradicted = not some_are_unknown and is_contradiction(rejected)
-    sensor_distances = _sensor_distances(slam, residuals)
-    is_suspect = _suspects(slam, gains, residuals, sensor_distances)
-    suspects = slam.landmarks.ids[residuals.rows[is_suspect]]
-    if not is_contradicted and (some_are_unknown or may_relabel(slam, matched)):
-        return _by_assignments(slam, gains, event, new_ids, suspects, budget)
+    sensor_distances = _sensor_distances(state, residuals)
+    is_suspect = _suspects(state, residuals, sensor_distances)
+    suspects = state.landmarks.ids[residuals.rows[is_suspect]]
+    if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
+        return _by_assignments(hypothesis, event, new_ids, suspects, budget)
     if is_contradicted:
-        trusting, *slipped = _rejected_or_slipped(slam, gains, matched, event, rejected)
+        trusting, *slipped = _rejected_or_slipped(hypothesis, matched, event, rejected)
     else:
-        trusting, slipped = Interpretation(event, pairing_cost(slam, gains, m, residuals)), []
+        trusting, slipped = Interpretation(event, pairing_cost(state, m, residuals)), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
-    without = [_without(ids, slam, gains, matched, trusting) for ids in doubted]
+    without = [_without(ids, state, matched, trusting) for ids in doubted]
     return [trusting, *without, *slipped]
 
 
 def _without(
     ids: IntArray,
-    slam: Slam,
-    gains: RiccatiGains,
+    state: State,
     matched: MatchedObservation,
     trusting: Interpretation,
 ) -> Interpretation:
@@ -131,12 +127,12 @@ def _without(
     that it may itself be the outlier.
     """
     event, residuals = trusting.event, matched.residuals
-    out = np.isin(slam.landmarks.ids[residuals.rows], ids)
-    cost = max(trusting.cost, pairing_cost(slam, gains, len(event.ids), residuals.select(~out)))
-    unconfirmed = out & (slam.landmarks.counts[residuals.rows] < slam.settings.confirmations)
-    again, staying = cost_of_staying(slam, matched)
-    saved = float(np.sum(outlier_cost(slam) - staying[again & unconfirmed]))
-    unconfirmed_ids = slam.landmarks.ids[residuals.rows[unconfirmed]]
+    out = np.isin(state.landmarks.ids[residuals.rows], ids)
+    cost = max(trusting.cost, pairing_cost(state, len(event.ids), residuals.select(~out)))
+    unconfirmed = out & (state.landmarks.counts[residuals.rows] < state.settings.confirmations)
+    again, staying = cost_of_staying(state, matched)
+    saved = float(np.sum(outlier_cost(state) - staying[again & unconfirmed]))
+    unconfirmed_ids = state.landmarks.ids[residuals.rows[unconfirmed]]
     return Interpretation(
         event.select(~np.isin(event.ids, ids)),
         cost - saved,
@@ -144,29 +140,28 @@ def _without(
     )
 
 
-def is_ambiguous(slam: Slam, matched: MatchedObservation) -> bool:
+def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
     """Return whether an observation, all of whose points have ids, may mean different things."""
-    gains, residuals = slam.gains, matched.residuals
-    if not isinstance(gains, RiccatiGains):
+    residuals = matched.residuals
+    if not state.filter.has_joint_covariance:
         return False
-    sensor_distances = _sensor_distances(slam, residuals)
-    if (sensor_distances <= slam.settings.rejection_distance).all():
+    sensor_distances = _sensor_distances(state, residuals)
+    if (sensor_distances <= state.settings.rejection_distance).all():
         return False  # by all of S they are no further off
-    some_are_suspect = bool(_suspects(slam, gains, residuals, sensor_distances).any())
-    return some_are_suspect or is_contradiction(_are_rejected(slam, residuals))
+    some_are_suspect = bool(_suspects(state, residuals, sensor_distances).any())
+    return some_are_suspect or is_contradiction(_are_rejected(state, residuals))
 
 
-def may_relabel(slam: Slam, matched: MatchedObservation) -> bool:
+def may_relabel(state: State, matched: MatchedObservation) -> bool:
     """Return whether a point's id may be that of a landmark which had none of its own so far."""
     all_are_known = len(matched.known.ids) == len(matched.rows) + matched.left_out
-    if all_are_known or not isinstance(slam.gains, RiccatiGains):
+    if all_are_known or not state.filter.has_joint_covariance:
         return False
-    return bool(is_automatic(slam.landmarks.ids).any())
+    return bool(is_automatic(state.landmarks.ids).any())
 
 
 def _rejected_or_slipped(
-    slam: Slam,
-    gains: RiccatiGains,
+    hypothesis: Hypothesis,
     matched: MatchedObservation,
     event: ObservationEvent,
     rejected: BoolArray,
@@ -176,63 +171,60 @@ def _rejected_or_slipped(
     If a single motion would have put all where they are seen, that is as unlikely of a garbled
     message as of a robot that has made this motion.
     """
-    residuals, m = matched.residuals, len(event.ids)
-    cost, is_news = rejection_cost(slam, matched, rejected)
-    as_told = pairing_cost(slam, gains, m - int(np.sum(rejected)), residuals.select(~rejected))
-    after_slip = _after_slip(slam, matched, event) if is_news else None
+    state, residuals, m = hypothesis.state, matched.residuals, len(event.ids)
+    cost, is_news = rejection_cost(state, matched, rejected)
+    as_told = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
+    after_slip = _after_slip(hypothesis, matched, event) if is_news else None
     if after_slip is None:
         return [Interpretation(event, as_told + cost)]
-    if slam.was_contradicted:
+    if state.was_contradicted:
         return [Interpretation(event, as_told + cost), after_slip]
-    as_outliers = as_told + float(np.sum(rejected)) * outlier_cost(slam)
+    as_outliers = as_told + float(np.sum(rejected)) * outlier_cost(state)
     # A garbled message explains what happens to be where it should be, too.
     garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
     return [Interpretation(event, garbled), after_slip]
 
 
 def _after_slip(
-    slam: Slam, matched: MatchedObservation, event: ObservationEvent
+    hypothesis: Hypothesis, matched: MatchedObservation, event: ObservationEvent
 ) -> Interpretation | None:
     """Take the robot for slipped; return None if that does not explain all of it."""
-    settings = slam.settings
+    settings = hypothesis.state.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return None
-    slipped = deepcopy(slam)
-    cost = slip(slipped, matched)
-    residuals, gains = slipped.match(event).residuals, slipped.gains
-    if not isinstance(gains, RiccatiGains) or _are_rejected(slipped, residuals).any():
+    slipped = deepcopy(hypothesis)
+    cost = slip(slipped.state, matched)
+    residuals = match(slipped.state, event).residuals
+    if _are_rejected(slipped.state, residuals).any():
         return None
-    cost += SLIP_COST + pairing_cost(slipped, gains, len(event.ids), residuals)
+    cost += SLIP_COST + pairing_cost(slipped.state, len(event.ids), residuals)
     return Interpretation(event, cost, slipped)
 
 
-def _sensor_distances(slam: Slam, residuals: Residuals) -> FloatArray:
+def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
     """Return how far off points are by the sensor's noise alone (m,): this is quickly told."""
-    return mahalanobis(*residuals.on(slam.axes))
+    return mahalanobis(*residuals.on(state.axes))
 
 
-def _are_rejected(slam: Slam, residuals: Residuals) -> BoolArray:
+def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
     """Return which points (m,) the gate rejects."""
-    return np.asarray(slam.gains.distances(residuals) > slam.settings.rejection_distance)
+    return np.asarray(state.filter.distances(residuals) > state.settings.rejection_distance)
 
 
-def _suspects(
-    slam: Slam, gains: RiccatiGains, residuals: Residuals, sensor_distances: FloatArray
-) -> BoolArray:
+def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:
     """Return which points (m,) only pass the gate since the state is so uncertain.
 
     ``sensor_distances`` (m,) are their :func:`_sensor_distances`.
     """
-    far = are_far(sensor_distances, slam.settings)
+    far = are_far(sensor_distances, state.settings)
     if far.any():
-        r, noise = residuals.on(slam.axes)
-        far &= far_from_the_others(r, gains.predicted(residuals), noise, slam.settings)
+        r, noise = residuals.on(state.axes)
+        far &= far_from_the_others(r, state.filter.predicted(residuals)[1], noise, state.settings)
     return far
 
 
 def _by_assignments(
-    slam: Slam,
-    gains: RiccatiGains,
+    hypothesis: Hypothesis,
     event: ObservationEvent,
     new_ids: IntArray,
     suspects: IntArray,
@@ -243,14 +235,15 @@ def _by_assignments(
     An id is believed here, too, until something contradicts it: an interpretation without a
     suspect costs no less than one with all of them.
     """
-    found = find_assignments(slam, gains, event, budget)
+    state = hypothesis.state
+    found = find_assignments(state, hypothesis.index, event, budget)
     outliers = [np.isin(event.ids, suspects) & (assignment.rows < 0) for assignment in found]
     pairs = list(zip(found, outliers, strict=True))
     trusting = min((assignment.cost for assignment, out in pairs if not out.any()), default=0.0)
     interpreted = []
     for assignment, out in pairs:
         cost = max(assignment.cost, trusting) if out.any() else assignment.cost
-        interpretation = _with_ids(slam, event, assignment, new_ids)
+        interpretation = _with_ids(state, event, assignment, new_ids)
         interpreted.append(
             replace(interpretation, event=interpretation.event.select(~out), cost=cost)
         )
@@ -258,11 +251,11 @@ def _by_assignments(
 
 
 def _with_ids(
-    slam: Slam, event: ObservationEvent, assignment: Assignment, new_ids: IntArray
+    state: State, event: ObservationEvent, assignment: Assignment, new_ids: IntArray
 ) -> Interpretation:
     """Interpret m points as an assignment has them; ``new_ids`` (m,) are for new landmarks."""
     rows, has_id = assignment.rows, event.ids != UNKNOWN_ID
-    known_ids = np.append(slam.landmarks.ids, UNKNOWN_ID)[rows]
+    known_ids = np.append(state.landmarks.ids, UNKNOWN_ID)[rows]
     ids = np.where(has_id, event.ids, np.where(rows < 0, new_ids, known_ids))
     is_relabelled = has_id & (rows >= 0) & (known_ids != event.ids)
     return Interpretation(

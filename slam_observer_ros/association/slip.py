@@ -14,7 +14,7 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.state.matching import MatchedObservation
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.state import State
 
 MAX_DURATION_S = 4.0
 """Time, seconds, for which odometry is taken to have told nothing, at most."""
@@ -29,35 +29,36 @@ MIN_VARIANCE = 1e-6
 """Least variance of where a robot without odometry gets and sees what it does, rad² or m²."""
 
 
-def slip(slam: Slam, matched: MatchedObservation) -> float:
+def slip(state: State, matched: MatchedObservation) -> float:
     """Let the robot have slipped in a way that explains what it sees.
 
     It is then known as badly as if odometry had told nothing for as long as that takes, and what
     it sees is yet to be used. Return what it costs that it went where it was put.
     """
-    observer, start = slam.observer, slam.observer.A
-    needed_s = min(_duration_s(slam, matched), MAX_DURATION_S)
+    observer, start = state.observer, state.observer.A
+    needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
     stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
-    noise = slam.motion_noise.covariances(stray)
-    variances = np.maximum(np.diagonal(noise[1])[slam.axes.pose], MIN_VARIANCE)
-    observer.propagate(np.array([start, _pose_after(slam, matched, variances)]))
-    moved = Motion(
-        path=np.array([start, observer.A, observer.A]),
+    noise = state.motion_noise.covariances(stray)
+    variances = np.maximum(np.diagonal(noise[1])[state.axes.pose], MIN_VARIANCE)
+    after = _pose_after(state, matched, variances)
+    motion = Motion(
+        path=np.array([start, after, after]),
         measured_velocities=stray.body_velocities,
         dt_s=stray.dt_s,
         covariances=noise,
         duration_s=0.0,
         at_ends=None,
+        calibration=state.filter.calibration,
     )
-    slam.gains.predict(observer, moved)
-    slam.counts['slip'] += 1
-    strayed = se3.log(se3.inverse(start) @ observer.A)[slam.axes.pose]
+    state.propagate(motion)
+    state.counts['slip'] += 1
+    strayed = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
     return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
 
 
-def _duration_s(slam: Slam, matched: MatchedObservation) -> float:
+def _duration_s(state: State, matched: MatchedObservation) -> float:
     """Return after how long without odometry a robot might see what it does, seconds."""
-    settings, k, residuals = slam.settings, slam.axes.point, matched.residuals
+    settings, k, residuals = state.settings, state.axes.point, matched.residuals
     points = matched.known.points
     turned_m2 = (k - 1) * settings.unknown_angular_motion**2 * np.sum(points**2, axis=1)
     after_1_s_m2 = turned_m2 + k * settings.unknown_linear_motion**2
@@ -65,22 +66,24 @@ def _duration_s(slam: Slam, matched: MatchedObservation) -> float:
     return float(np.mean(needed_s))
 
 
-def _pose_after(slam: Slam, matched: MatchedObservation, variances: FloatArray) -> FloatArray:
+def _pose_after(state: State, matched: MatchedObservation, variances: FloatArray) -> FloatArray:
     """Return the likeliest Â (4, 4) after a motion of ``variances`` (p,), if it is far from here.
 
     If it is not, the correction that follows, which is linear, finds it as well.
     """
-    A, found = slam.observer.A, _likeliest_pose(slam, matched, variances)
+    A, found = state.observer.A, _likeliest_pose(state, matched, variances)
     turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
     shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
-    reach_m = slam.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)
+    reach_m = state.settings.unknown_linear_motion * math.sqrt(MAX_DURATION_S)
     return found if turn_rad > LARGE_TURN_RAD or shift_m > reach_m else A
 
 
-def _likeliest_pose(slam: Slam, matched: MatchedObservation, variances: FloatArray) -> FloatArray:
+def _likeliest_pose(
+    state: State, matched: MatchedObservation, variances: FloatArray
+) -> FloatArray:
     """Return Â (4, 4) by Gauss-Newton steps, as if landmarks and start were known exactly."""
-    A, axes = slam.observer.A, slam.axes
-    landmarks = slam.observer.points[matched.residuals.rows]
+    A, axes = state.observer.A, state.axes
+    landmarks = state.observer.points[matched.residuals.rows]
     points = matched.known.points
     W = np.linalg.inv(matched.covariances[matched.rows >= 0][:, : axes.point, : axes.point])
     found = A

@@ -8,6 +8,7 @@ import logging
 
 import numpy as np
 
+from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns, to_s
@@ -24,16 +25,21 @@ from slam_observer_ros.events import (
     VelocityEvent,
 )
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import MapFrame
-from slam_observer_ros.observer.observer import lyapunov
+from slam_observer_ros.known_map.localiser import Localiser
+from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
 from slam_observer_ros.state import covariances
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import Outcome
 
 logger = logging.getLogger(__name__)
+
+GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
+"""Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
 
 
 class Estimator:
@@ -85,7 +91,8 @@ class Estimator:
         on_motion: OnMotion | None = None,
         on_jump: Callable[[], None] | None = None,
     ) -> None:
-        self.settings = settings = checked(settings)
+        settings = checked(settings)
+        self._live = LiveSettings(settings)
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
@@ -93,11 +100,12 @@ class Estimator:
         self.last_update: Update | None = None
         self._on_update, self._on_stamp = on_update, on_stamp
         self._on_motion, self._on_jump = on_motion, on_jump
-        self._frame = MapFrame(settings)
+        self._start_pose: FloatArray | None = None
+        self._is_placed = False  # by somebody: the settings don't say any more where it is
+        self._hypotheses = Hypotheses(State(self._live, np.eye(4)))
+        self._localiser = Localiser()
         self.reset(initial_pose)
-        changed = set(changed_names(settings))
-        if unused := [name for name in self._slam.gains.ignores if name in changed]:
-            logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
+        self._warn_of_unused()
 
     def reset(self, pose: FloatArray | None = None) -> None:
         """Forget the motion, what was mapped and events held back, and start again.
@@ -116,11 +124,17 @@ class Estimator:
         """
         if pose is not None:
             check_pose(pose)
-        self._frame.start_run(pose)
-        self._begin()
+        self._start_pose = pose
+        self._is_placed = pose is not None
+        if pose is None and self.settings.set_initial_pose:
+            self._start_where_settings_say()
+        else:
+            self._start(pose)
+        self._clear_time()
+        self.last_update = None
 
-    def restart_time(self) -> None:
-        """Begin anew in time, after a jump of the clock, as ``on_time_jump`` says.
+    def handle_clock_jump(self) -> None:
+        """Go on after a jump of the clock, as ``on_time_jump`` says.
 
         What is held back for late events is used before. ``reset`` starts again where the run
         began; in a loaded map where the settings say, or anywhere. ``hold`` keeps pose and map,
@@ -134,14 +148,14 @@ class Estimator:
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
                 after,
             )
-            self._frame.restart_run()
-            self._begin()
+            self.reset(None if self._localiser.loaded else self._start_pose)
         else:
             logger.warning('The clock has jumped%s; pose and map are held.', after)
             self._timeline.catch_up()
-            self._tell_stamp()
-            self._frame.restart_time()
-            self._forget_time()
+            self._report_stamp()
+            self._hypotheses.clear_time()
+            self._is_placed = True
+            self._clear_time()
         self.jumps += 1
         if self._on_jump is not None:
             self._on_jump()
@@ -177,7 +191,16 @@ class Estimator:
         if pose is not None:
             check_pose(pose, pose_covariance)
             self._timeline.catch_up()
-        self._frame.load(landmark_map, pose, pose_covariance, self.stamp_ns is not None)
+        self._localiser.load(landmark_map, self.settings.two_d_mode)
+        is_at_start = self.stamp_ns is None and not self._is_placed
+        if pose is not None:
+            self._place(pose, pose_covariance)
+        elif self.settings.set_initial_pose and is_at_start:
+            self._start_where_settings_say()
+        elif self._state.is_mapping:
+            self._enter_map()
+        else:  # in a map that does not grow there is nothing to carry into another one
+            self._start(None)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
         """Move the robot as of ``stamp_ns``; the map stays.
@@ -197,7 +220,12 @@ class Estimator:
         """
         check_pose(pose, covariance)
         self._timeline.catch_up()
-        self._frame.set_pose(pose, covariance)
+        self._place(pose, covariance)
+
+    @property
+    def settings(self) -> Settings:
+        """The settings in force."""
+        return self._live.now
 
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.
@@ -215,8 +243,7 @@ class Estimator:
         ]
         if changed:
             raise ParameterError(f'{", ".join(changed)} can only be set before the start')
-        self.settings = settings
-        self._frame.change_settings(settings)
+        self._live.now = settings
 
     def add(self, event: Event) -> bool:
         """Take an event; return whether it was accepted.
@@ -231,7 +258,7 @@ class Estimator:
             self._drop(error)
             return False
         if jumped:
-            self.restart_time()
+            self.handle_clock_jump()
             self._queue.push(event)
         for ready in self._queue.pop_ready():
             self._process(ready)
@@ -250,7 +277,7 @@ class Estimator:
         for ready in self._queue.pop_all():
             self._process(ready)
         self._timeline.catch_up()
-        self._tell_stamp()
+        self._report_stamp()
 
     def smooth(self) -> Smoothed:
         """Return trajectory and map in hindsight; the state is not changed.
@@ -266,27 +293,27 @@ class Estimator:
             If the observations don't determine the whole trajectory.
 
         """
-        return self._slam.smooth()
+        return self._state.smooth()
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from the map; return whether it was known."""
-        return self._frame.hypotheses.forget(landmark_id)
+        return self._hypotheses.forget(landmark_id)
 
     @property
     def counts(self) -> Counter[str]:
-        """How many events were used, by kind, and what befell the landmarks in them.
+        """How many events were used, by kind, and the outcome for the landmarks in them.
 
         Events used (``'velocity'``, ``'observation'``), those of them that came late
         (``'late_velocity'``, ``'late_observation'``), points in observations
         (``'observed_point'``), observations made before the place in a loaded map was found
         (``'not_localised'``), how often it was lost again (``'lost'``), how often the robot was
         not where odometry had it (``'slip'``) or nothing in view, without ids, where the map has
-        it (``'strange_place'``), and what became of landmarks
+        it (``'unexpected_place'``), and what became of landmarks
         (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
         ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``,
         ``'repeated_id'`` and ``'reserved_id'``, which are not used).
         """
-        return self._counts + self._frame.counts
+        return self._counts + self._localiser.counts + self._hypotheses.counts
 
     @property
     def is_localised(self) -> bool:
@@ -294,7 +321,7 @@ class Estimator:
 
         Until the place in a loaded map is found, the estimate is in a frame of its own.
         """
-        return self._frame.is_localised
+        return self._localiser.is_localised
 
     @property
     def landmark_map(self) -> LandmarkMap:
@@ -303,7 +330,8 @@ class Estimator:
         Its covariances are those in its own frame: without the error of how it lies to where
         the robot started, unless the frame is that of a map that was loaded.
         """
-        return self._frame.landmark_map
+        is_own_frame = self._localiser.loaded is None or not self.is_localised
+        return map_of(self._state, is_own_frame)
 
     @property
     def stamp_ns(self) -> int | None:
@@ -322,10 +350,10 @@ class Estimator:
 
     def pose_at(self, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) at any time: the state, moved on by the velocities since."""
-        slam, state_ns = self._slam, self._timeline.state_ns
+        observer, state_ns = self._state.observer, self._timeline.state_ns
         if state_ns is None or stamp_ns == state_ns:
-            return slam.observer.pose
-        return slam.observer.pose @ self._timeline.motion(state_ns, stamp_ns)
+            return observer.pose
+        return observer.pose @ self._timeline.motion(state_ns, stamp_ns)
 
     @property
     def pose_covariance(self) -> FloatArray | None:
@@ -336,8 +364,7 @@ class Estimator:
         """
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        hypotheses = self._frame.hypotheses
-        return hypotheses.pose_covariance_after(timeline.velocities, start_ns, end_ns)
+        return self._hypotheses.pose_covariance_after(timeline.velocities, start_ns, end_ns)
 
     @property
     def body_velocity(self) -> FloatArray:
@@ -346,7 +373,7 @@ class Estimator:
         It is that of ``stamp_ns``, unless a delay is calibrated: then a little before or after.
         """
         velocity = self._timeline.body_velocity
-        return np.zeros(6) if velocity is None else self._slam.gains.calibration.apply(velocity)
+        return np.zeros(6) if velocity is None else self._state.filter.calibration.apply(velocity)
 
     @property
     def velocity_is_stale(self) -> bool:
@@ -356,24 +383,24 @@ class Estimator:
     @property
     def landmark_ids(self) -> IntArray:
         """(n,) ids of the landmarks in the map: those seen ``confirmations`` times or more."""
-        return self._slam.landmarks.ids[self._slam.confirmed]
+        return self._state.landmarks.ids[self._state.confirmed]
 
     @property
     def landmark_counts(self) -> IntArray:
         """(n,) number of observations of each landmark."""
-        return self._slam.landmarks.counts[self._slam.confirmed]
+        return self._state.landmarks.counts[self._state.confirmed]
 
     @property
     def world_points(self) -> FloatArray:
         """(n, 3) estimated landmarks at ``stamp_ns``, metres, world."""
-        points, lead_s = self._slam.world_points[self._slam.confirmed], self._timeline.lead_s
+        points, lead_s = self._state.world_points[self._state.confirmed], self._timeline.lead_s
         return points + lead_s * self.landmark_velocities if lead_s else points
 
     @property
     def landmark_covariances(self) -> FloatArray | None:
         """(n, 3, 3) covariances of the landmarks at ``stamp_ns``, world, m²; None if unknown."""
-        of_all = self._slam.landmark_covariances_after(self._timeline.lead_s)
-        return None if of_all is None else of_all[self._slam.confirmed]
+        of_all = self._state.landmark_covariances(self._timeline.lead_s)
+        return None if of_all is None else of_all[self._state.confirmed]
 
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
@@ -383,23 +410,22 @@ class Estimator:
         are places in ``landmark_ids``. None where the gains know none, and for landmarks that are
         fixed, whose errors nobody knows.
         """
-        slam = self._slam
-        if slam.is_fixed:
+        state = self._state
+        if state.is_fixed:
             return None
-        confirmed = slam.confirmed[rows]
-        return covariances.of_configuration(slam.observer, slam.gains, slam.axes, confirmed)
+        return covariances.of_configuration(state.filter, state.confirmed[rows])
 
     @property
     def landmark_velocities(self) -> FloatArray:
         """(n, 3) velocities of landmarks that move, known or estimated, m/s, world."""
-        observer = self._slam.observer
-        return se3.rotate(observer.reference_pose, observer.u[self._slam.confirmed])
+        observer = self._state.observer
+        return se3.rotate(observer.reference_pose, observer.u[self._state.confirmed])
 
     @property
     def calibration(self) -> list[CalibrationEstimate]:
         """Scale, bias and delay of the velocity, those that the settings ask for."""
-        gains = self._slam.gains
-        return gains.calibration.estimates(gains.calibration_variances)
+        known = self._state.filter
+        return known.calibration.estimates(known.calibration_variances)
 
     @property
     def lyapunov(self) -> float:
@@ -407,9 +433,9 @@ class Estimator:
         return 0.0 if self.last_update is None else self.last_update.lyapunov
 
     @property
-    def _slam(self) -> Slam:
+    def _state(self) -> State:
         """The most likely state."""
-        return self._frame.slam
+        return self._hypotheses.best
 
     def _drop(self, error: InvalidEventError) -> None:
         self.dropped[error.reason] += 1
@@ -417,14 +443,14 @@ class Estimator:
 
     def _process(self, event: Event) -> None:
         if event.stamp_ns > (self.stamp_ns or 0):
-            self._tell_stamp()
+            self._report_stamp()
         if isinstance(event, ObservationEvent):
             self._process_observation(event)
         else:
             self._process_velocity(event)
 
-    def _tell_stamp(self) -> None:
-        """Tell that all events of the present stamp have been used."""
+    def _report_stamp(self) -> None:
+        """Report that all events of the present stamp have been used."""
         if self._on_stamp is not None and self.stamp_ns is not None:
             self._on_stamp()
 
@@ -441,9 +467,11 @@ class Estimator:
             self._warnings.late_velocity()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        usable = usable_points(event, self.settings, self._counts, self._warnings)
-        event = self._timeline.meet(usable)
-        outcome = self._frame.observe(event)
+        needs_ids = not self._state.filter.has_joint_covariance
+        usable = usable_points(event, self.settings, needs_ids, self._counts, self._warnings)
+        event = self._timeline.synchronise(usable)
+        outcome = self._hypotheses.observe(event)
+        self._localise(outcome)
         self._counts['observation'] += 1
         self._counts['late_observation'] += event.stamp_ns > usable.stamp_ns
         self._warn_of(event, outcome)
@@ -451,19 +479,72 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self.last_update)
 
+    def _localise(self, outcome: Outcome) -> None:
+        """Look for the pose in a loaded map if it is not known, or not any more."""
+        reason = self._localiser.reason_to_restart(self._state, outcome)
+        if reason is not None:
+            logger.warning('%s; localising again.', reason)
+            self._start(None)
+        if self._localiser.search(self._state):
+            self._hypotheses.prune_to_best()
+
+    def _enter_map(self) -> None:
+        if self._localiser.enter(self._state):
+            self._hypotheses.prune_to_best()
+
+    def _place(self, pose: FloatArray, covariance: FloatArray | None) -> None:
+        """Move the robot; if the pose in a loaded map was not known, it is now."""
+        self._is_placed = True
+        if self.is_localised:
+            self._hypotheses.prune_to_best().set_pose(self._allowed(pose), covariance)
+            self._localiser.doubt_pose()
+        else:
+            self._start(pose, covariance)
+
+    def _start_where_settings_say(self) -> None:
+        settings = self.settings
+        pose = se3.from_rpy((*settings.initial_position, 0.0, 0.0, settings.initial_yaw))
+        self._start(pose, np.diag(GIVEN_POSE_STD**2))
+
+    def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
+        """Start again with an empty map, or with the one that was loaded.
+
+        At ``pose`` (4, 4); by default identity, or unknown in a map that was loaded.
+        ``covariance`` (6, 6) is that of a pose in a loaded map; default exact.
+        """
+        state = State(self._live, np.eye(4) if pose is None else self._allowed(pose))
+        self._hypotheses.reset(state)
+        self._localiser.start(state, pose is not None, covariance)
+
+    def _allowed(self, pose: FloatArray) -> FloatArray:
+        """Return a pose (4, 4), or with ``two_d_mode`` what of it lies in the plane."""
+        return se3.flatten(pose) if self.settings.two_d_mode else pose
+
+    def _warn_of_unused(self) -> None:
+        """Name settings that have been changed and have no effect."""
+        settings = self.settings
+        changed = set(changed_names(settings))
+        if unused := [name for name in self._state.filter.ignores if name in changed]:
+            logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
+        is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
+        if is_given and not settings.set_initial_pose:
+            logger.warning(
+                'initial_position and initial_yaw have no effect (use set_initial_pose: true).'
+            )
+
     def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
-        """Tell what is amiss with an observation, with what came of it, or with the map."""
+        """Warn of what is wrong with an observation, its outcome, or the map."""
         settings, warnings = self.settings, self._warnings
-        if 0 < settings.max_landmarks < len(event.ids) and self._slam.is_mapping:
+        if 0 < settings.max_landmarks < len(event.ids) and self._state.is_mapping:
             warnings.more_than_max(len(event.ids), settings.max_landmarks)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
-        warnings.lost_places(self._frame.count)
-        if settings.gains == 'riccati':
-            warnings.large_map(len(self._slam.landmarks))
+        warnings.unexpected_poses(self._hypotheses.count)
+        if self._state.filter.has_joint_covariance:
+            warnings.large_map(len(self._state.landmarks))
 
     def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
-        observer = self._slam.observer
+        observer = self._state.observer
         return Update(
             stamp_ns,
             observer.pose,
@@ -473,12 +554,7 @@ class Estimator:
             lyapunov(self.settings.gain_k, outcome.residuals),
         )
 
-    def _begin(self) -> None:
-        """Wait for the first event."""
-        self._forget_time()
-        self.last_update = None
-
-    def _forget_time(self) -> None:
+    def _clear_time(self) -> None:
         """Forget all that has a stamp but the map."""
         settings = self.settings
         self._queue = EventQueue(
@@ -486,4 +562,4 @@ class Estimator:
             max_jump_ns=to_ns(settings.max_stamp_jump),
             late_limit_ns=to_ns(settings.late_limit),
         )
-        self._timeline = Timeline(self._frame, settings, self._on_motion)
+        self._timeline = Timeline(self._hypotheses, settings, self._on_motion)

@@ -25,10 +25,10 @@ MANY_MOVED = 5
 MOVED_LATELY_NS = 60 * NANOSECONDS_PER_SECOND
 """How long ago that is at most, nanoseconds."""
 
-LOST_PLACES = {
+UNEXPECTED_POSES = {
     'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
-    'strange_place': 'Nothing that is seen is where the map has it: if the robot slipped or was '
-    'carried, it is not found again, as the points have no ids',
+    'unexpected_place': 'Nothing that is seen is where the map has it: if the robot slipped or '
+    'was carried, it is not found again, as the points have no ids',
 }
 """What is wrong with the robot's place when these counts grow."""
 
@@ -38,7 +38,7 @@ class EventWarnings:
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
-        self._places: Counter[str] = Counter()
+        self._reported: Counter[str] = Counter()
         self._moved_ns: dict[int, int] = {}
 
     def dropped(self, error: InvalidEventError) -> None:
@@ -101,12 +101,12 @@ class EventWarnings:
             )
             self._warn('many_moved', text)
 
-    def lost_places(self, count: Callable[[str], int]) -> None:
+    def unexpected_poses(self, count: Callable[[str], int]) -> None:
         """Tell that the robot is not where it was taken to be, if ``count`` says so again."""
-        for name, text in LOST_PLACES.items():
-            if count(name) > self._places[name]:
+        for name, text in UNEXPECTED_POSES.items():
+            if count(name) > self._reported[name]:
                 self._warn(name, text)
-                self._places[name] = count(name)
+                self._reported[name] = count(name)
 
     def _warn(self, kind: str, text: str) -> None:
         """Count one more of a kind; ``text`` is logged if their number is a power of ten."""

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
+from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.localiser import MapFrame
 from slam_observer_ros.sensor_models.integration import transition
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
@@ -29,8 +29,8 @@ class Timeline:
 
     Parameters
     ----------
-    frame : MapFrame
-        Holds the hypotheses; no event has been used yet.
+    hypotheses : Hypotheses
+        What is moved along them; no event has been used yet.
     settings : Settings
         ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
     on_motion : callable, optional
@@ -48,9 +48,9 @@ class Timeline:
     """
 
     def __init__(
-        self, frame: MapFrame, settings: Settings, on_motion: OnMotion | None = None
+        self, hypotheses: Hypotheses, settings: Settings, on_motion: OnMotion | None = None
     ) -> None:
-        self._frame = frame
+        self._hypotheses = hypotheses
         timeout_ns = to_ns(settings.velocity_timeout)
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
         self.stamp_ns: int | None = None
@@ -66,7 +66,7 @@ class Timeline:
         """Return whether what was in force at its stamp can't be changed any more."""
         return event.stamp_ns < self._in_force_ns
 
-    def _begin(self, stamp_ns: int) -> int:
+    def _note_stamp(self, stamp_ns: int) -> int:
         """Note the stamp of an event that is about to be used; return ``state_ns``."""
         self.stamp_ns = max(stamp_ns, self.stamp_ns or stamp_ns)
         if self.state_ns is None:
@@ -94,7 +94,7 @@ class Timeline:
         if not self.velocities.append(event):
             return False
         self._in_force_ns = event.stamp_ns
-        self._begin(event.stamp_ns)
+        self._note_stamp(event.stamp_ns)
         self._pending += 1
         if self._pending >= MAX_PENDING_VELOCITIES:
             # No further: the stamp of an observation without points may be ahead of velocities.
@@ -124,21 +124,21 @@ class Timeline:
             return
         if self._on_motion is not None:
             self._on_motion(self.velocities, start_ns, stamp_ns)
-        self._frame.hypotheses.advance(self.velocities, start_ns, stamp_ns)
+        self._hypotheses.propagate(self.velocities, start_ns, stamp_ns)
         self.velocities.forget_before(stamp_ns - self._kept_ns)
         self.state_ns = stamp_ns
         self._in_force_ns = max(self._in_force_ns, stamp_ns)
 
-    def meet(self, event: ObservationEvent) -> ObservationEvent:
+    def synchronise(self, event: ObservationEvent) -> ObservationEvent:
         """Move the hypotheses on to an observation, or it to them if it is late; return it.
 
         One without points, as an idle sensor sends, moves nothing: it would make others late.
         """
-        state_ns = self._begin(event.stamp_ns)
+        state_ns = self._note_stamp(event.stamp_ns)
         if not len(event.ids):
             return replace(event, stamp_ns=state_ns)
         if event.stamp_ns < state_ns:
-            event = carried_forward(self._frame.slam, event, self.velocities, state_ns)
+            event = carried_forward(self._hypotheses.best, event, self.velocities, state_ns)
         self._advance(event.stamp_ns)
         self._in_force_ns = max(self._in_force_ns, event.stamp_ns)
         return event
@@ -147,5 +147,5 @@ class Timeline:
         """Return how the body moves (4, 4) between two stamps, backwards if need be."""
         if end_ns < start_ns:
             return se3.inverse(self.motion(end_ns, start_ns))
-        calibration = self._frame.slam.gains.calibration
+        calibration = self._hypotheses.best.filter.calibration
         return transition(self.velocities, calibration, start_ns, end_ns)

@@ -12,9 +12,13 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 
 def usable_points(
-    event: ObservationEvent, settings: Settings, counts: Counter[str], warnings: EventWarnings
+    event: ObservationEvent,
+    settings: Settings,
+    needs_ids: bool,
+    counts: Counter[str],
+    warnings: EventWarnings,
 ) -> ObservationEvent:
-    """Return an observation as the states use it; count its points and tell of those left out."""
+    """Return an observation as the states use it; count its points, warn of those left out."""
     counts['observed_point'] += len(event.ids)
     event = flatten(event) if settings.two_d_mode else event
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
@@ -27,7 +31,7 @@ def usable_points(
         repeated = np.isin(event.ids, repeated_ids)
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
-    if settings.gains != 'riccati' and (unknown := event.ids == UNKNOWN_ID).any():
+    if needs_ids and (unknown := event.ids == UNKNOWN_ID).any():
         warnings.unknown_ids(settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)

@@ -98,7 +98,8 @@ def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: Axes) -
     """
     turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
     try:
-        _, after = anchor(P, G, rows, there, np.zeros(len(rows)))
+        S = P[np.ix_(rows, rows)] + there
+        _, after = anchor(P, G, P[:, rows], S, G[rows], np.zeros(len(rows)))
     except np.linalg.LinAlgError:
         return np.inf
     # Where landmarks leave a turn open, rounding decides whether its variance is +∞ or −∞.

@@ -22,28 +22,18 @@ from slam_observer_ros.geometry.matrices import (
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import find_transform
 from slam_observer_ros.observer.gauge import gauge_information, JITTER_M2
-from slam_observer_ros.observer.riccati.full_map import FullMapGains
-from slam_observer_ros.state.state import Slam
-from slam_observer_ros.state.step import Outcome
+from slam_observer_ros.state.state import State
 
 ROUNDING = 1e-14
 """Least variance that can be told from zero, as a share of the sum of all variances."""
 
-NEWS = 0.1
-"""Share of the observations that is new when the same landmarks are compared with a map again:
-with many of them that takes long, and a single further observation seldom decides it.
-"""
 
-CONFIRMING_VOTES = 10
-"""Observations that confirm a place that was told."""
-
-
-def start_in_map(slam: Slam, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
+def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
     """Take a map into an estimate that has none yet, at a pose that is given in the map's frame.
 
     Parameters
     ----------
-    slam : Slam
+    state : State
         At its start.
     known : LandmarkMap
         The map.
@@ -52,11 +42,11 @@ def start_in_map(slam: Slam, known: LandmarkMap, pose_covariance: FloatArray | N
         None for an exact pose.
 
     """
-    slam.set_pose(slam.observer.pose, pose_covariance)
-    _complete(slam, known)
+    state.set_pose(state.observer.pose, pose_covariance)
+    _complete(state, known)
 
 
-def enter_map(slam: Slam, known: LandmarkMap) -> bool:
+def enter_map(state: State, known: LandmarkMap) -> bool:
     """Move an estimate into the frame of a map, if enough of its landmarks have been seen.
 
     Landmarks that both have are merged. Those that contradict the others are taken as the map has
@@ -68,81 +58,36 @@ def enter_map(slam: Slam, known: LandmarkMap) -> bool:
         Whether the estimate is now in the map's frame.
 
     """
-    slam.gains.recall(slam.observer, np.arange(len(slam.landmarks)))
-    rows = slam.landmarks.rows_of(known.ids)
+    rows = state.landmarks.rows_of(known.ids)
     shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
-    found = _find_frame(slam, rows[shared], known.select(shared))
+    found = _find_frame(state, rows[shared], known.select(shared))
     if found is None:
         return False
-    slam.observer.reference_pose, agree = found
+    state.observer.reference_pose, agree = found
     merged = shared[agree]
-    _merge(slam, rows[merged], known.select(merged))
-    if slam.settings.localization_mode == 'off':
-        slam.remove(rows[shared[~agree]])
+    _merge(state, rows[merged], known.select(merged))
+    if state.settings.localization_mode == 'off':
+        state.remove(rows[shared[~agree]])
     else:
-        slam.remove(np.setdiff1d(np.arange(len(slam.landmarks)), rows[merged]))
-    _renumber(slam, known)
-    _complete(slam, known)
+        state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[merged]))
+    _renumber(state, known)
+    _complete(state, known)
     return True
 
 
-def is_lost(slam: Slam) -> bool:
+def is_lost(state: State) -> bool:
     """Return whether a place in a map has been wrong for some time, or the robot was carried.
 
     All landmarks seen of late were rejected then, and as many as would do to find the place again
     were rejected so often that elsewhere they would be taken to have moved.
     """
-    often = slam.settings.max_rejections
-    moved = np.sum(slam.landmarks.rejections >= often)
-    needed = slam.axes.point
-    return bool(not slam.is_mapping and slam.rejected_in_a_row >= often and moved >= needed)
+    often = state.settings.max_rejections
+    moved = np.sum(state.landmarks.rejections >= often)
+    needed = state.axes.point
+    return bool(not state.is_mapping and state.rejected_in_a_row >= often and moved >= needed)
 
 
-class PlaceSearch:
-    """When a map is worth comparing with what was seen: it takes long, and seldom tells more."""
-
-    def __init__(self) -> None:
-        self._observations = self._compared_at = self._shared = 0
-
-    def tell(self, shared: int) -> bool:
-        """Count an observation; return whether to compare, now that ``shared`` landmarks are."""
-        self._observations += 1
-        if shared == self._shared and self._observations < (1.0 + NEWS) * self._compared_at:
-            return False
-        self._shared, self._compared_at = shared, self._observations
-        return True
-
-
-class PoseTrial:
-    """A place in a map that someone has told, on trial until landmarks of the map confirm it.
-
-    With a wrong one the map's landmarks would be rejected, and where mapping goes on be taken to
-    have moved, all of them. Observations vote: against it, if more of the map's landmarks in them
-    were rejected than believed. One alone may be garbled, and some landmarks have moved.
-
-    Parameters
-    ----------
-    known : LandmarkMap
-        The map.
-
-    """
-
-    def __init__(self, known: LandmarkMap) -> None:
-        self._ids = known.ids
-        self._for = self._against = 0
-
-    def vote(self, outcome: Outcome, often: int) -> bool:
-        """Count the vote of an observation; return whether ``often`` ones say it is wrong."""
-        if self._for >= CONFIRMING_VOTES and self._for > self._against:
-            return False
-        rejected = int(np.isin(outcome.ids[outcome.rejected], self._ids).sum())
-        believed = int(np.isin(outcome.ids, self._ids).sum()) - rejected
-        self._for += int(believed > 0 and believed >= rejected)
-        self._against += int(rejected > believed)
-        return self._against >= often and self._against > self._for
-
-
-def shape_covariances(slam: Slam) -> FloatArray | None:
+def shape_covariances(state: State) -> FloatArray | None:
     """Return covariances (n, 3, 3) of the landmarks in a frame that is their own, world axes, m².
 
     A map's frame starts where the robot did, and all landmarks share the error of how they lie to
@@ -150,13 +95,13 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
     its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None
     where the gains know no covariances.
     """
-    n, axes, observer = len(slam.landmarks), slam.axes, slam.observer
-    k, R = axes.point, observer.reference_pose[:3, :3]
-    if not isinstance(slam.gains, FullMapGains) or n == 0:
-        return slam.landmark_covariances
-    joint = slam.gains.joint_covariance(np.arange(n))
-    P = joint[axes.p :, axes.p :]
-    G = axes.output_matrix(observer.y_ref - observer.y_ref.mean(axis=0)).reshape(n * k, -1)
+    n, axes, points = len(state.landmarks), state.axes, state.observer.points
+    k, R = axes.point, state.observer.reference_pose[:3, :3]
+    joint = state.filter.joint
+    if joint is None or state.is_fixed or n == 0:
+        return state.landmark_covariances()
+    P = joint.with_pose(np.arange(n), points)[axes.p :, axes.p :]
+    G = axes.output_matrix(points - points.mean(axis=0)).reshape(n * k, -1)
     least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
     information = gauge_information(G, with_variances_above(least_m2, P))
     G_each = G.reshape(n, k, -1)
@@ -168,81 +113,76 @@ def shape_covariances(slam: Slam) -> FloatArray | None:
 
 
 def _find_frame(
-    slam: Slam, rows: IntArray, known: LandmarkMap
+    state: State, rows: IntArray, known: LandmarkMap
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return P° (4, 4) in the frame of a map, of whose landmarks the estimate has ``rows``."""
-    axes = slam.axes
-    covariance = slam.gains.joint_covariance(rows)
+    axes = state.axes
+    covariance = state.filter.joint_covariance(rows)
     if covariance is None:
-        covariance = _of_constant_gains(slam, rows)
-    covariances = known.covariances_or(slam.settings.map_noise)
-    points = slam.observer.points[rows]
+        covariance = _of_constant_gains(state, rows)
+    covariances = known.covariances_or(state.settings.map_noise)
+    points = state.filter.points[rows]
     return find_transform(points, covariance, known.world_points, covariances, axes)
 
 
-def _of_constant_gains(slam: Slam, rows: IntArray) -> FloatArray:
+def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
     """Return a covariance (p + m k, p + m k) of ε and m landmarks for gains that know none.
 
     The pose is exact; a landmark is as uncertain as it would be if it was seen from here once.
     """
-    p, k = slam.axes.p, slam.axes.point
-    noise = slam.observation_noise.at(slam.observer.body_points(rows))
+    p, k = state.axes.p, state.axes.point
+    noise = state.observation_noise.at(state.observer.body_points(rows))
     covariance = np.zeros((p + k * len(rows),) * 2)
-    covariance[p:, p:] = block_diagonal(slam.observer.turned(noise)[:, :k, :k])
+    covariance[p:, p:] = block_diagonal(state.observer.turned(noise)[:, :k, :k])
     return covariance
 
 
-def _merge(slam: Slam, rows: IntArray, known: LandmarkMap) -> None:
+def _merge(state: State, rows: IntArray, known: LandmarkMap) -> None:
     """Correct the estimate by what a map knows of the landmarks at ``rows``."""
-    observer = slam.observer
-    targets, covariances = _in_reference_frame(slam, known)
-    r = observer.points[rows] - targets
-    observer.correct(slam.gains.anchor(observer, rows, r, covariances))
-    slam.gains.settle(observer)
-    slam.landmarks.counts[rows] += _counts(known, slam)
+    targets, covariances = _in_reference_frame(state, known)
+    r = state.filter.points[rows] - targets
+    state.filter.anchor(rows, r, covariances)
+    state.landmarks.counts[rows] += _counts(known, state)
 
 
-def _counts(known: LandmarkMap, slam: Slam) -> IntArray:
+def _counts(known: LandmarkMap, state: State) -> IntArray:
     """Return how often landmarks of a map count as seen: a surveyed one is believed at once."""
-    return np.asarray(np.maximum(known.counts, slam.settings.confirmations))
+    return np.asarray(np.maximum(known.counts, state.settings.confirmations))
 
 
-def _renumber(slam: Slam, known: LandmarkMap) -> None:
+def _renumber(state: State, known: LandmarkMap) -> None:
     """Give landmarks new numbers where the map's have the same, though no sensor gave these."""
-    ids = slam.landmarks.ids
+    ids = state.landmarks.ids
     own = np.flatnonzero(is_automatic(ids) & np.isin(ids, known.ids))
     taken = np.append(ids[is_automatic(ids)], known.ids[is_automatic(known.ids)])
-    slam.landmarks.renumber(own, np.max(taken, initial=0) + 1 + np.arange(len(own)))
+    state.landmarks.renumber(own, np.max(taken, initial=0) + 1 + np.arange(len(own)))
 
 
-def _complete(slam: Slam, known: LandmarkMap) -> None:
+def _complete(state: State, known: LandmarkMap) -> None:
     """Append what a map has beyond the estimate, now that both are in one frame."""
-    observer, settings = slam.observer, slam.settings
-    new = known.select(slam.landmarks.rows_of(known.ids) < 0)
-    y_ref, covariances = _in_reference_frame(slam, new)
-    observer.add_reference_landmarks(y_ref)
-    observer.rebase(observer.points)
-    slam.landmarks.add_known(new.ids, _counts(new, slam))
-    slam.is_mapping = settings.localization_mode == 'off'
-    if settings.localization_mode == 'fixed':
-        _fix(slam, known)
+    observer, mode = state.observer, state.settings.localization_mode
+    new = known.select(state.landmarks.rows_of(known.ids) < 0)
+    observer.set_reference(observer.points)
+    state.landmarks.add_known(new.ids, _counts(new, state))
+    state.is_mapping = mode == 'off'
+    if mode == 'fixed':
+        _fix(state, known)
     else:
-        slam.gains.add_known_landmarks(covariances)
-    slam.gains.restart(observer, 'the place in the loaded map was found')
+        state.filter.add_known(*_in_reference_frame(state, new))
+    state.forget_past('the place in the loaded map was found')
 
 
-def _fix(slam: Slam, known: LandmarkMap) -> None:
+def _fix(state: State, known: LandmarkMap) -> None:
     """Put the landmarks exactly where the map has them, and leave them there."""
     order = np.argsort(known.ids)
-    rows = order[np.searchsorted(known.ids, slam.landmarks.ids, sorter=order)]
-    y_ref, covariances = _in_reference_frame(slam, known.select(rows))
-    slam.observer.fix_landmarks(y_ref)
-    slam.gains = slam.gains.with_fixed_landmarks(covariances)
+    rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
+    y_ref, covariances = _in_reference_frame(state, known.select(rows))
+    state.fix_landmarks(y_ref, covariances)
 
 
-def _in_reference_frame(slam: Slam, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:
+def _in_reference_frame(state: State, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:
     """Return positions (m, 3) and covariances (m, 3, 3) of a map in the frame of P°."""
-    back = se3.inverse(slam.observer.reference_pose)
+    back = se3.inverse(state.observer.reference_pose)
     R = back[:3, :3]
-    covariances: FloatArray = R @ known.covariances_or(slam.settings.map_noise) @ R.T
+    covariances: FloatArray = R @ known.covariances_or(state.settings.map_noise) @ R.T
     return se3.transform(back, known.world_points), covariances

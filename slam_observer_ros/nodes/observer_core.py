@@ -141,7 +141,7 @@ class ObserverCore:
             self._outputs.repeat_transform()
 
     def _restart_time(self, _jump: object) -> None:
-        self._estimator.restart_time()
+        self._estimator.handle_clock_jump()
 
     def _follow_jump(self) -> None:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""

@@ -1,4 +1,4 @@
-"""The paper's gains: constant k_i and l_i, integrated so that every time step is stable.
+"""The paper's gains: constant k_i and l_i; (28)–(31) integrated so that any step is stable.
 
 The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²/2). Here
 the pose is moved by an exponential integrator of the linearised flow. With J_i = [−[e_i]×, I],
@@ -20,32 +20,24 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import Axes, axes_of, SPATIAL
-from slam_observer_ros.observer.filter import GainDesign, Residuals
-from slam_observer_ros.observer.observer import Correction, lyapunov, Observer
+from slam_observer_ros.geometry.axes import Axes, SPATIAL
+from slam_observer_ros.observer.filter import Filter, Residuals
+from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
 
 
-class ConstantGains(GainDesign):
+class ConstantFilter(Filter):
     """Constant gains k and l, the same for every landmark.
 
-    Parameters
-    ----------
-    settings : Settings
-        ``gain_k`` is k of (30), ``gain_l`` is l of (31). The ``step_mode`` 'paper' turns about
-        the reference's origin with the metric of (10), and so converges to the paper's
-        differential equation for dt → 0; 'exponential' turns about the centroid of the e_i,
-        where rotation and translation do not compete. In ``two_d_mode`` all turns are about z.
-
-    Attributes
-    ----------
-    calibration : Calibration
-        One that leaves the velocity as it is.
-
+    ``gain_k`` is k of (30), ``gain_l`` is l of (31). The ``step_mode`` 'paper' turns about the
+    reference's origin with the metric of (10), and so converges to the paper's differential
+    equation (:mod:`.innovation`) for dt → 0; 'exponential' turns about the centroid of the e_i,
+    where rotation and translation do not compete. In ``two_d_mode`` all turns are about z.
     """
 
     ignores = (
@@ -59,41 +51,34 @@ class ConstantGains(GainDesign):
         'observation_error_time',
     )
 
-    def __init__(self, settings: Settings) -> None:
-        self._axes = axes_of(settings.two_d_mode)
-        self._settings = settings
+    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
+        super().__init__(live, reference_pose)
+        self.calibration = Calibration(Settings(), self.axes)  # leaves the velocity as it is
         self._is_fixed = False
-        self.calibration = Calibration(Settings(), self._axes)
 
-    def change_settings(self, settings: Settings) -> None:
-        """Take over k, l and the step mode."""
-        self._settings = settings
-
-    def anchor(
-        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
-    ) -> Correction:
-        """Return the correction that puts the known landmarks where they are known to be."""
-        return Correction(np.eye(4), rows, -r)
-
-    def with_fixed_landmarks(self, covariances: FloatArray) -> ConstantGains:
-        """Return these gains with l = 0."""
-        self._is_fixed = True
-        return self
-
-    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
-        """Return the correction; all points seen take part."""
-        settings = self._settings
+    def correct(self, residuals: Residuals) -> FloatArray:
+        """Integrate the innovation (30), (31) over the time since landmarks were seen before."""
+        settings, e, r = self._settings, residuals.e, residuals.r
         gain_l = 0.0 if self._is_fixed else settings.gain_l
-        k = np.full(len(residuals.r), settings.gain_k)
+        k = np.full(len(r), settings.gain_k)
         step = paper_step if settings.step_mode == 'paper' else centroid_step
         dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)
         # One time for the pose: were the r_i to act for different ones, L (34) might grow.
-        act = partial(step, axes=self._axes)
-        D = safe_step(act, k, residuals.e, residuals.r, float(np.mean(dt_s)))  # (30)
-        remaining = se3.transform(D, residuals.e) - residuals.e + residuals.r
+        D = safe_step(partial(step, axes=self.axes), k, e, r, float(np.mean(dt_s)))  # (30)
+        remaining = se3.transform(D, e) - e + r
         shares = -np.expm1(-gain_l / settings.gain_k * dt_s)
         d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
-        return Correction(D, residuals.rows, d), np.ones(len(k))
+        self.observer.correct(D, residuals.rows, d)
+        return np.ones(len(k))
+
+    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Take all landmarks for exact: l is 0 from now on."""
+        super().fix_landmarks(y_ref, covariances)
+        self._is_fixed = True
+
+    def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
+        """Put the known landmarks where they are known to be."""
+        self.observer.correct(np.eye(4), rows, -r)
 
 
 def centroid_step(
@@ -101,17 +86,7 @@ def centroid_step(
 ) -> FloatArray:
     """Return the pose's step D (4, 4), turning about the gain-weighted centroid of the e_i.
 
-    Parameters
-    ----------
-    k : FloatArray
-        (m,) gains k_i.
-    e, r : FloatArray
-        (m, 3) errors and residuals, metres.
-    dt_s : float
-        Time step, seconds.
-    axes : Axes
-        Axes of the pose that are moved.
-
+    Gains k_i (m,), errors e_i and residuals r_i (m, 3) in metres, and the time step in seconds.
     """
     total = np.sum(k)
     centre = k @ e / total if total > 0.0 else np.zeros(3)
@@ -121,10 +96,7 @@ def centroid_step(
 def paper_step(
     k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: Axes = SPATIAL
 ) -> FloatArray:
-    """Return the pose's step D (4, 4) that tends to exp(Δ dt), Δ as in (30), for dt → 0.
-
-    Parameters are those of :func:`centroid_step`.
-    """
+    """Return the pose's step D (4, 4) that tends to exp(Δ dt), Δ as in (30), for dt → 0."""
     return _step_about(np.zeros(3), PAPER_METRIC, k, e, r, dt_s, axes)
 
 

@@ -1,22 +1,31 @@
-"""What all gain designs have in common, and what they are given."""
+"""What all filters have in common: the state X̂ on SLAM_n(3), and what is known of its errors.
+
+Both live and change together. What a filter does not override is right for one that knows no
+noise. Covariances are those of errors in the reference frame, m² and rad²; None where a filter
+knows none.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
-from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.observer.observer import Correction, Observer
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import Axes, axes_of
+from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
+
+if TYPE_CHECKING:
+    from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
-"""Settings without effect on other designs; ``gain_k`` is in the Lyapunov value of all."""
+"""Settings without effect on other filters; ``gain_k`` is in the Lyapunov value of all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +56,11 @@ class Residuals:
     covariances: FloatArray
     dt_s: FloatArray
 
+    @property
+    def landmarks(self) -> FloatArray:
+        """(m, 3) estimated landmarks y_i° + â_i, metres, reference frame."""
+        return self.e - self.r + self.a
+
     def on(self, axes: Axes) -> tuple[FloatArray, FloatArray]:
         """Return r (m, k), metres, and the covariances (m, k, k), m², on estimated axes."""
         k = axes.point
@@ -67,205 +81,152 @@ class Residuals:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class FrameObservation:
-    """All m landmarks of one observation, after the correction and with the new ones.
+class Filter:
+    """X̂ and what is known of its errors; a subclass sets the gains of the innovation.
+
+    Parameters
+    ----------
+    live : LiveSettings
+        The settings in force.
+    reference_pose : FloatArray
+        (4, 4) P°, body to world.
 
     Attributes
     ----------
-    stamp_ns : int
-        Stamp of the observation, nanoseconds.
-    rows : IntArray
-        (m,) which landmarks were seen.
-    points : FloatArray
-        (m, 3) where, metres, body frame.
-    lines_of_sight : FloatArray
-        (m, 3) from the sensor to where they should have been, or, where that is not sure, to where
-        they were seen, metres, body frame.
-    covariances : FloatArray or None
-        (m, 3, 3) covariance of the points, body frame, m²; None where the noise model has it.
-    dt_s : FloatArray
-        (m,) seconds since each of them was seen before; infinite if it was not.
-
-    """
-
-    stamp_ns: int
-    rows: IntArray
-    points: FloatArray
-    lines_of_sight: FloatArray
-    covariances: FloatArray | None
-    dt_s: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class InHindsight:
-    """Estimates from all that was seen before and after.
-
-    Attributes
-    ----------
-    stamps_ns : IntArray
-        (s,) stamps of the observations, nanoseconds.
-    poses : FloatArray
-        (s, 4, 4) Â at these stamps.
-    points : FloatArray
-        (n, 3) y_i° + â_i, metres, reference frame.
-    since : str
-        What has happened before the first of them, in words.
-
-    """
-
-    stamps_ns: IntArray
-    poses: FloatArray
-    points: FloatArray
-    since: str
-
-
-class GainDesign:
-    """Strategy that turns residuals into a correction: the innovation over a step of time.
-
-    What a design does not override is right for one that knows no noise and has no memory.
-    Covariances are those of the errors in the reference frame; None where a design knows none.
-
-    Attributes
-    ----------
+    observer : Observer
+        X̂ and its reference ξ°.
     calibration : Calibration
         Scale, bias and delay of the velocity, as far as they are known.
+    axes : Axes
+        What of the pose and of points is estimated.
+    joint : JointCovariance or None
+        The covariance of the errors of pose and landmarks together, where it is kept.
     ignores : tuple of str
-        Settings without effect on the design; a warning names those that were changed.
+        Settings without effect on the filter.
 
     """
 
-    calibration: Calibration
+    joint: JointCovariance | None = None
     ignores: ClassVar[tuple[str, ...]] = ()
 
-    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
-        """Return the correction and the weights (m,) of the points seen, 0 for a rejected one."""
-        raise NotImplementedError
-
-    def change_settings(self, settings: Settings) -> None:
-        """Use the settings that may change while running."""
-        raise NotImplementedError
-
-    def anchor(
-        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
-    ) -> Correction:
-        """Return the correction that brings the whole estimate to where known landmarks are.
-
-        Parameters
-        ----------
-        observer : Observer
-            The estimate.
-        rows : IntArray
-            (m,) which of its landmarks are known.
-        r : FloatArray
-            (m, 3) estimated minus known positions, metres, reference frame.
-        covariances : FloatArray
-            (m, 3, 3) covariances of the known positions, m².
-
-        """
-        raise NotImplementedError
-
-    def predict(self, observer: Observer, motion: Motion) -> None:
-        """Account for the noise of a motion that has brought ``observer`` to where it is."""
-
-    def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Account for landmarks (m, 3) whose first observation has ``covariances`` (m, 3, 3)."""
-
-    def relocate_landmarks(
-        self, rows: IntArray, y_ref: FloatArray, covariances: FloatArray
-    ) -> None:
-        """Take landmarks (m,) for new ones at ``y_ref`` (m, 3), seen for the first time."""
-
-    def add_known_landmarks(self, covariances: FloatArray) -> None:
-        """Account for landmarks from a map with ``covariances`` (m, 3, 3), reference frame, m²."""
-
-    def with_fixed_landmarks(self, covariances: FloatArray) -> GainDesign:
-        """Return gains that know what these do, and never move a landmark again.
-
-        ``covariances`` (n, 3, 3), reference frame, m², are what a map says of all landmarks, new
-        ones among them. These gains are not used any more.
-        """
-        raise NotImplementedError
-
-    def remove_landmarks(self, rows: IntArray) -> None:
-        """Forget the landmarks at ``rows``; those behind move up."""
-
-    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
-        """Take ``covariance`` (6, 6) for that of ε, independent of all else."""
-
-    def recall(self, observer: Observer, rows: IntArray) -> None:
-        """Move landmarks that are about to be used, where the design had put that off.
-
-        ``rows`` (m,) are −1 where one is new.
-        """
-
-    def postponed_shifts(self) -> FloatArray:
-        """Return how far landmarks have yet to be moved, (n, 3), metres; (1, 3) if it is zero."""
-        return np.zeros((1, 3))
-
-    def distances(self, residuals: Residuals) -> FloatArray:
-        """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
-        return np.zeros(len(residuals.r))
-
-    def settle(self, observer: Observer) -> None:
-        """Move the reference to the estimate after a correction, where the design needs that."""
+    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
+        self._live = live
+        self.axes = axes_of(live.now.two_d_mode)
+        self.observer = Observer(reference_pose)
+        self.calibration = Calibration(live.now, self.axes)
 
     @property
-    def looks_back(self) -> bool:
-        """Whether the design looks back at what was seen."""
-        return False
+    def has_joint_covariance(self) -> bool:
+        """Whether observations can be judged by it, as association and relinearising do."""
+        return self.joint is not None
 
-    def look_back(self, observer: Observer, seen: FrameObservation, in_doubt: bool) -> None:
-        """Note what was seen, and look back if it is time; only for those that do at all.
+    @property
+    def _settings(self) -> Settings:
+        return self._live.now
 
-        The observer's reference is moved then. ``in_doubt`` asks for it now, as a landmark seems
-        to have moved.
+    # The step (27)-(31)
+
+    def propagate(self, motion: Motion) -> None:
+        """Move pose and landmarks along a motion (27), and account for its noise."""
+        self.observer.propagate(motion.path)
+        self.observer.move_landmarks(motion.duration_s)
+
+    def residuals(
+        self, rows: IntArray, points: FloatArray, covariances: FloatArray, dt_s: FloatArray
+    ) -> Residuals:
+        """Return the residuals (29) of landmarks ``rows`` (m,) seen at ``points`` (m, 3).
+
+        Points and their ``covariances`` (m, 3, 3) are in the body frame, m and m²; ``dt_s`` (m,)
+        are the seconds since each was seen before. :meth:`expected_points` has been asked for
+        them: a filter that postpones moves of landmarks moves them there.
         """
+        observer = self.observer
+        e, r = observer.errors(rows, points)
+        return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s)
 
-    def smooth(self, observer: Observer) -> InHindsight:
-        """Return the estimates in hindsight.
+    def correct(self, residuals: Residuals) -> FloatArray:
+        """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
+        raise NotImplementedError
 
-        Raises
-        ------
-        ParameterError
-            If the design keeps no history.
-        SmoothingError
-            If the observations don't determine the whole trajectory.
+    # Landmarks
 
+    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
+        self.observer.add_landmarks(points)
+
+    def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks that a map has at ``y_ref`` (m, 3), reference frame."""
+        self.observer.add_reference_landmarks(y_ref)
+
+    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+        """Take landmarks for new ones, seen for the first time at ``points``, body frame."""
+        self.observer.relocate_landmarks(rows, points)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``; those behind move up."""
+        self.observer.remove_landmarks(rows)
+
+    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Take all landmarks for exact and at rest at ``y_ref`` (n, 3), and never move them.
+
+        ``covariances`` (n, 3, 3) are what the map says of them, which is only passed on.
         """
-        raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
+        self.observer.fix_landmarks(y_ref)
 
-    def restart(self, observer: Observer, since: str) -> None:
-        """Forget the past: what is known now is all that is known when looking back.
+    def expected_points(self, rows: IntArray) -> FloatArray:
+        """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
+        return self.observer.body_points(rows)
 
-        ``since`` is what has happened, in words, for whoever asks why hindsight begins here.
+    # The frame
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
+        """Put the robot at Â = ``pose`` (4, 4), ε of ``covariance`` (6, 6) independent of all."""
+        self.observer.A = pose
+
+    def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
+        """Move the whole estimate to where m of its landmarks are known to be.
+
+        ``r`` (m, 3) are estimated minus known positions, metres, reference frame; ``covariances``
+        (m, 3, 3) those of the known positions, m².
         """
+        raise NotImplementedError
+
+    # What is known of the errors
+
+    @property
+    def world_points(self) -> FloatArray:
+        """(n, 3) estimated landmarks, metres, world."""
+        return se3.transform(self.observer.reference_pose, self.points)
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 3) the same in the reference frame."""
+        return self.observer.points
 
     @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
         return np.empty(0)
 
-    @property
-    def pose_error_covariance(self) -> FloatArray | None:
-        """(6, 6) covariance of the error ε of Â = exp(ε) A, (Ω, v) order; None if unknown."""
+    def pose_covariance(self, motion: Motion | None = None) -> FloatArray | None:
+        """Return the covariance (6, 6) of ε in Â = exp(ε) A; after a motion that is yet to be."""
         return None
 
-    def pose_error_covariance_after(self, motion: Motion) -> FloatArray | None:
-        """Return what the same (6, 6) will be after a motion that is yet to be predicted."""
+    def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:
+        """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
         return None
-
-    @property
-    def landmark_error_covariances(self) -> FloatArray | None:
-        """(n, 3, 3) covariances of the errors ã_i, reference frame, m²; None if unknown."""
-        return None
-
-    def landmark_error_covariances_after(
-        self, observer: Observer, duration_s: float
-    ) -> FloatArray | None:
-        """Return what the same will be when landmarks that move have moved on."""
-        return self.landmark_error_covariances
 
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
-        """Return the covariance (p + m k, p + m k) of ε and m landmarks; None if unknown."""
+        """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks."""
         return None
+
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
+        return np.zeros(len(residuals.r))
+
+    def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+        """Return what a joint covariance predicts of m residuals, but for the points' noise.
+
+        Their covariances (p, m k) with ε, and their own, (m k, m k).
+        """
+        raise NotImplementedError

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry.matrices import symmetric
 
 JITTER_M2 = 1e-12
@@ -24,15 +24,15 @@ JITTER_M2 = 1e-12
 
 
 def gauge_information(J: FloatArray, S: FloatArray) -> FloatArray:
-    """Return Λ⁻¹ = Jᵀ S⁻¹ J (d, d), what landmarks tell of γ, for J (q, d) and S (q, q)."""
+    """Return Λ⁻¹ = Jᵀ S⁻¹ J (d, d), what landmarks say of γ, for J (q, d) and S (q, q)."""
     information: FloatArray = J.T @ _solve(S, J)
     return information
 
 
 def anchor(
-    P: FloatArray, G: FloatArray, columns: IntArray, R: FloatArray, r: FloatArray
+    P: FloatArray, G: FloatArray, PH: FloatArray, S: FloatArray, J: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Bring an estimate of unknown gauge to where known landmarks say that it is.
+    """Bring an estimate of unknown gauge to where known landmarks show it to be.
 
     Parameters
     ----------
@@ -40,10 +40,9 @@ def anchor(
         (N, N) covariance of the error x.
     G : FloatArray
         (N, d) how x changes when the whole estimate is moved.
-    columns : IntArray
-        (q,) entries of x that are the errors of the known landmarks' coordinates.
-    R : FloatArray
-        (q, q) covariance of the known landmarks.
+    PH, S, J : FloatArray
+        (N, q) P Hᵀ, (q, q) H P Hᵀ + R and (q, d) H G, with H x the errors of the known
+        landmarks' coordinates.
     r : FloatArray
         (q,) estimate minus known coordinates.
 
@@ -55,8 +54,7 @@ def anchor(
         (N, N) its covariance now.
 
     """
-    J, PH = G[columns], P[:, columns]
-    S = PH[columns] + R + JITTER_M2 * np.eye(len(r))
+    S = S + JITTER_M2 * np.eye(len(r))
     information = gauge_information(J, S)
     gamma = np.linalg.solve(information, J.T @ _solve(S, r))
     K = _solve(S, PH.T).T

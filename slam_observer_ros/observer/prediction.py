@@ -1,11 +1,10 @@
-"""What a motion does to the covariance of pose and calibration, for every design that has one."""
+"""What a motion does to the covariance of pose and calibration, in every filter that has one."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import paths, se3
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.geometry.matrices import symmetric
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -17,38 +16,14 @@ def initial_covariance(axes: Axes, calibration: Calibration) -> FloatArray:
     return np.diag(np.append(np.zeros(axes.p), calibration.initial_variances))
 
 
-def predict(
-    P: FloatArray, axes: Axes, calibration: Calibration, motion: Motion
-) -> tuple[FloatArray, FloatArray]:
-    """Add a motion's noise Ad_Â Q Ad_Âᵀ to the pose block of P, in place.
-
-    Parameters
-    ----------
-    P : FloatArray
-        (p + c + …, p + c + …) covariance of pose error, calibration, and anything else.
-    axes, calibration : Axes, Calibration
-        Which p axes of the pose and c of the calibration are estimated.
-    motion : Motion
-        The motion since the last call.
-
-    Returns
-    -------
-    noise : FloatArray
-        (p, p) what was added to the pose block.
-    F : FloatArray
-        (p, c) how the pose error has grown with that of the calibration.
-
-    """
-    p = axes.p
-    c = slice(p, p + calibration.count)
-    Ad = se3.adjoint(motion.path)[:, axes.pose]
-    F = calibration.sensitivity(Ad, motion)
-    noise = paths.summed_noise(Ad, motion.covariances)
-    if calibration.count:
-        P[:p] += F @ P[c]
-        P[:p, :p] += P[:p, c] @ F.T
+def predict(P: FloatArray, motion: Motion) -> None:
+    """Let ε become ε + F c̃ + w, w ~ N(0, noise), in the covariance P of (ε, c̃, …), in place."""
+    p, c_count = motion.sensitivity.shape
+    c = slice(p, p + c_count)
+    if c_count:
+        P[:p] += motion.sensitivity @ P[c]
+        P[:p, :p] += P[:p, c] @ motion.sensitivity.T
         P[p:, :p] = P[:p, p:].T
-        P[c, c] += calibration.drift_covariance * motion.duration_s
+        P[c, c] += motion.drift
     # No observation takes a skew part away again, so rounding must not add to it.
-    P[:p, :p] = symmetric(P[:p, :p] + noise)
-    return noise, F
+    P[:p, :p] = symmetric(P[:p, :p] + motion.noise)

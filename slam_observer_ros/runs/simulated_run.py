@@ -13,7 +13,7 @@ from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.evaluation.truth import PoseTruth
-from slam_observer_ros.observer.observer import lyapunov
+from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.runs.sampling import SAMPLE_PERIOD_NS
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation

@@ -13,7 +13,6 @@ from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.geometry import paths
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 NAMES = (
@@ -49,6 +48,8 @@ class Calibration:
 
     Attributes
     ----------
+    axes : Axes
+        The same.
     count : int
         c, how many entries of s, b and τ are estimated.
     initial_variances : FloatArray
@@ -63,6 +64,7 @@ class Calibration:
     """
 
     def __init__(self, settings: Settings, axes: Axes) -> None:
+        self.axes = axes
         scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
         bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
         errors = np.concatenate([scale, bias, [settings.velocity_delay_error]])
@@ -116,23 +118,29 @@ class Calibration:
         biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
         return body_velocities * self._all[:6] + biases
 
-    def sensitivity(self, Ad: FloatArray, motion: Motion) -> FloatArray:
+    def sensitivity(
+        self,
+        Ad: FloatArray,
+        measured_velocities: FloatArray,
+        dt_s: FloatArray,
+        at_ends: FloatArray | None,
+    ) -> FloatArray:
         """Return (p, c), how the pose error grows with the errors of s, b and τ over a motion.
 
         From ε' = Ad_Â (V ∘ s̃ + b̃), and from a delay taken too long by τ̃, so that velocities
         were taken from an interval that begins and ends τ̃ earlier. ``Ad`` (k + 1, p, 6) holds
-        the estimated rows of Ad_Â.
+        the estimated rows of Ad_Â; the others are those of :class:`.Motion`.
         """
         if not self.count:
             return np.empty((Ad.shape[1], 0))
-        rates = motion.measured_velocities[:, self._calibrated]
-        rates[:, self._scales :] = _moves(motion.measured_velocities)[:, None]
-        shares = paths.at_poses(rates * motion.dt_s[:, None])
+        rates = measured_velocities[:, self._calibrated]
+        rates[:, self._scales :] = _moves(measured_velocities)[:, None]
+        shares = paths.at_poses(rates * dt_s[:, None])
         of_rates = Ad[:, :, self._calibrated] * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
         F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
-        if len(self._calibrated) < self.count and motion.at_ends is not None:
-            first, last = self.apply(motion.at_ends)
+        if len(self._calibrated) < self.count and at_ends is not None:
+            first, last = self.apply(at_ends)
             F[:, -1] = Ad[0] @ first - Ad[-1] @ last
         return F
 

@@ -68,6 +68,7 @@ def integrate(
         covariances=noise.covariances(held),
         duration_s=to_s(end_ns - start_ns),
         at_ends=at_ends,
+        calibration=calibration,
     )
 
 

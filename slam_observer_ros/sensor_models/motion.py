@@ -1,13 +1,16 @@
-"""A motion of the robot, as a gain design is given it."""
+"""A motion of the robot, as the filters are given it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.geometry import paths, se3
+from slam_observer_ros.sensor_models.calibration import Calibration
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Motion:
     """Motion from one instant of the state to the next, in k pieces of held velocity.
 
@@ -20,12 +23,14 @@ class Motion:
     dt_s : FloatArray
         (k,) seconds that each velocity was held.
     covariances : FloatArray
-        (k, 6, 6) covariance of each piece, in the body frame, rad² and m².
+        (k, 6, 6) covariance of each piece, body frame, rad² and m².
     duration_s : float
         Seconds in all, with those without a known velocity.
     at_ends : FloatArray or None
         (2, 6) measured velocities around the start and the end, rad/s and m/s; None where what
         moved does not depend on the delay of the velocities.
+    calibration : Calibration
+        The calibration that led along the path.
 
     """
 
@@ -35,3 +40,26 @@ class Motion:
     covariances: FloatArray
     duration_s: float
     at_ends: FloatArray | None
+    calibration: Calibration
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """(p, p) Σ Ad_Â Q Ad_Âᵀ, what the motion adds to the covariance of ε."""
+        return paths.summed_noise(self._Ad, self.covariances)
+
+    @cached_property
+    def sensitivity(self) -> FloatArray:
+        """(p, c) F, how ε grows with the errors of the calibration."""
+        return self.calibration.sensitivity(
+            self._Ad, self.measured_velocities, self.dt_s, self.at_ends
+        )
+
+    @cached_property
+    def drift(self) -> FloatArray:
+        """(c, c) what the motion's time adds to the covariance of the calibration."""
+        return self.calibration.drift_covariance * self.duration_s
+
+    @cached_property
+    def _Ad(self) -> FloatArray:
+        """(k + 1, p, 6) the estimated rows of Ad_Â along the path."""
+        return se3.adjoint(self.path)[:, self.calibration.axes.pose]

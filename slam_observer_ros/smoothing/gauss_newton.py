@@ -27,21 +27,21 @@ from slam_observer_ros.smoothing.prior import EXACT_M, Prior
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
-    """S frames with M observed points: what happened since the prior.
+class Keyframes:
+    """S keyframes with M observed points: what happened since the prior.
 
     Attributes
     ----------
     motions : FloatArray
-        (S, 4, 4) pose of each frame in the one before it; the first in the prior's pose.
+        (S, 4, 4) pose of each keyframe in the one before it; the first in the prior's pose.
     motion_covariances : FloatArray
         (S, d, d) covariance of each motion as a right perturbation.
     sensitivities : FloatArray
         (S, d, c) derivative of each motion by the calibration, as a right perturbation.
     calibrations : FloatArray
         (S, c) calibration with which each motion was computed.
-    frames : IntArray
-        (M,) in which frame each point was observed.
+    keyframes : IntArray
+        (M,) in which keyframe each point was observed.
     landmarks : IntArray
         (M,) which landmark it is.
     points : FloatArray
@@ -57,17 +57,17 @@ class Frames:
     motion_covariances: FloatArray
     sensitivities: FloatArray
     calibrations: FloatArray
-    frames: IntArray
+    keyframes: IntArray
     landmarks: IntArray
     points: FloatArray
     information: FloatArray
     shares: FloatArray
 
-    def only(self, kept: BoolArray) -> Frames:
-        """Return the frames with only some of the points (M,)."""
+    def only(self, kept: BoolArray) -> Keyframes:
+        """Return the keyframes with only some of the points (M,)."""
         return replace(
             self,
-            frames=self.frames[kept],
+            keyframes=self.keyframes[kept],
             landmarks=self.landmarks[kept],
             points=self.points[kept],
             information=self.information[kept],
@@ -75,21 +75,21 @@ class Frames:
         )
 
 
-def joined(parts: list[Frames]) -> Frames:
-    """Return the frames of one or more parts, one after the other."""
-    names = [field.name for field in fields(Frames)]
-    return Frames(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+def joined(parts: list[Keyframes]) -> Keyframes:
+    """Return the keyframes of one or more parts, one after the other."""
+    names = [field.name for field in fields(Keyframes)]
+    return Keyframes(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def no_frames(d: int, c: int, k: int) -> Frames:
+def no_keyframes(d: int, c: int, k: int) -> Keyframes:
     """Return what happened while nothing did; d, c and k as in :class:`Smoother`."""
     none = np.empty(0, dtype=np.int64)
-    return Frames(
+    return Keyframes(
         motions=np.empty((0, 4, 4)),
         motion_covariances=np.empty((0, d, d)),
         sensitivities=np.empty((0, d, c)),
         calibrations=np.empty((0, c)),
-        frames=none,
+        keyframes=none,
         landmarks=none,
         points=np.empty((0, 3)),
         information=np.empty((0, k, k)),
@@ -104,7 +104,7 @@ class Solution:
     Attributes
     ----------
     poses : FloatArray
-        (S + 1, 4, 4) pose of the prior, then of each frame.
+        (S + 1, 4, 4) pose of the prior, then of each keyframe.
     calibration : FloatArray
         (c,) calibration of the velocity.
     points : FloatArray
@@ -140,27 +140,27 @@ class Step:
 
 
 class Smoother:
-    """Gauss–Newton iterations over a prior and frames.
+    """Gauss–Newton iterations over a prior and keyframes.
 
     Parameters
     ----------
     axes : Axes
         Which axes are estimated: d of the pose, k of a point.
     prior : Prior
-        What was known before the first frame.
-    frames : Frames
+        What was known before the first keyframe.
+    keyframes : Keyframes
         What happened since.
     settings : Settings
         ``huber_threshold`` and ``rejection_distance``.
 
     """
 
-    def __init__(self, axes: Axes, prior: Prior, frames: Frames, settings: Settings) -> None:
+    def __init__(self, axes: Axes, prior: Prior, keyframes: Keyframes, settings: Settings) -> None:
         self._axes = axes
         self._prior = prior
-        self._frames = frames
+        self._keyframes = keyframes
         self._settings = settings
-        self._motion_information = _inverse(frames.motion_covariances)
+        self._motion_information = _inverse(keyframes.motion_covariances)
         self._prior_information = _inverse(prior.covariance)
 
     def smooth(self, start: Solution, iterations: int, tolerance: float) -> Step:
@@ -191,10 +191,10 @@ class Smoother:
         )
 
     def _linearise(self, solution: Solution) -> Equations:
-        c, k, frames = len(solution.calibration), self._axes.point, self._frames
+        c, k, keyframes = len(solution.calibration), self._axes.point, self._keyframes
         S, d, b = len(solution.poses), self._axes.p, c + k * len(solution.points)
         H, gradient = self._observations(solution)
-        poses, landmarks, n = frames.frames + 1, frames.landmarks, len(solution.points)
+        poses, landmarks, n = keyframes.keyframes + 1, keyframes.landmarks, len(solution.points)
         columns = landmark_columns(np.arange(n), c, k)
         corner, border_gradient = np.zeros((b, b)), np.zeros(b)
         corner[columns[:, :, None], columns[:, None]] = sum_by(landmarks, n, H[:, d:, d:])
@@ -233,17 +233,17 @@ class Smoother:
 
     def _add_motions(self, equations: Equations, solution: Solution) -> None:
         """Add e_s = log((M_s exp(F_s (c − c_s)))⁻¹ Â_{s−1}⁻¹ Â_s) of each motion M_s."""
-        frames, pose = self._frames, self._axes.pose
+        keyframes, pose = self._keyframes, self._axes.pose
         d, c = self._axes.p, len(solution.calibration)
-        eta = np.zeros((len(frames.motions), 6))
-        off = solution.calibration - frames.calibrations
-        eta[:, pose] = (frames.sensitivities @ off[:, :, None])[:, :, 0]
+        eta = np.zeros((len(keyframes.motions), 6))
+        off = solution.calibration - keyframes.calibrations
+        eta[:, pose] = (keyframes.sensitivities @ off[:, :, None])[:, :, 0]
         back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
-        motions = frames.motions @ se3.exp(eta)
+        motions = keyframes.motions @ se3.exp(eta)
         error = se3.log(se3.inverse(back @ motions))
         J_to = self._estimated(se3.left_jacobian_inverse(-error))
         J_from = -J_to @ self._estimated(se3.adjoint(back))
-        F = frames.sensitivities
+        F = keyframes.sensitivities
         if c:
             J_off = -J_to @ self._estimated(se3.adjoint(back @ motions) @ se3.left_jacobian(-eta))
             F = J_off @ F
@@ -269,21 +269,21 @@ class Smoother:
 
         They are (M, d + k, d + k) and (M, d + k), for the pose and the landmark of each point.
         """
-        frames, k = self._frames, self._axes.point
-        poses = solution.poses[frames.frames + 1]
+        keyframes, k = self._keyframes, self._axes.point
+        poses = solution.poses[keyframes.keyframes + 1]
         R = poses[:, :3, :3]
-        arms = solution.points[frames.landmarks] - poses[:, :3, 3]
+        arms = solution.points[keyframes.landmarks] - poses[:, :3, 3]
         predicted = (transpose(R) @ arms[:, :, None])[:, :, 0]
-        error = (predicted - frames.points)[:, :k]
+        error = (predicted - keyframes.points)[:, :k]
         J_point = transpose(R)[:, :k, :k]
         J = np.concatenate([-self._axes.output_matrix(predicted), J_point], axis=2)
-        counted = frames.shares * self._weights(error)
-        return _normal(J, frames.information * counted[:, None, None], error)
+        counted = keyframes.shares * self._weights(error)
+        return _normal(J, keyframes.information * counted[:, None, None], error)
 
     def _weights(self, error: FloatArray) -> FloatArray:
         """Return Huber's weights (M,), which fall off faster where a filter would reject."""
         huber, rejection = self._settings.huber_threshold, self._settings.rejection_distance
-        squared = (error[:, None, :] @ self._frames.information @ error[:, :, None])[:, 0, 0]
+        squared = (error[:, None, :] @ self._keyframes.information @ error[:, :, None])[:, 0, 0]
         weights: FloatArray = np.minimum(1.0, rejection**2 / np.maximum(squared, rejection**2))
         if huber > 0.0:
             weights = weights * huber / np.sqrt(np.maximum(squared, huber**2))

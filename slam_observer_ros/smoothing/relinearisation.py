@@ -1,13 +1,13 @@
-"""Looking back: when what was seen is linearised anew, and what comes of it.
+"""When what was seen is linearised again, and what the filter takes over from that.
 
 Covariances that were computed around a poor early estimate stay wrong, so after a long blind
 stretch a plain filter closes its loop badly. How much its linearisation can have lost shows in
 how far its corrections have turned the robot.
 
-What was linearised anew stays as it is: from then on a summary stands for it, in coordinates in
+What was linearised again stays as it is: from then on a summary stands for it, in coordinates in
 which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a blind stretch
-there may be no such summary until landmarks seen before are seen again. Else the cost of looking
-back does not grow with the history, of which only :meth:`Hindsight.smooth` needs all.
+there may be no such summary until landmarks seen before are seen again. Else the cost does not
+grow with the history, of which only :meth:`Relinearisation.smooth` needs all.
 """
 
 from __future__ import annotations
@@ -17,157 +17,139 @@ import math
 
 import numpy as np
 
-from slam_observer_ros.common.errors import SmoothingError
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.errors import ParameterError, SmoothingError
+from slam_observer_ros.common.types import FloatArray, Immutable, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.observer.filter import FrameObservation
-from slam_observer_ros.observer.observer import Correction, Observer
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
-from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
-from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Solution, Step
-from slam_observer_ros.smoothing.history import History
+from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.prior import Prior
 
 logger = logging.getLogger(__name__)
 
 SHARE_OF_HISTORY = 0.1
-"""Share of all observations so far that are looked back at at least, up to ``MAX_INTERVAL``.
+"""Share of all observations so far that are linearised again at least, up to ``MAX_INTERVAL``.
 
-As large maps take many observations, the O(n³) that looking back costs for n landmarks is shared
-by so many that each of them costs no more than an update, O(n²).
+As large maps take many observations, the O(n³) that this costs for n landmarks is shared by so
+many that each of them costs no more than an update, O(n²).
 """
 
 MAX_INTERVAL = 300
-"""Observations that are enough to be looked back at, however many there were before."""
+"""Observations that are enough, however many there were before."""
 
 MAX_TURN_RAD = 0.2
 """Angle, see :meth:`.Prior.least_nonlinear`, beyond which there is no summary."""
 
 EARLY_SHARE = 0.1
 """Share of the observations otherwise waited for that will do after a single large correction:
-what is linearised before the next time of looking back is linearised in the wrong place.
+what is linearised before the next time is linearised in the wrong place.
 """
 
 ITERATIONS, TOLERANCE = 2, 2e-2
-"""Steps of looking back at most; change of pose and map, rad and m, below which one will do."""
+"""Steps at most; change of pose and map, rad and m, below which one will do."""
 
 SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
 """The same for smoothing everything."""
 
 
-class Hindsight:
-    """What was seen since a prior, and looking back at it.
+class Relinearisation:
+    """What a filter has seen since a prior, and when that is linearised again.
 
     Parameters
     ----------
-    axes : Axes
-        Which axes are estimated.
-    settings : Settings
-        The settings ``hindsight_*``, ``huber_threshold``, and the noise of observations.
-    calibration, joint : Calibration, JointCovariance
-        What the gains know, which looking back changes; at first there are no landmarks.
+    filter_, joint : Filter, JointCovariance
+        The filter, at its start, and its covariance; relinearising changes what they know.
+    live : LiveSettings
+        ``hindsight_*``, ``huber_threshold``, ``rejection_distance``, noise of observations.
 
     Attributes
     ----------
-    settings : Settings
-        The settings in force.
     history : History
         What was seen since the prior.
 
     """
 
-    def __init__(
-        self, axes: Axes, settings: Settings, calibration: Calibration, joint: JointCovariance
-    ) -> None:
-        self.settings = settings
-        self._axes, self._calibration, self._joint = axes, calibration, joint
-        self._observation_noise = ObservationNoise(settings)
+    def __init__(self, filter_: Filter, joint: JointCovariance, live: LiveSettings) -> None:
+        self._filter, self._joint, self._live = filter_, joint, live
+        self._observation_noise = ObservationNoise(live.now)
         self._warning = _Warning()
-        self._seen = 0
-        at_start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), joint.P.copy())
-        self._start(at_start, 'the last start')
+        self._seen = self._observations = 0
+        self._turn_squared = self._largest_turn = 0.0
+        self.reset('the last start')
 
-    def restart(self, observer: Observer, since: str) -> None:
+    @property
+    def is_active(self) -> bool:
+        """Whether there is a history, of what the smoother takes for constant."""
+        return self._live.now.hindsight_interval > 0 and not self._filter.calibration.drifts
+
+    def reset(self, since: str) -> None:
         """Forget all but what is known now; ``since`` is why, in words."""
-        self._start(self._known(observer), since)
+        self._start(self._known(), since)
 
-    def _start(self, prior: Prior, since: str) -> None:
-        self.history = History(self._axes, self._observation_noise, prior, since)
-        self._rest()
+    def move(self, motion: Motion) -> None:
+        """Note a motion of the robot."""
+        if not self.is_active:
+            return
+        if self._filter.observer.u.any():
+            # How far they went depends on how the robot was turned, which no smoother here knows.
+            self.reset('a landmark came with a velocity')
+        else:
+            self.history.move(motion)
 
-    def _rest(self) -> None:
-        self._observations, self._turn_squared, self._largest_turn = 0, 0.0, 0.0
-        self._is_owed = False
+    def note_correction(self, before: FloatArray, after: FloatArray) -> None:
+        """Note a correction that turned the robot from Â to another (4, 4)."""
+        half_sine = np.linalg.norm(after[:3, :3] - before[:3, :3]) / math.sqrt(8.0)
+        turn_rad = 2.0 * math.asin(min(float(half_sine), 1.0))
+        self._turn_squared += turn_rad**2
+        self._largest_turn = max(self._largest_turn, turn_rad)
 
-    @property
-    def _window_is_full(self) -> bool:
-        """Whether the history has as many frames as it may have."""
-        return 0 < self.settings.hindsight_window <= len(self.history.stamps_ns)
-
-    @property
-    def _is_due(self) -> bool:
-        """Whether corrections have turned far, with enough observations since it last was due.
-
-        Or whether what was looked back at could not be summed up for a landmark in doubt.
-        """
-        if self._is_owed:
-            return True
-        settings = self.settings
-        least = max(settings.hindsight_interval, min(SHARE_OF_HISTORY * self._seen, MAX_INTERVAL))
-        if 0.0 < settings.hindsight_turn < self._largest_turn:
-            least *= EARLY_SHARE
-        turned_far = self._turn_squared > settings.hindsight_turn**2
-        return turned_far and self._observations >= least
-
-    def note_correction(self, rotation: FloatArray) -> None:
-        """Note a correction that turned the robot by ``rotation`` (3,), rad."""
-        turn_squared = float(rotation @ rotation)
-        self._turn_squared += turn_squared
-        self._largest_turn = max(self._largest_turn, math.sqrt(turn_squared))
-
-    def look_back(self, observer: Observer, seen: FrameObservation, in_doubt: bool) -> None:
-        """Add a frame to the history; if it is time, or asked for, linearise the latest ones anew.
+    def add(self, keyframe: Keyframe, in_doubt: bool) -> None:
+        """Add a keyframe; if it is time, or a landmark ``in_doubt``, linearise the latest again.
 
         The smoother's marginal becomes the filter's covariance, and its solution the observer's
         new reference ξ°, with â_i = 0. It sums up all that was seen, for the next time.
         """
-        self.history.see(seen, observer.A)
+        if not len(keyframe.rows):  # says nothing: the motions before and after it add up
+            return
+        self.history.add(keyframe, self._filter.observer.A)
         self._seen += 1
         self._observations += 1
         if in_doubt:
-            self._linearise_anew(observer)
-            # It may be placed anew by this very frame, which must be kept for that.
+            self._relinearise()
+            # It may be placed again by this very keyframe, which must be kept for that.
             self._is_owed = True
         elif self._window_is_full or self._is_due:
-            self._sum_up(observer, self._linearise_anew(observer))
+            self._sum_up(self._relinearise())
 
-    def _sum_up(self, observer: Observer, is_done: bool) -> None:
-        """Let what is known now stand for all frames, if they could be linearised anew."""
-        self._rest()
-        known, angle_rad = self._known(observer).least_nonlinear(self._axes)
-        if self._window_is_full:
-            self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
-        elif is_done and angle_rad < MAX_TURN_RAD:
-            self.history.summarise(known)
+    def relocate(self, rows: IntArray) -> None:
+        """Forget all about landmarks (m,) but their latest observation."""
+        self.history.relocate(rows)
 
-    def smooth(self, observer: Observer) -> Solution:
-        """Return all estimates in hindsight, iterated from the present ones.
+    def remove(self, rows: IntArray) -> None:
+        """Forget landmarks; those behind move up."""
+        self.history.remove(rows)
 
-        Until the last pose, the map and the calibration rest.
+    def smooth(self) -> Solution:
+        """Return all estimates, iterated from the present ones; pose, map, calibration rest.
 
         Raises
         ------
+        ParameterError
+            If what the smoother takes for constant is not, or nothing is kept.
         SmoothingError
             If the observations don't determine everything.
 
         """
+        self._check_smoothable()
         history = self.history
         try:
-            smoother = Smoother(self._axes, history.prior, history.frames(), self.settings)
-            start = self._solution_from(0, observer)
+            smoother = Smoother(self._axes, history.prior, history.keyframes(), self._live.now)
+            start = self._solution_from(0)
             return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE).end
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
@@ -175,8 +157,60 @@ class Hindsight:
                 'covariances that say they are exact'
             ) from error
 
-    def _linearise_anew(self, observer: Observer) -> bool:
-        """Linearise the frames anew that are not summarised yet, at the present estimates.
+    def _check_smoothable(self) -> None:
+        if self._live.now.hindsight_interval == 0:
+            raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
+        if self._filter.calibration.drifts:
+            raise ParameterError(
+                "smoothing takes the calibration to stay: 'calibration_drift' must be 0"
+            )
+        if self._filter.observer.have_moved:
+            raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
+
+    @property
+    def _axes(self) -> Axes:
+        return self._filter.axes
+
+    def _start(self, prior: Prior, since: str) -> None:
+        self.history = History(self._axes, self._observation_noise, prior, since)
+        self._rest()
+
+    def _rest(self) -> None:
+        self._observations = 0
+        self._turn_squared = self._largest_turn = 0.0
+        self._is_owed = False
+
+    @property
+    def _window_is_full(self) -> bool:
+        """Whether the history has as many keyframes as it may have."""
+        return 0 < self._live.now.hindsight_window <= len(self.history.stamps_ns)
+
+    @property
+    def _is_due(self) -> bool:
+        """Whether corrections have turned far, with enough observations since it last was due.
+
+        Or whether what was linearised could not be summed up for a landmark in doubt.
+        """
+        if self._is_owed:
+            return True
+        settings = self._live.now
+        least = max(settings.hindsight_interval, min(SHARE_OF_HISTORY * self._seen, MAX_INTERVAL))
+        if 0.0 < settings.hindsight_turn < self._largest_turn:
+            least *= EARLY_SHARE
+        turned_far = self._turn_squared > settings.hindsight_turn**2
+        return turned_far and self._observations >= least
+
+    def _sum_up(self, is_done: bool) -> None:
+        """Let what is known now stand for all keyframes, if they could be linearised again."""
+        self._rest()
+        known, angle_rad = self._known().least_nonlinear(self._axes)
+        if self._window_is_full:
+            self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
+        elif is_done and angle_rad < MAX_TURN_RAD:
+            self.history.summarise(known)
+
+    def _relinearise(self) -> bool:
+        """Linearise the keyframes that are not summarised yet at the present estimates.
 
         Return whether anything came of it. If they don't determine everything, more may do so
         later; the first time there is a warning.
@@ -184,60 +218,67 @@ class Hindsight:
         history, first = self.history, self.history.summarised
         try:
             smoother = Smoother(
-                self._axes, history.summary, history.latest_frames(), self.settings
+                self._axes, history.summary, history.latest_keyframes(), self._live.now
             )
-            step = smoother.smooth(self._solution_from(first, observer), ITERATIONS, TOLERANCE)
+            step = smoother.smooth(self._solution_from(first), ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             self._warning.give()
             return False
         history.poses[first:] = list(step.end.poses)
-        self._rebase(observer, step, covariance)
+        self._take_over(step, covariance)
         return True
 
-    def _rebase(self, observer: Observer, step: Step, covariance: FloatArray) -> None:
+    def _take_over(self, step: Step, covariance: FloatArray) -> None:
         """Take where all was linearised for the reference; the step from there is a correction.
 
-        ``covariance`` belongs to the step's start. Taken for that of its end it would tell
-        something of the gauge, of which nothing is known; settling carries it over.
+        ``covariance`` belongs to the step's start. Taken for that of its end it would say
+        something of the gauge, of which nothing is known.
         """
-        start, end = step.start, step.end
+        start, end, observer = step.start, step.end, self._filter.observer
         observer.A = start.poses[-1]
-        observer.rebase(start.points)
-        self._joint.P = covariance
-        self._joint.P = self._joint.with_pose_error_by(observer.A)
-        self._calibration.shift(end.calibration - self._calibration.values)
+        observer.set_reference(start.points)
+        P = _with_pose_error_by(observer.A, covariance, self._axes)
+        self._joint.set_of_positions(P, start.points)
+        self._filter.calibration.shift(end.calibration - self._filter.calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
-        observer.correct(Correction(D, slice(None), end.points - start.points))
-        self._joint.settle(observer)
+        observer.correct(D, slice(None), end.points - start.points)
 
-    def _solution_from(self, first: int, observer: Observer) -> Solution:
-        """Return the present estimates, of poses those from before frame ``first`` on."""
+    def _solution_from(self, first: int) -> Solution:
+        """Return the present estimates, of poses those from before keyframe ``first`` on."""
         poses = np.array(self.history.poses[first:])
-        return Solution(poses, self._calibration.values, observer.points)
+        return Solution(poses, self._filter.calibration.values, self._filter.observer.points)
 
-    def _known(self, observer: Observer) -> Prior:
+    def _known(self) -> Prior:
         """Return what is known now."""
-        covariance = self._joint.with_pose_error_by(se3.inverse(observer.A))
-        points = observer.points
-        return Prior(observer.A, self._calibration.values, points, covariance)
+        observer, points = self._filter.observer, self._filter.observer.points
+        P = self._joint.of_positions(points)
+        P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)
+        return Prior(observer.A, self._filter.calibration.values, points, P)
 
 
-class _Warning:
-    """Says once what may be amiss, for all copies of its owner: hypotheses are copies."""
+def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: Axes) -> FloatArray:
+    """Return the covariance of Ad_A ε and all else, given that of ε and all else."""
+    p = axes.p
+    Ad = se3.adjoint(A)[axes.pose, axes.pose]
+    changed: FloatArray = P.copy()
+    changed[:p] = Ad @ changed[:p]
+    changed[:, :p] = changed[:, :p] @ Ad.T
+    return changed
+
+
+class _Warning(Immutable):
+    """Says once what may be wrong, for all copies of its owner: hypotheses are copies."""
 
     def __init__(self) -> None:
         self._is_given = False
-
-    def __deepcopy__(self, _memo: object) -> _Warning:
-        return self
 
     def give(self) -> None:
         if self._is_given:
             return
         self._is_given = True
         logger.warning(
-            'Could not look back (told only once): the observations so far leave something open, '
-            'as where covariances are so large that they say nothing. Odometry often has such for '
-            'z, roll and pitch: set two_d_mode: true for a robot on a floor.'
+            'Could not relinearise (said only once): the observations so far leave something '
+            'open, as where covariances are so large that they say nothing. Odometry often has '
+            'such for z, roll and pitch: set two_d_mode: true for a robot on a floor.'
         )

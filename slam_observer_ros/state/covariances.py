@@ -1,6 +1,6 @@
-"""Covariances as users know them, in the world or as seen from the robot, from those of the gains.
+"""Covariances as users know them, in the world or as seen from the robot, from the filter's.
 
-The gains know the error ε of Â = exp(ε) A and the errors ã_i of the landmarks, in the reference
+The filter knows the error ε of Â = exp(ε) A and the errors ã_i of the landmarks, in the reference
 frame. Functions return None where they know none.
 """
 
@@ -10,13 +10,12 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.geometry.matrices import limited
-from slam_observer_ros.observer.filter import GainDesign
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.observer import Observer
 
 MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
-"""Standard deviations of a pose that is told, rad and m, beyond which it is only 'unknown'."""
+"""Standard deviations of a given pose, rad and m, beyond which it is only 'unknown'."""
 
 
 def of_landmarks(observer: Observer, covariances: FloatArray | None) -> FloatArray | None:
@@ -28,23 +27,20 @@ def of_landmarks(observer: Observer, covariances: FloatArray | None) -> FloatArr
     return world
 
 
-def of_configuration(
-    observer: Observer, gains: GainDesign, axes: Axes, rows: IntArray
-) -> FloatArray | None:
+def of_configuration(filter_: Filter, rows: IntArray) -> FloatArray | None:
     """Return the covariance (m k, m k) of where landmarks are seen from the robot, m².
 
     Joint, along the axes of the body that are estimated. The choice of the world's frame has no
     part in it.
     """
-    P = gains.joint_covariance(rows)
+    P, axes = filter_.joint_covariance(rows), filter_.axes
     if P is None:
         return None
     m, k, p = len(rows), axes.point, axes.p
-    points = observer.points + gains.postponed_shifts()
-    C = axes.output_matrix(points[rows]).reshape(-1, p)
+    C = axes.output_matrix(filter_.points[rows]).reshape(-1, p)
     CP = C @ P[:p] - P[p:]
     blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
-    R = observer.A[:k, :k]
+    R = filter_.observer.A[:k, :k]
     seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
     return seen
 

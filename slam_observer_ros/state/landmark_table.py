@@ -91,7 +91,7 @@ class LandmarkTable:
             room = np.zeros((m, *column.shape[1:]), dtype=column.dtype)
             setattr(self, name, np.concatenate([column, room]))
         self.ids[first:] = ids
-        self.restart(np.arange(first, first + m), stamp_ns)
+        self.take_for_new(np.arange(first, first + m), stamp_ns)
         self._order = np.argsort(self.ids)
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
@@ -101,7 +101,7 @@ class LandmarkTable:
         self.counts[n:] = counts
         self.tentative[n:] = False
 
-    def restart_time(self) -> None:
+    def clear_time(self) -> None:
         """Take all landmarks as last seen before any stamp to come."""
         self.last_seen_ns = np.full(len(self), -1)
         self.seen_before_ns = np.full(len(self), -1)
@@ -193,7 +193,7 @@ class LandmarkTable:
         unseen = np.flatnonzero(self.last_seen_ns < stamp_ns)
         return unseen[np.lexsort((self.last_seen_ns[unseen], self.counts[unseen]))]
 
-    def restart(self, rows: IntArray, stamp_ns: int) -> None:
+    def take_for_new(self, rows: IntArray, stamp_ns: int) -> None:
         """Take ``rows`` as seen for the first time, at a stamp."""
         self.last_seen_ns[rows] = stamp_ns
         self.seen_before_ns[rows] = -1

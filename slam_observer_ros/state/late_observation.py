@@ -15,11 +15,12 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.sensor_models.extrinsics import move_observation
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.matching import point_covariances
+from slam_observer_ros.state.state import State
 
 
 def carried_forward(
-    slam: Slam, event: ObservationEvent, velocities: VelocityHistory, state_ns: int
+    state: State, event: ObservationEvent, velocities: VelocityHistory, state_ns: int
 ) -> ObservationEvent:
     """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
 
@@ -29,7 +30,7 @@ def carried_forward(
 
     Parameters
     ----------
-    slam : Slam
+    state : State
         The state at ``state_ns``.
     event : ObservationEvent
         The observation, of m points, made before.
@@ -39,41 +40,35 @@ def carried_forward(
         Stamp of the state, nanoseconds.
 
     """
-    lag_s, calibration = to_s(state_ns - event.stamp_ns), slam.gains.calibration
-    back = se3.inverse(transition(velocities, calibration, event.stamp_ns, state_ns))
-    shifts = _landmark_velocities(slam, event, slam.observer.A @ back) * lag_s
+    interval = (event.stamp_ns, state_ns)
+    lag_s, calibration = to_s(state_ns - event.stamp_ns), state.filter.calibration
+    back = se3.inverse(transition(velocities, calibration, *interval))
+    shifts = _landmark_velocities(state, event, state.observer.A @ back) * lag_s
     points = event.points + shifts
     # The sensor with it, so that it was measured from as far.
     sensor = shifts if event.sensor is None else event.sensor + shifts
     shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
     moved = move_observation(shifted, back)
-    Q = transition_covariance(velocities, calibration, slam.motion_noise, event.stamp_ns, state_ns)
+    Q = transition_covariance(
+        velocities, calibration, state.motion_noise, event.stamp_ns, state_ns
+    )
     C = back[:3, :3] @ SPATIAL.output_matrix(points)
     shared = len(points) * C @ Q @ transpose(C)
-    own = (lag_s * slam.landmark_velocity_error) ** 2 * np.eye(3)
-    return replace(moved, covariances=_covariances(slam, moved) + shared + own)
+    rows = state.landmarks.rows_of(event.ids)
+    own = (lag_s * state.landmark_velocity_error) ** 2 * np.eye(3)
+    return replace(moved, covariances=point_covariances(state, moved, rows) + shared + own)
 
 
-def _landmark_velocities(slam: Slam, event: ObservationEvent, A: FloatArray) -> FloatArray:
+def _landmark_velocities(state: State, event: ObservationEvent, A: FloatArray) -> FloatArray:
     """Return how the landmarks (m, 3) seen move, m/s, along the axes of the body at Â = ``A``.
 
     As estimated, or else as the observation says, which is made there; zero if neither is.
     """
     velocities = np.zeros_like(event.points)
-    if slam.is_fixed:
+    if state.is_fixed:
         return velocities
-    if not slam.landmark_velocity_error:
+    if not state.landmark_velocity_error:
         return velocities if event.velocities is None else event.velocities
-    rows = slam.landmarks.rows_of(event.ids)
-    velocities[rows >= 0] = slam.observer.u[rows[rows >= 0]]
+    rows = state.landmarks.rows_of(event.ids)
+    velocities[rows >= 0] = state.observer.u[rows[rows >= 0]]
     return se3.rotate(se3.inverse(A), velocities)
-
-
-def _covariances(slam: Slam, event: ObservationEvent) -> FloatArray:
-    """Return what points that are in time are taken to be off by: (m, 3, 3), body frame, m².
-
-    It moves landmarks whose gains had put that off.
-    """
-    rows = slam.landmarks.rows_of(event.ids)
-    slam.gains.recall(slam.observer, rows)
-    return slam.measurement_model.covariances(event, rows)

@@ -1,4 +1,4 @@
-"""Life cycle of landmarks: which are added, placed anew, disbelieved and forgotten."""
+"""Life cycle of landmarks: which are added, placed again, disbelieved and forgotten."""
 
 from __future__ import annotations
 
@@ -6,96 +6,115 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.state.matching import MatchedObservation
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.matching import (
+    mapped,
+    MatchedObservation,
+    positions,
+    residuals_of,
+)
+from slam_observer_ros.state.state import State
 
 
-def initialise(slam: Slam, event: ObservationEvent, noise: FloatArray) -> None:
+def make_room(state: State, matched: MatchedObservation) -> None:
+    """Choose landmarks out of view to be forgotten for new ones, and stop relying on their past.
+
+    A history without them would lose what they have said of the pose.
+    """
+    if len(_rows_to_forget(state, matched)):
+        state.forget_past('landmarks had to make room (max_landmarks)')
+
+
+def add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEvent, IntArray]:
+    """Add the landmarks of an observation that are new, in the place of others if need be.
+
+    Return the part of it that is of landmarks which are known now, and their rows.
+    """
+    event, rows = matched.event, matched.rows
+    if len(matched.known.ids) == len(rows):
+        return event, rows
+    is_new = rows < 0
+    forget(state, _rows_to_forget(state, matched), 'forgotten_landmark')
+    _initialise(state, event.select(is_new), matched.covariances[is_new])
+    return mapped(state, event)
+
+
+def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> None:
     """Add landmarks where they were seen, as many as ``max_landmarks`` allows."""
-    limit, new = slam.settings.max_landmarks, len(event.ids)
-    m = min(new, max(limit - len(slam.landmarks), 0)) if limit else new
-    slam.counts['unmapped_landmark'] += new - m
-    if not m:
-        return
-    event = event.select(np.arange(new) < m)
-    slam.observer.add_landmarks(event.points)
-    slam.gains.add_landmarks(slam.observer.y_ref[-m:], slam.observer.turned(noise[:m]))
-    slam.landmarks.add(event.ids, event.stamp_ns)
+    limit, new = state.settings.max_landmarks, len(event.ids)
+    m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
+    state.counts['unmapped_landmark'] += new - m
+    if m:
+        event = event.select(np.arange(new) < m)
+        state.filter.add(event.points, noise[:m])
+        state.landmarks.add(event.ids, event.stamp_ns)
 
 
-def relocate(slam: Slam, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Start landmarks in doubt anew that are still far from where they were expected.
+def relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
+    """Take landmarks in doubt for new ones if they are still far from where they were expected.
 
     Return the ids of those that were seen often enough to say that they have moved.
     """
-    noise = slam.observation_noise.covariances(event)
-    residuals = slam.measurement_model.residuals(event, rows, noise)
-    far = slam.gains.distances(residuals) > slam.settings.rejection_distance
-    moved = far & (slam.landmarks.counts[rows] >= slam.settings.confirmations)
-    slam.counts['moved_landmark'] += int(np.sum(moved))
+    noise = state.observation_noise.covariances(event)
+    residuals = residuals_of(state, event, rows, noise)
+    far = state.filter.distances(residuals) > state.settings.rejection_distance
+    moved = far & (state.landmarks.counts[rows] >= state.settings.confirmations)
+    state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
-        slam.observer.relocate_landmarks(rows[far], event.points[far])
-        y_ref = slam.observer.y_ref[rows[far]]
-        slam.gains.relocate_landmarks(rows[far], y_ref, residuals.covariances[far])
-        slam.landmarks.restart(rows[far], event.stamp_ns)
+        state.relocate(rows[far], event.points[far], noise[far])
+        state.landmarks.take_for_new(rows[far], event.stamp_ns)
     return event.ids[moved]
 
 
-def rejected_before(slam: Slam, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
+def note_velocities(state: State, event: ObservationEvent, rows: IntArray) -> None:
+    """Let landmarks move as the sensor says; by one that says nothing they are static."""
+    velocities = event.velocities
+    if velocities is None and state.observer.have_moved:
+        velocities = np.zeros((len(rows), 3))
+    if velocities is None or state.landmark_velocity_error or state.is_fixed:
+        return
+    used = state.landmarks.rejections[rows] == 0
+    state.observer.set_landmark_velocities(rows[used], velocities[used])
+
+
+def rejected_before(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
     """Return which known landmarks (m,) in it were rejected before where they are seen now.
 
     And how far all of them (m, 3) are from where they were rejected last, metres, reference
     frame.
     """
     rows = matched.residuals.rows
-    points, tolerances_m = slam.measurement_model.places(matched.known)
-    again = slam.landmarks.are_rejected_again(rows, points, tolerances_m)
-    return again, points - slam.landmarks.rejected_last[rows]
+    points, tolerances_m = positions(state, matched.known)
+    again = state.landmarks.are_rejected_again(rows, points, tolerances_m)
+    return again, points - state.landmarks.rejected_last[rows]
 
 
-def disbelieve(slam: Slam, event: ObservationEvent) -> None:
+def disbelieve(state: State, event: ObservationEvent) -> None:
     """Count points as rejected although the gate lets them pass.
 
     Landmarks that are in doubt by then are forgotten, and are new when they are seen next.
     """
-    event, rows = slam.mapped(event)  # one may have made room
-    slam.landmarks.reject(rows, *slam.measurement_model.places(event))
-    in_doubt = slam.landmarks.in_doubt(rows, slam.settings.max_rejections) & slam.is_mapping
+    event, rows = mapped(state, event)  # one may have made room
+    state.landmarks.reject(rows, *positions(state, event))
+    in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     if in_doubt.any():
-        slam.remove(rows[in_doubt])
+        state.remove(rows[in_doubt])
 
 
-def note_surroundings(slam: Slam, event: ObservationEvent, some_have_ids: bool) -> float:
-    """Count what was in view of an observation of landmarks without an id.
-
-    Return −2 ln of the probability that what was not seen of it was not.
-
-    Those that were seen too seldom while they were in view are forgotten; out of view none
-    is: it may be the only tie to what was mapped before. Parameters are those of
-    :meth:`.Surroundings.note`.
-    """
-    cost, is_strange = slam.surroundings.note(event, some_have_ids)
-    slam.counts['strange_place'] += is_strange
-    unsupported = slam.landmarks.unsupported(slam.settings.min_support)
-    forget(slam, unsupported, 'unsupported_landmark')
-    return cost
+def forget(state: State, rows: IntArray, why: str) -> None:
+    """Forget the landmarks at ``rows``; ``why`` is the name of the count that they go to."""
+    if len(rows):
+        state.remove(rows)
+        state.counts[why] += len(rows)
 
 
-def rows_to_forget(slam: Slam, matched: MatchedObservation) -> IntArray:
+def _rows_to_forget(state: State, matched: MatchedObservation) -> IntArray:
     """Return which landmarks out of view are to make room for the new ones of ``matched``.
 
     The least often seen go first.
     """
-    limit, new = slam.settings.max_landmarks, len(matched.rows) - len(matched.residuals.rows)
-    excess = len(slam.landmarks) + new - limit
+    limit, new = state.settings.max_landmarks, len(matched.rows) - len(matched.residuals.rows)
+    excess = len(state.landmarks) + new - limit
     if limit == 0 or new == 0 or excess <= 0:
         return np.empty(0, dtype=np.int64)
-    unseen = slam.landmarks.unseen_since(matched.event.stamp_ns)
+    unseen = state.landmarks.unseen_since(matched.event.stamp_ns)
     return np.sort(unseen[~np.isin(unseen, matched.rows)][:excess])
-
-
-def forget(slam: Slam, rows: IntArray, why: str) -> None:
-    """Forget the landmarks at ``rows``; ``why`` is the count that tells of it."""
-    if len(rows):
-        slam.remove(rows)
-        slam.counts[why] += len(rows)

@@ -1,4 +1,4 @@
-"""Matching of an observation with a state: residuals of known landmarks, and their noise."""
+"""Matching an observation with a state: which landmarks it is of, residuals, their noise."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.filter import FrameObservation, Residuals
-from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, RESOLUTION_M
-from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state.landmark_table import LandmarkTable
+from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
+from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.state.state import State
 
-SAME_PLACE = 4.0
-"""Rejections within this many standard deviations of each other are at one place."""
+SAME_POSITION = 4.0
+"""Rejections within this many standard deviations of each other are at one position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,95 +47,75 @@ class MatchedObservation:
     left_out: int
 
 
-class MeasurementModel:
-    """Predicts where landmarks should be seen, and forms the residuals.
+def match(state: State, event: ObservationEvent) -> MatchedObservation:
+    """Match an observation made at the state's instant with landmarks by their ids."""
+    m, rows = len(event.ids), state.landmarks.rows_of(event.ids)
+    if not state.is_mapping:
+        event, rows = mapped(state, event)
+    is_known, covariances = rows >= 0, point_covariances(state, event, rows)
+    known = event.select(is_known)
+    residuals = residuals_of(state, known, rows[is_known], covariances[is_known])
+    return MatchedObservation(event, rows, covariances, known, residuals, m - len(event.ids))
 
-    Rows are those of the landmarks, −1 where one is new.
 
-    Parameters
-    ----------
-    observer, landmarks : Observer, LandmarkTable
-        The state.
-    noise : ObservationNoise
-        Noise of observations.
-    settings : Settings
-        ``confirmations`` and ``max_rejections``.
+def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
+    """Return the part of an observation that is of known landmarks, and their rows."""
+    rows = state.landmarks.rows_of(event.ids)
+    return event.select(rows >= 0), rows[rows >= 0]
 
+
+def residuals_of(
+    state: State, event: ObservationEvent, rows: IntArray, covariances: FloatArray
+) -> Residuals:
+    """Return the residuals (29) of landmarks ``rows`` (m,) seen with ``covariances``, m²."""
+    dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    return state.filter.residuals(rows, event.points, covariances, dt_s)
+
+
+def keyframe_of(state: State, event: ObservationEvent, rows: IntArray) -> Keyframe:
+    """Return what is needed to linearise an observation again, after its correction."""
+    lines_of_sight, noise = _lines_of_sight(state, event, rows), state.observation_noise
+    is_stated = event.covariances is not None
+    stated = noise.covariances(event, lines_of_sight) if is_stated else None
+    dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    return Keyframe(event.stamp_ns, rows, event.points, lines_of_sight, stated, dt_s)
+
+
+def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
+    """Return where points seem to be (m, 3), and within what they are at one position, metres.
+
+    In the reference frame, by their noise there: that of where a landmark should be may be much
+    less.
     """
+    spread_m = np.sqrt(np.trace(state.observation_noise.covariances(event), axis1=1, axis2=2))
+    return se3.transform(state.observer.A, event.points), SAME_POSITION * spread_m
 
-    def __init__(
-        self,
-        observer: Observer,
-        landmarks: LandmarkTable,
-        noise: ObservationNoise,
-        settings: Settings,
-    ) -> None:
-        self._observer, self._landmarks, self._noise = observer, landmarks, noise
-        self._settings = settings
 
-    def match(self, event: ObservationEvent, rows: IntArray, left_out: int) -> MatchedObservation:
-        """Compare the points of ``event`` with where landmarks ``rows`` (m,) should be seen."""
-        is_known, covariances = rows >= 0, self.covariances(event, rows)
-        known = event.select(is_known)
-        residuals = self.residuals(known, rows[is_known], covariances[is_known])
-        return MatchedObservation(event, rows, covariances, known, residuals, left_out)
+def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    """Return the covariances (m, 3, 3) of points of landmarks ``rows``, −1 if new, body frame, m².
 
-    def residuals(
-        self, event: ObservationEvent, rows: IntArray, covariances: FloatArray
-    ) -> Residuals:
-        """Return what landmarks ``rows`` (m,) tell that were seen with ``covariances``, m²."""
-        observer = self._observer
-        e, r = observer.errors(rows, event.points)
-        return Residuals(
-            rows=rows,
-            e=e,
-            r=r,
-            a=observer.a[rows],
-            covariances=observer.turned(covariances),
-            dt_s=self._landmarks.unseen_s(rows, event.stamp_ns),
-        )
+    The noise model is given how far off a landmark should be, not how far it was measured: one
+    measured too near would be believed more than one measured too far, and all would be drawn
+    towards the robot. In which direction, the sensor knows better than a state does whose heading
+    is yet to be corrected.
+    """
+    measured, expected = event.lines_of_sight, _lines_of_sight(state, event, rows)
+    measured_m = np.maximum(np.linalg.norm(measured, axis=1), RESOLUTION_M)
+    shares = np.linalg.norm(expected, axis=1) / measured_m
+    return state.observation_noise.covariances(event, shares[:, None] * measured)
 
-    def frame_observation(self, event: ObservationEvent, rows: IntArray) -> FrameObservation:
-        """Return what there is to look back at later, after the correction."""
-        lines_of_sight = self._lines_of_sight(event, rows)
-        is_stated = event.covariances is not None
-        stated = self._noise.covariances(event, lines_of_sight) if is_stated else None
-        dt_s = self._landmarks.unseen_s(rows, event.stamp_ns)
-        return FrameObservation(event.stamp_ns, rows, event.points, lines_of_sight, stated, dt_s)
 
-    def places(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
-        """Return where points seem to be (m, 3), and within what they are at one place, metres.
+def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
+    """Return where points should be (m, 3), from the sensor, metres, body frame.
 
-        In the reference frame, by their noise there: that of where a landmark should be may be
-        much less.
-        """
-        spread_m = np.sqrt(np.trace(self._noise.covariances(event), axis1=1, axis2=2))
-        return se3.transform(self._observer.A, event.points), SAME_PLACE * spread_m
-
-    def covariances(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
-        """Return what observed points may be off by: (m, 3, 3), body frame, m².
-
-        The noise model is told how far off a landmark should be, not how far it was measured:
-        one measured too near would be believed more than one measured too far, and all would be
-        drawn towards the robot. In which direction, the sensor knows better than a state does
-        whose heading is yet to be corrected.
-        """
-        measured, expected = event.lines_of_sight, self._lines_of_sight(event, rows)
-        measured_m = np.maximum(np.linalg.norm(measured, axis=1), RESOLUTION_M)
-        shares = np.linalg.norm(expected, axis=1) / measured_m
-        return self._noise.covariances(event, shares[:, None] * measured)
-
-    def _lines_of_sight(self, event: ObservationEvent, rows: IntArray) -> FloatArray:
-        """Return where points should be (m, 3), from the sensor, metres, body frame.
-
-        Of a landmark that is new, that is in doubt, or that was seen so seldom that it may itself
-        be an outlier, this is where it was measured.
-        """
-        landmarks = self._landmarks
-        if not len(landmarks):
-            return event.lines_of_sight
-        is_confirmed = landmarks.counts[rows] >= self._settings.confirmations
-        in_doubt = landmarks.in_doubt(rows, self._settings.max_rejections)
-        is_sure = (rows >= 0) & is_confirmed & ~in_doubt
-        points = np.where(is_sure[:, None], self._observer.body_points(rows), event.points)
-        return points if event.sensor is None else points - event.sensor
+    Of a landmark that is new, that is in doubt, or that was seen so seldom that it may itself be
+    an outlier, this is where it was measured.
+    """
+    landmarks, settings = state.landmarks, state.settings
+    if not len(landmarks):
+        return event.lines_of_sight
+    is_confirmed = landmarks.counts[rows] >= settings.confirmations
+    in_doubt = landmarks.in_doubt(rows, settings.max_rejections)
+    is_sure = (rows >= 0) & is_confirmed & ~in_doubt
+    points = np.where(is_sure[:, None], state.filter.expected_points(rows), event.points)
+    return points if event.sensor is None else points - event.sensor

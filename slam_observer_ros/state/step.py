@@ -1,4 +1,4 @@
-"""What an observation changes in a state: pose and landmarks are corrected, the map managed."""
+"""One step of the observer: what an observation changes in a state."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.filter import Residuals
-from slam_observer_ros.state.map_management import forget, initialise, relocate, rows_to_forget
-from slam_observer_ros.state.matching import MatchedObservation
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.map_management import (
+    add_new,
+    make_room,
+    note_velocities,
+    relocate_moved,
+)
+from slam_observer_ros.state.matching import keyframe_of, MatchedObservation, positions
+from slam_observer_ros.state.state import State
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,67 +47,55 @@ def is_contradiction(rejected: BoolArray) -> bool:
     return bool(2 * np.count_nonzero(rejected) > len(rejected))
 
 
-def update(slam: Slam, matched: MatchedObservation) -> Outcome:
-    """Use what :meth:`.Slam.match` has returned for an observation; return what came of it."""
-    slam.counts['unmapped_landmark'] += matched.left_out
-    event, rows, known = matched.event, matched.rows, matched.known
-    forgotten = rows_to_forget(slam, matched)
-    if len(forgotten):
-        # A history without them would lose what they have told of the pose.
-        slam.gains.restart(slam.observer, 'landmarks had to make room (max_landmarks)')
-    rejected = _correct(slam, known, matched.residuals)
-    if len(known.ids) < len(rows):
-        is_new = rows < 0
-        forget(slam, forgotten, 'forgotten_landmark')
-        initialise(slam, event.select(is_new), matched.covariances[is_new])
-        event, rows = slam.mapped(event)
-    moved_ids = _look_back(slam, event, rows)
-    _note_velocities(slam, event, rows)
-    return Outcome(known.ids, matched.residuals.r, rejected, moved_ids)
+def step(state: State, matched: MatchedObservation) -> Outcome:
+    """One step of the observer (28), from where the velocity has led it (27): the innovation."""
+    residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
+    make_room(state, matched)
+    weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
+    rejected = weights == 0.0
+    _count(state, matched, rejected)
+    event, rows = add_new(state, matched)
+    moved_ids = _relinearise(state, event, rows)
+    note_velocities(state, event, rows)
+    return Outcome(matched.known.ids, residuals.r, rejected, moved_ids)
 
 
-def _correct(slam: Slam, event: ObservationEvent, residuals: Residuals) -> BoolArray:
-    """Correct the state by the landmarks of ``event``; return which (m,) were rejected."""
-    rows = residuals.rows
+def _correct(state: State, residuals: Residuals) -> FloatArray:
+    """Correct the state; return the weights (m,), 0 for a rejected landmark."""
+    if not len(residuals.rows):
+        return np.empty(0)
+    before = state.observer.A
+    weights = state.filter.correct(residuals)
+    if state.relinearisation is not None:
+        state.relinearisation.note_correction(before, state.observer.A)
+    return weights
+
+
+def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> None:
+    """Count which known landmarks (m,) were accepted, and which rejected."""
+    event, rows, count = matched.known, matched.residuals.rows, int(np.count_nonzero(rejected))
+    state.counts['unmapped_landmark'] += matched.left_out
     if not len(rows):
-        return np.empty(0, dtype=np.bool_)
-    correction, weights = slam.gains.correct(residuals)
-    slam.observer.correct(correction)
-    slam.gains.settle(slam.observer)
-    rejected: BoolArray = weights == 0.0
-    count = int(np.count_nonzero(rejected))
-    slam.rejected_in_a_row = slam.rejected_in_a_row + 1 if count == len(rows) else 0
-    slam.was_contradicted = is_contradiction(rejected)
-    slam.landmarks.accept(rows[~rejected], event.stamp_ns)
+        return
+    state.rejected_in_a_row = state.rejected_in_a_row + 1 if count == len(rows) else 0
+    state.was_contradicted = is_contradiction(rejected)
+    state.landmarks.accept(rows[~rejected], event.stamp_ns)
     if count:
-        places = slam.measurement_model.places(event.select(rejected))
-        slam.landmarks.reject(rows[rejected], *places)
-        slam.counts['rejected_landmark'] += count
-    return rejected
+        state.landmarks.reject(rows[rejected], *positions(state, event.select(rejected)))
+        state.counts['rejected_landmark'] += count
 
 
-def _look_back(slam: Slam, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Let the gains look back; start landmarks in doubt anew if that doesn't explain them.
+def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
+    """Linearise the past again, if it is time; take landmarks for moved if that explains nothing.
 
     Now that the state is corrected, it is known better than before from where they were seen.
     Return the ids of those that have moved.
     """
-    in_doubt = slam.landmarks.in_doubt(rows, slam.settings.max_rejections) & slam.is_mapping
+    in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     some_are = bool(in_doubt.any())
-    if slam.gains.looks_back:
-        seen = slam.measurement_model.frame_observation(event, rows)
-        slam.gains.look_back(slam.observer, seen, some_are)
+    past = state.relinearisation
+    if past is not None and past.is_active:
+        past.add(keyframe_of(state, event, rows), some_are)
     if some_are:
-        return relocate(slam, event.select(in_doubt), rows[in_doubt])
+        return relocate_moved(state, event.select(in_doubt), rows[in_doubt])
     return np.empty(0, dtype=np.int64)
-
-
-def _note_velocities(slam: Slam, event: ObservationEvent, rows: IntArray) -> None:
-    """Let landmarks move as the sensor says; by one that says nothing they are static."""
-    velocities = event.velocities
-    if velocities is None and slam.observer.have_moved:
-        velocities = np.zeros((len(rows), 3))
-    if velocities is None or slam.landmark_velocity_error or slam.is_fixed:
-        return
-    used = slam.landmarks.rejections[rows] == 0
-    slam.observer.set_landmark_velocities(rows[used], velocities[used])

@@ -306,7 +306,7 @@ def test_points_that_gains_leave_out_tell_nothing_of_the_place(gains):
         stand(estimator, float(second))
         observe(estimator, float(second), known, np.full(12, UNKNOWN_ID))
     assert estimator.counts['unknown_id'] == 12 * 40
-    assert estimator.counts['strange_place'] == 0
+    assert estimator.counts['unexpected_place'] == 0
 
 
 @pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])

@@ -153,7 +153,7 @@ def without_ids(_, event):
 def test_without_ids_there_is_one_warning_where_landmarks_are_far_apart(seed, caplog):
     world, _ = carried(PLANAR, seed, landmarks=6)
     estimator, _ = run(world.with_observations(without_ids), PLANAR)
-    assert estimator.counts['strange_place'] == 1
+    assert estimator.counts['unexpected_place'] == 1
     assert 'Nothing that is seen is where the map has it' in caplog.text
 
 
@@ -170,7 +170,7 @@ def test_landmarks_with_ids_are_another_sensors_to_see(seed):
         passer_by = np.array([[0.1 * step - 4.0, 2.0, 0.0]])
         nobody = np.array([UNKNOWN_ID])
         assert estimator.add(ObservationEvent(stamp_ns + 50_000_000, nobody, passer_by))
-    assert estimator.counts['strange_place'] == 0
+    assert estimator.counts['unexpected_place'] == 0
 
 
 @modes
@@ -178,7 +178,7 @@ def test_landmarks_with_ids_are_another_sensors_to_see(seed):
 def test_a_robot_that_is_where_it_should_be_is_not_warned_of(settings, seed):
     world = gain_worlds.drive(settings, 60.0, seed, noise=0.5, landmarks=30)
     estimator, _ = run(world.with_observations(without_ids), settings)
-    assert estimator.counts['strange_place'] == 0
+    assert estimator.counts['unexpected_place'] == 0
 
 
 @modes

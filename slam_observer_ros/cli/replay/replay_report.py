@@ -90,8 +90,8 @@ def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str,
     }
     if slips := estimator.counts['slip']:
         rows['slips'] = f'{slips} × the robot was not where odometry had it'
-    if strange := estimator.counts['strange_place']:
-        rows['strange places'] = f'{strange} × nothing seen was where the map has it'
+    if unexpected := estimator.counts['unexpected_place']:
+        rows['unexpected places'] = f'{unexpected} × nothing seen was where the map has it'
     if outcome.localised_after_s is not None:
         rows['place in the map'] = _told_place(outcome.result, outcome.localised_after_s)
     rows |= {part.name: str(part) for part in estimator.calibration}

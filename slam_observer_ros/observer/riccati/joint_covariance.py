@@ -1,52 +1,43 @@
-"""The covariance of all errors that the Riccati gains know of, and which columns are whose."""
+"""The covariance of all errors that the Riccati filter knows of, in right-invariant coordinates.
+
+The errors are x = (ε, c̃, ξ_1 … ξ_n): of the pose, Â = exp(ε) A, of the calibration, and of the
+landmarks, ξ_i = ã_i + [ŷ_i]× ε_Ω with ã_i that of the estimate ŷ_i in the reference frame. The
+p axes of ε and k of a point are those that are estimated. A point that moves with the pose has
+ξ_i = ε_v, so residuals are r_i = ε_v − ξ_i whatever the map is (A. Barrau and
+S. Bonnabel, *The invariant extended Kalman filter as a stable observer*, 2017).
+"""
 
 from __future__ import annotations
-
-from copy import copy
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import Axes
-from slam_observer_ros.geometry.matrices import block_diagonal, transpose
-from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.prediction import initial_covariance
+from slam_observer_ros.geometry.matrices import block_diagonal, kalman_update, transpose
+from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.prediction import initial_covariance, predict
 from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.motion import Motion
 
 
 class JointCovariance:
-    """P, the covariance of x = (ε, c, ã_1 … ã_n); with landmarks that move, (ã_i, ũ_i) for ã_i.
-
-    Parameters
-    ----------
-    axes, calibration : Axes, Calibration
-        Which p axes of the pose and k of a point, and which c of the calibration are estimated.
-    velocity_error : float
-        Standard deviation of a new landmark's velocity, m/s; 0 where landmarks stand still.
+    """P, and which of its columns are whose.
 
     Attributes
     ----------
     P : FloatArray
-        (p + c + …, p + c + …) the covariance.
+        (p + c + k n, p + c + k n) covariance of x.
     first : int
         p + c, the first column of the landmarks.
 
     """
 
-    def __init__(self, axes: Axes, calibration: Calibration, velocity_error: float) -> None:
-        self._axes = axes
-        self._p = axes.p
-        self._velocity_error = velocity_error
-        self._stride = axes.point * (2 if velocity_error > 0.0 else 1)
+    def __init__(self, axes: Axes, calibration: Calibration) -> None:
+        self._axes, self._p = axes, axes.p
         self.P = initial_covariance(axes, calibration)
         self.first = len(self.P)
+        self._stride = axes.point  # columns of each landmark
         self._first_columns = self.first + np.arange(axes.point)
-
-    @property
-    def count(self) -> int:
-        """How many landmarks there are."""
-        return (len(self.P) - self.first) // self._stride
 
     @property
     def pose(self) -> FloatArray:
@@ -54,122 +45,218 @@ class JointCovariance:
         return self.P[: self._p, : self._p]
 
     @property
-    def landmarks(self) -> FloatArray:
-        """(n, 3, 3) covariances of the landmark errors ã_i."""
-        k = self._axes.point
-        columns = self.columns(np.arange(self.count)).reshape(-1, k)
-        covariances = np.zeros((self.count, 3, 3))
-        covariances[:, :k, :k] = self.P[columns[:, :, None], columns[:, None, :]]
-        return covariances
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of the calibration."""
+        variances: FloatArray = np.diagonal(self.P)[self._p : self.first]
+        return variances
 
-    def landmarks_after(self, duration_s: float, velocities: FloatArray) -> FloatArray:
-        """Return the same after t seconds at û_i (n, 3), once they are settled there.
-
-        The error is ã_i + t (û_i − u_i) then, where û_i − u_i = ũ_i − [û_i]× ω.
-        """
-        n, k, p, everything = self.count, self._axes.point, self._p, np.arange(self.count)
-        eye = np.tile(np.eye(k), (n, 1, 1))
-        parts = [duration_s * self._axes.turn_matrix(velocities), eye]
-        at = [np.tile(np.arange(p), (n, 1)), self.columns(everything).reshape(n, k)]
-        if self._velocity_error > 0.0:
-            parts.append(duration_s * eye)
-            at.append(self.velocity_columns(everything).reshape(n, k))
-        D, columns = np.concatenate(parts, axis=2), np.concatenate(at, axis=1)
+    def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
+        """Return the covariances (n, 3, 3) of ã_i for ``points`` (n, 3), ``ahead_s`` from now."""
+        n, k = len(points), self._axes.point
+        _, own = self.output(self._turning(points), np.arange(n))
         covariances = np.zeros((n, 3, 3))
-        own = self.P[columns[:, :, None], columns[:, None, :]]
-        covariances[:, :k, :k] = D @ own @ transpose(D)
+        covariances[:, :k, :k] = own
         return covariances
 
-    @property
-    def map_columns(self) -> IntArray | slice:
-        """Columns that belong to all landmarks; a slice, which is cheap, if it can be."""
-        if self._velocity_error > 0.0:
-            return self.columns(np.arange(self.count))
-        return slice(self.first, None)
+    def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i, for estimates (m, 3)."""
+        columns = np.append(np.arange(self._p), self._columns(rows))
+        P: FloatArray = self.P[np.ix_(columns, columns)]
+        return sheared(P, self._p, -self._turning(points).reshape(-1, self._p))
 
-    def columns(self, rows: IntArray) -> IntArray:
-        """Return the columns that belong to landmarks (m,), as (m k,)."""
-        return (self._first_columns + self._stride * rows[:, None]).ravel()
+    def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """Return ξ_i (n, 3) of x, and the changes of velocities, None where there are none."""
+        return self._axes.full_points(x[self.first :]), None
 
-    def velocity_columns(self, rows: IntArray) -> IntArray:
-        """Return those of the landmarks' velocities, none where these are not estimated."""
-        if self._velocity_error == 0.0:
-            return np.empty(0, dtype=np.int64)
-        return self.columns(rows) + self._axes.point
+    # The step
 
-    def with_pose(self, rows: IntArray) -> FloatArray:
-        """Return the covariance (p + m k, p + m k) of ε and m landmarks together."""
-        columns = np.append(np.arange(self._p), self.columns(rows))
-        return self.P[np.ix_(columns, columns)]
+    def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
+        """Let x become x + J (F c̃ + w), w the noise of a motion that has led to ``points``.
 
-    def without_landmarks(self) -> JointCovariance:
-        """Return the covariance of ε and c alone."""
-        alone = copy(self)
-        alone.P = self.P[: self.first, : self.first].copy()
-        return alone
+        Landmarks with velocities ``u`` (n, 3) have moved there; known ones change no ξ_i.
+        """
+        self._propagate(motion, self._turning(points).reshape(-1, self._p))
 
-    def set_pose(self, covariance: FloatArray) -> None:
-        """Take over the covariance (p, p) of ε, independent of all else."""
-        self.P[: self._p] = self.P[:, : self._p] = 0.0
-        self.P[: self._p, : self._p] = covariance
+    def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
+        """Let x become x + J (F c̃ + w), given the rows of J that belong to landmarks."""
+        P, c = self.P, slice(self._p, self.first)
+        J = np.zeros((len(P), self._p))  # how a motion of the robot alone changes x
+        J[: self._p] = np.eye(self._p)
+        J[self.first :] = J_landmarks
+        growth = 0.5 * motion.noise @ J.T
+        if self._p < self.first:
+            F = motion.sensitivity
+            growth += F @ (P[c] + 0.5 * P[c, c] @ (J @ F).T)
+        half = J @ growth
+        P += half + half.T
+        P[c, c] += motion.drift
 
-    def make_room(self, m: int) -> IntArray:
-        """Append m landmarks, filled with zeros; return their rows."""
-        count, old = self.count, self.P
-        self.P = np.zeros((len(old) + self._stride * m,) * 2)
-        self.P[: len(old), : len(old)] = old
-        return np.arange(count, count + m)
+    def lever_arms(self, residuals: Residuals) -> FloatArray:
+        """Return y_i (m, 3) of r_i = [−[y_i]×, I] ε − ξ_i: zero, in these coordinates."""
+        return np.zeros_like(residuals.r)
 
-    def place_seen(self, rows: IntArray, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Fill in landmarks seen now: ã_i = J ε + noise, with J = [−[y_i°]×, I]."""
-        P, p, k = self.P, self._p, self._axes.point
-        columns = self.columns(rows)
-        J = self._axes.output_matrix(y_ref).reshape(-1, p)
-        P[columns] = J @ P[:p]
-        P[:, columns] = P[columns].T
-        own = J @ P[:p, :p] @ J.T + block_diagonal(covariances[:, :k, :k])
-        P[np.ix_(columns, columns)] = own
-        self._place_velocities(rows)
+    def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m k, …) and H P Hᵀ (m k, m k) of H x = C_i ε − ξ_i, C_i (m, k, p)."""
+        C, columns = C.reshape(-1, self._p), self._columns(rows)
+        HP = C @ self.P[: self._p] - self.P[columns]  # rows of P cost less to pick than columns
+        return HP, HP[:, : self._p] @ C.T - HP[:, columns]
 
-    def place_known(self, rows: IntArray, covariances: FloatArray) -> None:
-        """Fill in landmarks whose errors are independent of all else."""
-        k, columns = self._axes.point, self.columns(rows)
-        self.P[np.ix_(columns, columns)] = block_diagonal(covariances[:, :k, :k])
-        self._place_velocities(rows)
+    def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
+        columns = self._columns(rows).reshape(len(rows), self._axes.point)
+        return self._output(C, columns)
+
+    def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same of all together, (p, m k) and (m k, m k)."""
+        return self._output(C.reshape(-1, self._p), self._columns(rows))
+
+    def update(self, HP: FloatArray, S: FloatArray) -> FloatArray:
+        """Update P by what :meth:`project` projected; return the gain K = P Hᵀ S⁻¹."""
+        return kalman_update(self.P, HP, S)
+
+    # Landmarks
+
+    def add_seen(self, covariances: FloatArray) -> None:
+        """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3)."""
+        self._place(self._make_room(len(covariances)), self._moving(covariances), covariances)
+
+    def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
+        self._place(self._make_room(len(points)), self._turning(points), covariances)
+
+    def relocate(self, rows: IntArray, covariances: FloatArray) -> None:
+        """Take landmarks (m,) for newly seen ones, with covariances (m, 3, 3)."""
+        self._place(rows, self._moving(covariances), covariances)
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
-        columns = np.append(self.columns(rows), self.velocity_columns(rows))
+        columns = (self.first + self._stride * rows[:, None] + np.arange(self._stride)).ravel()
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
 
-    def turn(self, columns: IntArray | slice, vectors: FloatArray) -> None:
-        """Make errors x_i at ``columns`` x_i − [y_i]× ω, for ``vectors`` y (m, 3)."""
-        L = self._axes.turn_matrix(vectors).reshape(-1, self._p)
-        half = L @ self.P[: self._p]
-        half[:, columns] += 0.5 * half[:, : self._p] @ L.T
-        self.P[columns] += half
-        self.P[:, columns] += half.T  # its mirror image, so that P stays symmetric
+    def gauge(self, n: int) -> FloatArray:
+        """Return G (…, p): how x changes when all, with n landmarks, is moved by exp(γ)."""
+        rows = np.arange(n)
+        G = np.zeros((len(self.P), self._p))
+        G[: self._p] = np.eye(self._p)
+        G[self._columns(rows)] = self._moving(rows).reshape(-1, self._p)
+        return G
 
-    def settle(self, observer: Observer) -> None:
-        """Take the landmarks' estimates for their reference, so that â_i = 0.
+    # Other coordinates
 
-        ã_i = â_i − R_Ã a_i turns with the noise of the pose unless a_i is small, which prediction
-        in the pose block alone leaves out. With y_i° + â_i for y_i°, ã_i becomes ã_i − [â_i]× ω.
-        """
-        self.turn(self.map_columns, observer.a)
-        observer.rebase(observer.points)
+    def of_positions(self, points: FloatArray) -> FloatArray:
+        """Return the covariance of (ε, c̃, ã_1 … ã_n) for estimates ``points`` (n, 3)."""
+        return sheared(self.P, self.first, -self._all_turning(points))
 
-    def with_pose_error_by(self, A: FloatArray) -> FloatArray:
-        """Return the covariance of Ad_A ε and all else."""
-        p, pose = self._p, self._axes.pose
-        Ad = se3.adjoint(A)[pose, pose]
-        changed: FloatArray = self.P.copy()
-        changed[:p] = Ad @ changed[:p]
-        changed[:, :p] = changed[:, :p] @ Ad.T
-        return changed
+    def set_of_positions(self, covariance: FloatArray, points: FloatArray) -> None:
+        """Take over what :meth:`of_positions` returns."""
+        self.P = sheared(covariance, self.first, self._all_turning(points))
 
-    def _place_velocities(self, rows: IntArray) -> None:
-        """Fill in landmarks whose velocity is not known at all yet."""
-        columns = self.velocity_columns(rows)
-        self.P[columns] = self.P[:, columns] = 0.0
-        self.P[columns, columns] = self._velocity_error**2
+    def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
+        """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
+        P = self.of_positions(points)
+        P[: self._p] = P[:, : self._p] = 0.0
+        P[: self._p, : self._p] = covariance
+        self.set_of_positions(P, points)
+
+    def _output(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+        P = self.P
+        to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
+        PC = self.pose @ transpose(C) - transpose(to_pose)
+        return PC, C @ PC - to_pose @ transpose(C) + own
+
+    def _place(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
+        """Fill in landmarks with ξ_i = C_i ε + noise of ``covariances``."""
+        k, columns, C = self._axes.point, self._columns(rows), C.reshape(-1, self._p)
+        CP = C @ self.P[: self._p]
+        self.P[columns], self.P[:, columns] = CP, CP.T
+        own = CP[:, : self._p] @ C.T + block_diagonal(covariances[:, :k, :k])
+        self.P[np.ix_(columns, columns)] = 0.5 * (own + own.T)
+
+    def _make_room(self, m: int) -> IntArray:
+        """Append rows and columns for m landmarks; return which landmarks they are."""
+        before, stride = len(self.P), self._stride
+        P = np.zeros((before + m * stride,) * 2)
+        P[:before, :before] = self.P
+        self.P = P
+        first_row = (before - self.first) // stride
+        return np.arange(first_row, first_row + m)
+
+    def _columns(self, rows: IntArray) -> IntArray:
+        """Return the columns (m k,) that belong to landmarks (m,)."""
+        return (self._first_columns + self._stride * rows[:, None]).ravel()
+
+    def _all_turning(self, points: FloatArray) -> FloatArray:
+        """Return the rows [ŷ_i]× ε_Ω of all landmarks' columns, for ``points`` (n, 3)."""
+        return self._turning(points).reshape(-1, self._p)
+
+    def _turning(self, points: FloatArray) -> FloatArray:
+        """Return the blocks [[y_i]×, 0] (m, k, p): ξ_i of landmarks without an error ã_i."""
+        return -self._axes.turn_matrix(points)
+
+    def _moving(self, landmarks: FloatArray | IntArray) -> FloatArray:
+        """Return the blocks [0, I] (m, k, p): ξ_i of m landmarks that move with the pose."""
+        return self._axes.output_matrix(np.zeros((len(landmarks), 3)))
+
+
+class ExactMapCovariance(JointCovariance):
+    """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω.
+
+    Parameters
+    ----------
+    joint : JointCovariance
+        What was known so far.
+    covariances : FloatArray
+        (n, 3, 3) what the map says of its landmarks, which is only passed on.
+
+    """
+
+    def __init__(self, axes: Axes, joint: JointCovariance, covariances: FloatArray) -> None:
+        self._axes, self._p, self.first = axes, axes.p, joint.first
+        self.P = joint.P[: self.first, : self.first].copy()
+        self._covariances = covariances
+
+    def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
+        """Return the covariances (n, 3, 3) of the landmarks, as the map has them."""
+        return self._covariances
+
+    def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
+        """Add a motion's noise to that of the pose."""
+        predict(self.P, motion)
+
+    def lever_arms(self, residuals: Residuals) -> FloatArray:
+        """Return ŷ_i (m, 3) of r_i = [−[ŷ_i]×, I] ε."""
+        return residuals.landmarks
+
+    def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P and H P Hᵀ of H x = C_i ε."""
+        C = C.reshape(-1, self._p)
+        HP = C @ self.P[: self._p]
+        return HP, HP[:, : self._p] @ C.T
+
+    def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε alone."""
+        PC = self.pose @ transpose(C)
+        return PC, C @ PC
+
+    def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same of all together, (p, m k) and (m k, m k)."""
+        return self.output(C.reshape(-1, self._p), rows)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget landmarks."""
+        self._covariances = np.delete(self._covariances, rows, axis=0)
+
+    def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
+        """Take ``covariance`` (p, p) for that of ε, independent of c̃."""
+        super().set_pose(covariance, np.empty((0, 3)))
+
+
+def sheared(P: FloatArray, first: int, L: FloatArray) -> FloatArray:
+    """Return the covariance of x whose entries from ``first`` on have grown by L ε, L (…, p)."""
+    p = L.shape[1]
+    result: FloatArray = P.copy()
+    half = L @ P[:p]
+    half[:, first:] += 0.5 * half[:, :p] @ L.T
+    result[first:] += half
+    result[:, first:] += half.T  # its mirror image, so that P stays symmetric
+    return result

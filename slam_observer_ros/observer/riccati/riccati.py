@@ -1,168 +1,165 @@
-"""Riccati gains: the equivariant filter on SLAM_n(3), from a covariance P.
+"""The Riccati filter: gains K = P Hᵀ (H P Hᵀ + R)⁻¹ from the covariance P of all errors.
 
-The error E = X̂ X⁻¹ = (Ã, ã_i) (proof of Theorem 5.1) does not move while the robot does, so with
-Ã = exp(ε) the state of the filter is x = (ε, c, ã_1 … ã_n), c being the errors of the velocity's
-calibration. The residual is, by (33), r_i = Ã y_i° − ã_i − y_i° ≈ C_i x with
+The error E = X̂ X⁻¹ (proof of Theorem 5.1) does not move while the robot does. In the coordinates
+of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i for any map,
 
-    C_i = [ −[y_i°]×  I  0 … −I … 0 ].
+    H_i = [ 0  I  0 … −I … 0 ],
 
-What no observation can tell, the choice of the world's frame, is exactly in its null space, so
-the covariance stays honest. While â_i = 0, which :meth:`.FullMapGains.settle` sees to after each
-correction and each motion (the reference ξ° is arbitrary), noise of the motion touches Ã alone:
-
-    prediction   P ← P + Ad_Â Q Ad_Âᵀ in the pose block alone: O(1), however large the map;
-                 with a calibration O(n), as what is known of it goes on into the pose
-    update       K = P Cᵀ (C P Cᵀ + R)⁻¹,   X̂ ← exp(−K r) · X̂
-
-at O(m n) for m landmarks seen plus O(m n²) to update the covariance of n known ones.
-
-:mod:`slam_observer_ros.observer.riccati.full_map` has the landmarks in P,
-:mod:`slam_observer_ros.observer.riccati.fixed_map` takes them for exact.
+and what no observation can determine, the choice of the world's frame, is exactly in its null
+space: the covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
+X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²).
 """
 
 from __future__ import annotations
 
-import numpy as np
-
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.geometry.matrices import kalman_update, mahalanobis, with_blocks
-from slam_observer_ros.observer.filter import GainDesign, OF_CONSTANT_GAINS, Residuals
-from slam_observer_ros.observer.observer import Correction, Observer
+from slam_observer_ros.geometry import se3, slam_group
+from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
+from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, Residuals
+from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.prediction import predict
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
+from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
 from slam_observer_ros.observer.robust import observation_weights
-from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
-from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
 
 
-class RiccatiGains(GainDesign):
-    """Gains K = P Cᵀ (C P Cᵀ + R)⁻¹, with a gate and robust weights before.
+class RiccatiFilter(Filter):
+    """Gains from the full covariance of pose, velocity calibration and landmarks.
 
-    Parameters
+    Attributes
     ----------
-    settings : Settings
-        Robustness and ``two_d_mode``.
-    calibration, joint : Calibration, JointCovariance
-        What is known of the velocity's calibration, and the covariance P of everything.
+    joint : JointCovariance
+        The covariance P.
 
     """
 
+    joint: JointCovariance
     ignores = OF_CONSTANT_GAINS
 
-    def __init__(
-        self, settings: Settings, calibration: Calibration, joint: JointCovariance
-    ) -> None:
-        self._settings = settings
-        self._axes = axes_of(settings.two_d_mode)
-        self._p = self._axes.p
-        self.calibration = calibration
-        self._joint = joint
+    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
+        super().__init__(live, reference_pose)
+        error = live.now.landmark_velocity_error
+        self.joint = (
+            MovingLandmarksCovariance(self.axes, self.calibration, error)
+            if error > 0.0
+            else JointCovariance(self.axes, self.calibration)
+        )
 
-    def change_settings(self, settings: Settings) -> None:
-        """Take over the robustness."""
-        self._settings = settings
+    def propagate(self, motion: Motion) -> None:
+        """Move pose and landmarks along a motion (27), and add its noise to P."""
+        super().propagate(motion)
+        self.joint.propagate(motion, self.observer.points, self.observer.u)
+
+    def correct(self, residuals: Residuals) -> FloatArray:
+        """Move the state by exp(−K r); return the weight that each point was given."""
+        r, R = residuals.on(self.axes)
+        weights = observation_weights(r, self.predicted(residuals)[1], R, self._settings)
+        passed = weights > 0.0
+        used = residuals.select(passed)
+        r, R = used.on(self.axes)
+        repeated = repetition_factors(used.dt_s, self._settings.observation_error_time)
+        C = self.axes.output_matrix(self.joint.lever_arms(used))
+        HP, HPH = self.joint.project(C, used.rows)
+        S = with_blocks(HPH, R / (weights[passed] / repeated)[:, None, None])
+        K = self.joint.update(HP, S)
+        self._move(-K @ r.ravel())  # for (30) and (31)
+        return weights
+
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        r, R = residuals.on(self.axes)
+        _, predicted = self.joint.output(self._chord_output(residuals), residuals.rows)
+        return mahalanobis(r, predicted + R)
+
+    def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+        """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
+        return self.joint.outputs(self._chord_output(residuals), residuals.rows)
+
+    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
+        super().add(points, covariances)
+        self.joint.add_seen(self.observer.turned(covariances))
+
+    def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks whose errors are independent of all else."""
+        super().add_known(y_ref, covariances)
+        self.joint.add_known(y_ref, covariances)
+
+    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+        """Take landmarks for new ones; what was known of them is forgotten."""
+        super().relocate(rows, points, covariances)
+        self.joint.relocate(rows, self.observer.turned(covariances))
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        super().remove(rows)
+        self.joint.remove(rows)
+
+    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Take all landmarks for exact; P is that of pose and calibration from now on."""
+        super().fix_landmarks(y_ref, covariances)
+        self.joint = ExactMapCovariance(self.axes, self.joint, covariances)
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
+        """Put the robot at Â = ``pose``; what it has to do with the map is forgotten."""
+        super().set_pose(pose, covariance)
+        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.observer.points)
+
+    def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
+        """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be.
+
+        A rigid motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v.
+        """
+        k, joint = self.axes.point, self.joint
+        G = joint.gauge(len(self.observer.y_ref))
+        to_position = -self.axes.turn_matrix(self.observer.points[rows])
+        HP, HPH = joint.project(to_position, rows)  # of −ã_i
+        J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
+        R = block_diagonal(covariances[:, :k, :k])
+        x, joint.P = anchor(joint.P, G, -HP.T, HPH + R, J, r[:, :k].ravel())
+        self._move(-x)
 
     @property
     def calibration_variances(self) -> FloatArray:
         """(c,) variances of what is estimated of the calibration."""
-        variances: FloatArray = np.diagonal(self._joint.P)[self._p : self._joint.first]
-        return variances
+        return self.joint.calibration_variances
 
-    @property
-    def pose_error_covariance(self) -> FloatArray:
-        """(6, 6) covariance of the pose error ε; zero on axes that are not estimated."""
-        return self._axes.full_pose_covariance(self._joint.pose)
+    def pose_covariance(self, motion: Motion | None = None) -> FloatArray:
+        """Return the covariance (6, 6) of ε, zero on axes that are not estimated."""
+        if motion is None:
+            return self.axes.full_pose_covariance(self.joint.pose)
+        P = self.joint.P[: self.joint.first, : self.joint.first].copy()
+        predict(P, motion)
+        return self.axes.full_pose_covariance(P[: self.axes.p, : self.axes.p])
 
-    @property
-    def landmark_error_covariances(self) -> FloatArray:
-        """(n, 3, 3) covariances of the landmark errors ã_i, reference frame, m²."""
-        raise NotImplementedError
+    def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
+        """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
+        points = self.observer.points + duration_s * self.observer.u
+        return self.joint.landmarks(points, duration_s)
 
-    def predict(self, observer: Observer, motion: Motion) -> None:
-        """Add the motion's noise to the pose block, and what the calibration's error adds."""
-        predict(self._joint.P, self._axes, self.calibration, motion)
-
-    def pose_error_covariance_after(self, motion: Motion) -> FloatArray:
-        """Return what the same (6, 6) will be after a motion that is yet to be predicted."""
-        first = self._joint.first
-        P = self._joint.P[:first, :first].copy()
-        predict(P, self._axes, self.calibration, motion)
-        return self._axes.full_pose_covariance(P[: self._p, : self._p])
-
-    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
-        """Take over the covariance (6, 6) of ε, independent of all else."""
-        pose = self._axes.pose
-        self._joint.set_pose(covariance[pose, pose])
-
-    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
-        """Return exp(−K r) and the weight that each point was given."""
-        r, noise = residuals.on(self._axes)
-        weights = observation_weights(r, self.predicted(residuals), noise, self._settings)
-        passed = weights > 0.0
-        used = residuals.select(passed)
-        r, noise = used.on(self._axes)
-        CP, CPC = self._project(used)
-        share = weights[passed] / repetition_factors(
-            used.dt_s, self._settings.observation_error_time
-        )
-        S = with_blocks(CPC, noise / share[:, None, None])
-        K = kalman_update(self._joint.P, CP, S)
-        return self._as_correction(K @ -r.ravel()), weights  # for (30) and (31)
-
-    def distances(self, residuals: Residuals) -> FloatArray:
-        """Return the Mahalanobis distance (m,) of each residual."""
-        r, noise = residuals.on(self._axes)
-        columns = self._joint.columns(residuals.rows).reshape(r.shape)
-        _, CPC = self._output_covariances(self._chord_output(residuals), columns)
-        return mahalanobis(r, CPC + noise)
-
-    def predicted(self, residuals: Residuals) -> FloatArray:
-        """Return the covariance (m k, m k) of m residuals but for the noise of the points, m²."""
-        return self.predicted_with_pose(residuals)[1]
-
-    def predicted_with_pose(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-        """Return what the state predicts of m residuals, as it is to judge them by.
-
-        Returns
-        -------
-        PC : FloatArray
-            (p, m k) their covariances with ε.
-        CPC : FloatArray
-            (m k, m k) their covariance, without the noise of the points, m².
-
-        """
-        C = self._chord_output(residuals).reshape(-1, self._p)
-        return self._output_covariances(C, self._joint.columns(residuals.rows))
-
-    def _project(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-        """Return C P and C P Cᵀ."""
-        raise NotImplementedError
-
-    def _output_covariances(
-        self, C: FloatArray, columns: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances of C ε − ã with ε (…, p, j), and of its own (…, j, j).
-
-        C is (…, j, p), and ``columns`` (…, j) are those of ã in P.
-        """
-        raise NotImplementedError
-
-    def _as_correction(self, x: FloatArray) -> Correction:
-        """Return the group element exp(x); the calibration moves by its own part of x."""
-        raise NotImplementedError
-
-    def _pose_output(self, residuals: Residuals) -> FloatArray:
-        """Return the columns (m k, p) of C that belong to ε."""
-        y_ref = residuals.e - residuals.r
-        return self._axes.output_matrix(y_ref).reshape(-1, self._p)
+    def joint_covariance(self, rows: IntArray) -> FloatArray:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks."""
+        return self.joint.with_pose(rows, self.observer.points[rows])
 
     def _chord_output(self, residuals: Residuals) -> FloatArray:
-        """Return C_i (m, k, p) at the middle of the chord from y_i° to e_i.
+        """Return C_i (m, k, p) at the middle of the chord from ŷ_i to R_Â y_i + x_Â.
 
-        Turning y_i° to e_i, by however much, moves it at right angles to (e_i + y_i°)/2; with C
-        at y_i° a robot that has turned further than it knows would reject what it sees.
+        Turning one to the other, by however much, moves it at right angles to the middle; with C
+        at ŷ_i a robot that has turned further than it knows would reject what it sees.
         """
-        return self._axes.output_matrix(residuals.e - 0.5 * residuals.r)
+        return self.axes.output_matrix(self.joint.lever_arms(residuals) + 0.5 * residuals.r)
+
+    def _move(self, x: FloatArray) -> None:
+        """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
+        p, first, observer = self.axes.p, self.joint.first, self.observer
+        self.calibration.shift(x[p:first])
+        xi, u = self.joint.split(x)
+        X = slam_group.exp(self.axes.full_pose(x[:p]), xi)
+        moved = slice(len(xi))  # none in an exact map
+        turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
+        observer.correct(X.A, moved, X.a + turned)
+        if u is not None:
+            observer.correct_velocities(X.A, u)

@@ -17,7 +17,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.geometry.matrices import kalman_update, symmetric, transpose
 from slam_observer_ros.observer.prediction import initial_covariance, predict
-from slam_observer_ros.observer.scheduled.postponed_landmarks import Leaves
+from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
@@ -48,8 +48,8 @@ class Core:
     ----------
     P : FloatArray
         (q, q) covariance of z. The entries of a place where no landmark is are zero.
-    leaves : Leaves
-        How all landmarks hang on z.
+    postponed : PostponedLandmarks
+        How all landmarks depend on z.
     rows : IntArray
         (K,) the landmarks in the core, or ``NOBODY``.
 
@@ -64,21 +64,21 @@ class Core:
         self.rows: IntArray = np.full(CAPACITY, NOBODY)
         self.P: FloatArray = np.zeros((len(start) + self._places.size,) * 2)
         self.P[: len(start), : len(start)] = start
-        self.leaves = Leaves(axes, len(self.P))
+        self.postponed = PostponedLandmarks(axes, len(self.P))
 
     def predict(self, motion: Motion) -> None:
         """Add a motion's noise to the pose, and what the calibration's error adds."""
         before, Phi = self.P.copy(), np.eye(len(self.P))
-        _, F = predict(self.P, self._axes, self._calibration, motion)
-        Phi[: self._p, self._p : self._p + self._calibration.count] = F
-        self._tell_leaves(before, Phi)
+        predict(self.P, motion)
+        Phi[: self._p, self._p : self._p + self._calibration.count] = motion.sensitivity
+        self._change_core(before, Phi)
 
     def set_pose_error_covariance(self, covariance: FloatArray) -> None:
         """Take over the covariance (p, p) of ε, independent of all else."""
         before, Phi = self.P.copy(), np.eye(len(self.P))
         Phi[: self._p] = self.P[: self._p] = self.P[:, : self._p] = 0.0
         self.P[: self._p, : self._p] = covariance
-        self._tell_leaves(before, Phi)
+        self._change_core(before, Phi)
 
     def step(self, H: FloatArray, gain_k: FloatArray, r: FloatArray) -> FloatArray:
         """Return −P⁺ Σ H_iᵀ k_i r_i (q, 1), for H (m, k, q), k_i (m, k, k) and r (m, k, 1)."""
@@ -103,7 +103,7 @@ class Core:
         eye = np.eye(len(T))
         self.P = _transformed(self.P, eye + T)
         # (I + T)⁻¹ = I − T: T turns landmarks by the pose, and leaves the pose alone.
-        self.leaves.change_core(eye - T, np.zeros_like(T))
+        self.postponed.change_core(eye - T, np.zeros_like(T))
 
     def admit(self, rows: IntArray) -> None:
         """Take in landmarks (m,) just seen, for those that have not been seen for longest."""
@@ -114,40 +114,40 @@ class Core:
             return
         places = np.argsort(-self._unseen, kind='stable')[: len(new)]
         leaving, columns = self.rows[places], self._places[places]
-        self.leaves.release(leaving[leaving != NOBODY])
-        F, N, _ = self.leaves.now(new)
+        self.postponed.release(leaving[leaving != NOBODY])
+        F, N, _ = self.postponed.now(new)
         before, Phi = self.P, np.eye(len(self.P))
         Phi[columns] = F
         self.P = _transformed(before, Phi)
         self.P[columns[:, :, None], columns[:, None, :]] += N
-        self._tell_leaves(before, Phi)
+        self._change_core(before, Phi)
         self.rows[places], self._unseen[places] = new, 0
-        self.leaves.hold(new, np.eye(len(Phi))[columns])
+        self.postponed.hold(new, np.eye(len(Phi))[columns])
 
     def dismiss(self, rows: IntArray) -> None:
         """Let those of the landmarks (m,) that are in the core leave it."""
         places = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != NOBODY))
         if not len(places):
             return
-        self.leaves.release(self.rows[places])
+        self.postponed.release(self.rows[places])
         self.rows[places], self._unseen[places] = NOBODY, NEVER
         before, Phi = self.P, np.eye(len(self.P))
         Phi[self._places[places].ravel()] = 0.0
         self.P = _transformed(before, Phi)
-        self._tell_leaves(before, Phi)
+        self._change_core(before, Phi)
 
     def remove(self, rows: IntArray) -> None:
         """Forget landmarks (m,); those behind move up."""
         self.dismiss(rows)
-        self.leaves.remove(rows)
+        self.postponed.remove(rows)
         self.rows -= np.searchsorted(np.sort(rows), self.rows)  # by 0 for NOBODY
 
-    def _tell_leaves(self, before: FloatArray, Phi: FloatArray) -> None:
+    def _change_core(self, before: FloatArray, Phi: FloatArray) -> None:
         """Let landmarks hang on z', whose covariance P is already; ``before`` is that of z."""
         after = Phi @ before
         G = _times_inverse(after.T, self.P)
         shared = G @ after
-        self.leaves.change_core(G, before - shared - shared.T + G @ self.P @ G.T)
+        self.postponed.change_core(G, before - shared - shared.T + G @ self.P @ G.T)
 
 
 def regression(P: FloatArray, of: IntArray, on: IntArray) -> tuple[FloatArray, FloatArray]:

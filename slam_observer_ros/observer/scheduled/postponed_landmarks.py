@@ -32,7 +32,7 @@ zero: these never change. Only moves are put off, until the landmark is seen or 
 """
 
 
-class Leaves:
+class PostponedLandmarks:
     """F_i and N_i of all landmarks, and what each group has yet to follow.
 
     Parameters

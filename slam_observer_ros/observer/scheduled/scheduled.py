@@ -43,7 +43,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     diagonal_blocks,
@@ -51,15 +50,13 @@ from slam_observer_ros.geometry.matrices import (
     symmetric,
     transpose,
 )
-from slam_observer_ros.observer.filter import GainDesign, OF_CONSTANT_GAINS, Residuals
+from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, Residuals
 from slam_observer_ros.observer.gauge import anchor
-from slam_observer_ros.observer.observer import Correction, Observer
 from slam_observer_ros.observer.robust import huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled.core import Core, regression
-from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
-from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,151 +85,155 @@ class _Step:
     weights: FloatArray
 
 
-class ScheduledGains(GainDesign):
-    """Gains from the covariance of a small core and how each landmark hangs on it.
-
-    Parameters
-    ----------
-    settings : Settings
-        Noise, calibration, robustness and ``two_d_mode``.
-
-    """
+class ScheduledFilter(Filter):
+    """Gains from the covariance of a small core and how each landmark depends on it."""
 
     ignores = (*OF_CONSTANT_GAINS, 'landmark_velocity_error')
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._axes = axes_of(settings.two_d_mode)
-        self.calibration = Calibration(settings, self._axes)
-        self._core = Core(self._axes, self.calibration)
-        self._leaves = self._core.leaves
+    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
+        super().__init__(live, reference_pose)
+        self._core = Core(self.axes, self.calibration)
+        self._postponed = self._core.postponed
 
-    def change_settings(self, settings: Settings) -> None:
-        """Take over the robustness."""
-        self._settings = settings
-
-    @property
-    def calibration_variances(self) -> FloatArray:
-        """(c,) variances of what is estimated of the calibration."""
-        p = self._axes.p
-        variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
-        return variances
-
-    def predict(self, observer: Observer, motion: Motion) -> None:
-        """Add the motion's noise to the core's covariance."""
+    def propagate(self, motion: Motion) -> None:
+        """Move pose and landmarks along a motion (27), and add its noise to the core's."""
+        super().propagate(motion)
         self._core.predict(motion)
 
-    def add_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Append landmarks (m, 3): their error is that of the pose and of the observation."""
-        self._leaves.add(self._output_matrix(y_ref), self._noise(covariances))
+    def correct(self, residuals: Residuals) -> FloatArray:
+        """Move the state by the step of all points; return the weight that each was given."""
+        rows = residuals.rows
+        F, N, _ = self._postponed.now(rows)
+        H = self._output_matrix(residuals.landmarks) - F
+        passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
+        step = self._reweighted_step(residuals, H, N, passed)
+        Delta, gain_k = step.Delta, step.gain_k
+        delta = self.axes.full_points((F @ Delta + N @ step.k_left).ravel())
+        F = F + N @ gain_k @ H
+        F[:, :, : self.axes.p] += self.axes.turn_matrix(delta)
+        N[passed] = symmetric(N[passed] @ gain_k[passed] @ step.noise)  # N − N k N, but positive
+        self._core.measurement_update(H[passed], gain_k[passed])
+        self._postponed.shift(Delta[:, 0])
+        self._postponed.update(rows, F, N)
+        self._core.turn(Delta[:, 0])
+        self._core.admit(rows[passed])
+        self._move(rows, Delta[:, 0], delta)
+        return step.weights
 
-    def relocate_landmarks(
-        self, rows: IntArray, y_ref: FloatArray, covariances: FloatArray
-    ) -> None:
-        """Take landmarks for new ones."""
-        self._core.dismiss(rows)
-        self._leaves.update(rows, self._output_matrix(y_ref), self._noise(covariances))
+    def distances(self, residuals: Residuals) -> FloatArray:
+        """Return the Mahalanobis distance (m,) of each residual."""
+        F, N, _ = self._postponed.now(residuals.rows)
+        return self._distances(residuals, F, N)
 
-    def add_known_landmarks(self, covariances: FloatArray) -> None:
+    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks (m,): their error is that of the pose and of the observation."""
+        super().add(points, covariances)
+        y_ref, noise = self.observer.y_ref[-len(points) :], self.observer.turned(covariances)
+        self._postponed.add(self._output_matrix(y_ref), self._noise(noise))
+
+    def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks (m,) as certain as the map has them."""
+        super().add_known(y_ref, covariances)
         N = self._noise(covariances)
-        self._leaves.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
+        self._postponed.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
 
-    def set_pose_error_covariance(self, covariance: FloatArray) -> None:
-        """Take over the covariance (6, 6) of ε, independent of all else."""
-        self._core.set_pose_error_covariance(covariance[self._axes.pose, self._axes.pose])
+    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+        """Take landmarks for new ones."""
+        super().relocate(rows, points, covariances)
+        y_ref, noise = self.observer.y_ref[rows], self.observer.turned(covariances)
+        self._core.dismiss(rows)
+        self._postponed.update(rows, self._output_matrix(y_ref), self._noise(noise))
 
-    def joint_covariance(self, rows: IntArray) -> FloatArray:
-        """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
-        F, N, _ = self._leaves.now(rows)
-        p, q = self._axes.p, len(self._core.P)
-        joint = self._with_landmarks(F, N)
-        columns = np.append(np.arange(p), np.arange(q, len(joint)))
-        return joint[np.ix_(columns, columns)]
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        super().remove(rows)
+        self._core.remove(rows)
 
-    def anchor(
-        self, observer: Observer, rows: IntArray, r: FloatArray, covariances: FloatArray
-    ) -> Correction:
-        """Return the correction that puts pose and known landmarks where these are known to be.
+    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Take all landmarks for exact."""
+        super().fix_landmarks(y_ref, covariances)
+        count, k = len(y_ref), self.axes.point
+        self._core.remove(np.arange(len(self._postponed)))
+        self._postponed.add(np.zeros((count, k, len(self._core.P))), np.zeros((count, k, k)))
 
-        The motion γ of everything, see :mod:`slam_observer_ros.observer.gauge`, is estimated, too.
-        Other landmarks' errors are ã_i = F_i (z − γ) + J_i γ + η_i, the core being the pose alone.
+    def expected_points(self, rows: IntArray) -> FloatArray:
+        """Return where landmarks, brought up to date, should be seen (m, 3), body frame."""
+        self._bring_up_to_date(rows[rows >= 0])
+        return super().expected_points(rows)
+
+    def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
+        """Put the robot at Â = ``pose``; what it has to do with the map is forgotten."""
+        super().set_pose(pose, covariance)
+        self._core.set_pose_error_covariance(covariance[self.axes.pose, self.axes.pose])
+
+    def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
+        """Move pose and known landmarks to where these are known to be.
+
+        The motion γ of everything, see :mod:`.gauge`, is estimated, too. Other landmarks' errors
+        are ã_i = F_i (z − γ) + J_i γ + η_i, the core being the pose alone.
         """
         self._core.dismiss(self._core.rows)
-        everything, p = np.arange(len(self._leaves)), self._axes.p
-        m, k, q = len(r), self._axes.point, len(self._core.P)
-        F, N, _ = self._leaves.now(everything)
-        J = self._axes.output_matrix(observer.points)
+        everything, p = np.arange(len(self._postponed)), self.axes.p
+        self._bring_up_to_date(everything)
+        m, k, q = len(r), self.axes.point, len(self._core.P)
+        F, N, _ = self._postponed.now(everything)
+        J = self.axes.output_matrix(self.observer.points)
         z, known, gamma = np.split(np.arange(q + m * k + p), [q, q + m * k])
         P, G = np.zeros((gamma[-1] + 1,) * 2), np.zeros((gamma[-1] + 1, p))
         P[: gamma[0], : gamma[0]] = self._with_landmarks(F[rows], N[rows])
         G[:p] = G[gamma] = np.eye(p)
         G[known] = J[rows].reshape(-1, p)
-        R = block_diagonal(self._noise(covariances))
-        x, P = anchor(P, G, known, R, r[:, :k].ravel())
+        S = P[np.ix_(known, known)] + block_diagonal(self._noise(covariances))
+        x, P = anchor(P, G, P[:, known], S, G[known], r[:, :k].ravel())
 
         self._core.P = P[:q, :q]
-        # γ = B z + ζ, so ã_i = F_i z + (J_i − F_i) γ + η_i hangs on z by F_i + (J_i − F_i) B.
+        # γ = B z + ζ, so ã_i = F_i z + (J_i − F_i) γ + η_i depends on z by F_i + (J_i − F_i) B.
         J_gamma = J - F[:, :, :p]
         errors = F @ x[z] + J_gamma @ x[gamma]
         B, left = regression(P, gamma, z)
         F, N = F + J_gamma @ B, N + J_gamma @ left @ transpose(J_gamma)
-        # Known landmarks were estimated themselves: they hang on z as P has it.
+        # Known landmarks were estimated themselves: they depend on z as P has it.
         errors[rows] = x[known].reshape(m, k)
         B, left = regression(P, known, z)
         F[rows] = B.reshape(m, k, q)
         N[rows] = symmetric(diagonal_blocks(left, k))
-        shifts = -self._axes.full_points(errors.ravel())
-        F[:, :, :p] += self._axes.turn_matrix(shifts)
-        self._leaves.update(everything, F, N)
-        return self._as_correction(everything, -x[z], shifts, observer.a)
+        shifts = -self.axes.full_points(errors.ravel())
+        F[:, :, :p] += self.axes.turn_matrix(shifts)
+        self._postponed.update(everything, F, N)
+        self._move(everything, -x[z], shifts)
 
-    def with_fixed_landmarks(self, covariances: FloatArray) -> ScheduledGains:
-        """Return these gains with all landmarks taken for exact."""
-        count, k = len(covariances), self._axes.point
-        self._core.remove(np.arange(len(self._leaves)))
-        self._leaves.add(np.zeros((count, k, len(self._core.P))), np.zeros((count, k, k)))
-        return self
+    @property
+    def points(self) -> FloatArray:
+        """(n, 3) estimated landmarks, reference frame, metres: where they are yet to be moved."""
+        return self.observer.points + self._postponed.postponed_shifts()
 
-    def recall(self, observer: Observer, rows: IntArray) -> None:
-        """Move landmarks that are about to be used to where they should have been moved by now."""
-        rows = np.union1d(rows[rows >= 0], self._leaves.due())
-        F, N, shifts = self._leaves.now(rows)
-        self._leaves.update(rows, F, N)
-        observer.a[rows] += shifts
+    @property
+    def calibration_variances(self) -> FloatArray:
+        """(c,) variances of what is estimated of the calibration."""
+        p = self.axes.p
+        variances: FloatArray = np.diagonal(self._core.P)[p : p + self.calibration.count]
+        return variances
 
-    def postponed_shifts(self) -> FloatArray:
-        """Return how far each landmark (n, 3) has yet to be moved, metres, reference frame."""
-        return self._leaves.postponed_shifts()
+    def joint_covariance(self, rows: IntArray) -> FloatArray:
+        """Return the covariance (p + m k, p + m k) of ε and m landmarks."""
+        F, N, _ = self._postponed.now(rows)
+        p, q = self.axes.p, len(self._core.P)
+        joint = self._with_landmarks(F, N)
+        columns = np.append(np.arange(p), np.arange(q, len(joint)))
+        return joint[np.ix_(columns, columns)]
 
-    def remove_landmarks(self, rows: IntArray) -> None:
-        """Forget the landmarks at ``rows``."""
-        self._core.remove(rows)
-
-    def correct(self, residuals: Residuals) -> tuple[Correction, FloatArray]:
-        """Return the correction and the weight that each point was given."""
-        rows = residuals.rows
-        F, N, _ = self._leaves.now(rows)
-        H = self._output_matrix(residuals.e + residuals.a - residuals.r) - F
-        passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
-        step = self._reweighted_step(residuals, H, N, passed)
-        Delta, gain_k = step.Delta, step.gain_k
-        delta = self._axes.full_points((F @ Delta + N @ step.k_left).ravel())
-        F = F + N @ gain_k @ H
-        F[:, :, : self._axes.p] += self._axes.turn_matrix(delta)
-        N[passed] = symmetric(N[passed] @ gain_k[passed] @ step.noise)  # N − N k N, but positive
-        self._core.measurement_update(H[passed], gain_k[passed])
-        self._leaves.shift(Delta[:, 0])
-        self._leaves.update(rows, F, N)
-        self._core.turn(Delta[:, 0])
-        self._core.admit(rows[passed])
-        return self._as_correction(rows, Delta[:, 0], delta, residuals.a), step.weights
+    def _bring_up_to_date(self, rows: IntArray) -> None:
+        """Move landmarks that are about to be used, and others whose turn it is."""
+        rows = np.union1d(rows, self._postponed.due())
+        F, N, shifts = self._postponed.now(rows)
+        self._postponed.update(rows, F, N)
+        self.observer.a[rows] += shifts
 
     def _reweighted_step(
         self, residuals: Residuals, H: FloatArray, N: FloatArray, passed: BoolArray
     ) -> _Step:
         """Return the step Δ that the points which passed the gate ask for, by Huber's weights."""
-        r, R = residuals.r[:, : self._axes.point, None], self._noise(residuals.covariances)
+        r, R = residuals.r[:, : self.axes.point, None], self._noise(residuals.covariances)
         repeated = repetition_factors(
             residuals.dt_s[passed], self._settings.observation_error_time
         )
@@ -251,19 +252,14 @@ class ScheduledGains(GainDesign):
             weights[passed] = found
         return _Step(Delta, gain_k, k_left, noise, weights)
 
-    def distances(self, residuals: Residuals) -> FloatArray:
-        """Return the Mahalanobis distance (m,) of each residual."""
-        F, N, _ = self._leaves.now(residuals.rows)
-        return self._distances(residuals, F, N)
-
     def _distances(self, residuals: Residuals, F: FloatArray, N: FloatArray) -> FloatArray:
         """Return the Mahalanobis distances (m,), with C_i at the middle of the chord.
 
         For the reason that Riccati gains have.
         """
-        H = self._output_matrix(residuals.e + residuals.a - 0.5 * residuals.r) - F
+        H = self._output_matrix(residuals.landmarks + 0.5 * residuals.r) - F
         S = H @ self._core.P @ transpose(H) + N + self._noise(residuals.covariances)
-        return mahalanobis(residuals.r[:, : self._axes.point], S)
+        return mahalanobis(residuals.r[:, : self.axes.point], S)
 
     def _with_landmarks(self, F: FloatArray, N: FloatArray) -> FloatArray:
         """Return the covariance (q + m k, q + m k) of z and m landmarks."""
@@ -275,21 +271,19 @@ class ScheduledGains(GainDesign):
 
     def _output_matrix(self, lever_arms: FloatArray) -> FloatArray:
         """Return C_i (m, k, q), with zeros for all of z but ε."""
-        C = self._axes.output_matrix(lever_arms)
+        C = self.axes.output_matrix(lever_arms)
         full = np.zeros((*C.shape[:2], len(self._core.P)))
         full[:, :, : C.shape[2]] = C
         return full
 
     def _noise(self, covariances: FloatArray) -> FloatArray:
         """Return the part (m, k, k) of covariances (m, 3, 3) on the axes that are estimated."""
-        k = self._axes.point
+        k = self.axes.point
         return covariances[:, :k, :k]
 
-    def _as_correction(
-        self, rows: IntArray, x: FloatArray, shifts: FloatArray, a: FloatArray
-    ) -> Correction:
-        """Return the element that moves the core by x and â_i (m, 3) by ``shifts`` alone."""
-        p = self._axes.p
+    def _move(self, rows: IntArray, x: FloatArray, shifts: FloatArray) -> None:
+        """Move the core by x, and landmarks (m,) by ``shifts`` (m, 3) alone."""
+        p, a = self.axes.p, self.observer.a[rows]
         self.calibration.shift(x[p : p + self.calibration.count])
-        D = se3.exp(self._axes.full_pose(x[:p]))
-        return Correction(D, rows, shifts + a - se3.rotate(D, a))
+        D = se3.exp(self.axes.full_pose(x[:p]))
+        self.observer.correct(D, rows, shifts + a - se3.rotate(D, a))

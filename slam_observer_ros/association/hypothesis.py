@@ -1,0 +1,37 @@
+"""One of several ideas of where everything is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from slam_observer_ros.association.landmark_index import LandmarkIndex
+from slam_observer_ros.association.visibility import Visibility
+from slam_observer_ros.state.state import State
+
+
+@dataclass(slots=True, eq=False)
+class Hypothesis:
+    """A state, and what only points without an id need of it.
+
+    Attributes
+    ----------
+    state : State
+        Pose and map.
+    visibility : Visibility
+        What is in view of a sensor that gives no ids.
+    index : LandmarkIndex
+        For landmarks near a point.
+    cost : float
+        −2 ln of its likelihood, over that of the most likely one.
+
+    """
+
+    state: State
+    visibility: Visibility
+    index: LandmarkIndex = field(default_factory=LandmarkIndex)
+    cost: float = 0.0
+
+    @classmethod
+    def of(cls, state: State) -> Hypothesis:
+        """Return the only hypothesis there is."""
+        return cls(state, Visibility(state))

@@ -1,0 +1,29 @@
+"""The present map, as it can be saved and loaded."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.geometry.matrices import with_variances_above
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.merging import shape_covariances
+from slam_observer_ros.state.state import State
+
+MOVING_SPEED = 0.1
+"""Speed from which on a landmark is left out of a map, m/s; slower ones may be at rest."""
+
+
+def map_of(state: State, is_own_frame: bool) -> LandmarkMap:
+    """Return the confirmed landmarks that are at rest.
+
+    Covariances are those of the map's shape if the frame is the estimate's own.
+    """
+    rows = state.confirmed
+    rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
+    covariances = shape_covariances(state) if is_own_frame else state.landmark_covariances()
+    return LandmarkMap(
+        state.landmarks.ids[rows],
+        state.world_points[rows],
+        None if covariances is None else with_variances_above(0.0, covariances[rows]),
+        state.landmarks.counts[rows],
+    )
