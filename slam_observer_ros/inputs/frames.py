@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -14,11 +14,6 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
-from slam_observer_ros.sensor_models.extrinsics import (
-    move_observation,
-    move_velocity,
-    turn_angular_velocity,
-)
 from slam_observer_ros.settings.input_settings import InputSettings
 
 EventT = TypeVar('EventT', ObservationEvent, VelocityEvent, AngularVelocityEvent)
@@ -120,10 +115,10 @@ class BaseFrame:
 
         """
         if self._sensor_pose is not None:
-            return move_observation(event, self._sensor_pose)
+            return event.moved(self._sensor_pose)
         frame_id = self._sensor_frame or frame_id
         self._refuse_map_frame(frame_id)
-        return self._moved(move_observation, event, frame_id)
+        return self._moved(event, frame_id)
 
     def tags(self, detections: TagDetections) -> ObservationEvent:
         """Return where /tf has the fiducials of a detection message, in the base frame.
@@ -155,7 +150,7 @@ class BaseFrame:
         """
         if frame_id.lstrip('/') in self._world_frames:
             raise TransformError(f"'{frame_id}' does not move with the robot")
-        return self._moved(move_velocity, event, frame_id)
+        return self._moved(event, frame_id)
 
     def angular_velocity(self, event: AngularVelocityEvent, frame_id: str) -> AngularVelocityEvent:
         """Return an angular velocity in the base frame's axes.
@@ -166,7 +161,7 @@ class BaseFrame:
             If the sensor's pose is not known (yet).
 
         """
-        return self._moved(turn_angular_velocity, event, frame_id)
+        return self._moved(event, frame_id)
 
     def _refuse_map_frame(self, frame_id: str) -> None:
         """Refuse landmarks that the estimate itself would bring to where it has them."""
@@ -176,15 +171,10 @@ class BaseFrame:
                 "landmarks: publish them in the sensor's frame"
             )
 
-    def _moved(
-        self,
-        move: Callable[[EventT, FloatArray], EventT],
-        event: EventT,
-        frame_id: str,
-    ) -> EventT:
+    def _moved(self, event: EventT, frame_id: str) -> EventT:
         if frame_id.lstrip('/') in ('', self.name):
             return event
-        return move(event, self._transforms.lookup(self.name, frame_id, event.stamp_ns))
+        return event.moved(self._transforms.lookup(self.name, frame_id, event.stamp_ns))
 
     def _tag_position(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
         """Return where a tag is in the camera's frame (3,), under either of its names."""

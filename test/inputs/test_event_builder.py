@@ -17,7 +17,6 @@ from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
-from slam_observer_ros.sensor_models.extrinsics import move_velocity
 from slam_observer_ros.settings.input_settings import InputSettings
 
 MS = 1_000_000
@@ -49,7 +48,7 @@ class Wheel:
 
 
 def of_base(stamp_ns):
-    return move_velocity(VelocityEvent(stamp_ns, V), WHEEL).body_velocity
+    return VelocityEvent(stamp_ns, V).moved(WHEEL).body_velocity
 
 
 @pytest.fixture
