@@ -1,24 +1,45 @@
-"""What the estimator gives out: after each observation, and in hindsight."""
+"""What the estimator gives out: updates, calibration, smoothed run, names of its counts."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 import math
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
+UNUSED_POINTS = {
+    'rejected_landmark': 'rejected',
+    'unknown_id': 'without id',
+    'repeated_id': 'of a repeated id',
+    'reserved_id': 'of a reserved id',
+    'unmapped_landmark': 'not mapped',
+}
+"""Names under which observed points that are not used are counted, and what they are."""
+
+MAX_REJECTED = 0.1
+"""Share of the points beyond which they are more than a sensor's outliers."""
+
 IMPLAUSIBLE = 4.0
-"""Standard deviations as stated by which no calibration is off: something else is wrong."""
+"""Stated standard deviations by which no calibration is off: something else is wrong."""
+
+
+def used_points(counts: Counter[str]) -> int:
+    """Return how many points were used, from :attr:`.Estimator.counts`."""
+    return counts['observed_point'] - sum(counts[name] for name in UNUSED_POINTS)
+
+
+def point_share(counts: Counter[str], name: str) -> float:
+    """Return the share of the points that ``name`` counts, from :attr:`.Estimator.counts`."""
+    return counts[name] / max(counts['observed_point'], 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """The state right after an observation was used.
+    """The state at ``stamp_ns``, right after an observation was used.
 
     Attributes
     ----------
-    stamp_ns : int
-        Stamp of the state, nanoseconds.
     pose : FloatArray
         (4, 4) estimated pose, body to world.
     ids : IntArray
@@ -44,19 +65,10 @@ class Update:
 class CalibrationEstimate:
     """What was found out about one property of the velocity.
 
-    Attributes
-    ----------
-    name : str
-        Which: ``angular_scale_z``, ``linear_bias_x``, ``velocity_delay`` and so on.
-    value, deviation : float
-        Estimate and its standard deviation; of a scale, the factor that the velocity is
-        multiplied by.
-    unit : str
-        Unit of both; '' for a factor.
-    nominal, stated : float
-        What it was taken for at the start, and the standard deviation that the settings state;
-        infinite where it may drift away from there.
-
+    ``name`` is ``angular_scale_z``, ``linear_bias_x``, ``velocity_delay`` and so on; a scale is
+    the factor that the velocity is multiplied by, its ``unit`` is ''. ``nominal`` is the value at
+    the start, ``stated`` the standard deviation that the settings state, infinite where the value
+    may drift away from there.
     """
 
     name: str
@@ -67,7 +79,7 @@ class CalibrationEstimate:
     stated: float = math.inf
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """What is wrong if it is further from nominal than the settings can mean; else ''."""
         times = abs(self.value - self.nominal) / self.stated
         if times <= IMPLAUSIBLE:
@@ -92,16 +104,12 @@ class Smoothed:
 
     Attributes
     ----------
-    stamps_ns : IntArray
-        (s,) stamps of the observations, nanoseconds.
-    poses : FloatArray
-        (s, 4, 4) poses at these stamps, body to world.
-    world_points : FloatArray
-        (n, 3) landmarks, metres, world.
-    ids : IntArray
-        (n,) their ids.
+    stamps_ns, poses : IntArray, FloatArray
+        (s,) stamps of the observations and (s, 4, 4) poses at these, body to world.
+    world_points, ids : FloatArray, IntArray
+        (n, 3) landmarks, metres, world, and (n,) their ids.
     since : str
-        What happened before the first of them, so that there is no hindsight of more, in words.
+        What happened before the first of them, so that no more is smoothed, in words.
 
     """
 

@@ -14,7 +14,7 @@ from numpy.testing import assert_array_equal
 import pytest
 
 from slam_observer_ros.common.errors import MapError, ParameterError
-from slam_observer_ros.counts import used_points
+from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator import event_warnings
 from slam_observer_ros.estimator.checks import MAX_MEASURED
 from slam_observer_ros.estimator.estimator import Estimator
