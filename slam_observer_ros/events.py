@@ -29,12 +29,6 @@ FIRST_AUTOMATIC_ID = 10_000_000
 LAST_AUTOMATIC_ID = 2**24 - 1
 """They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
 
-AGREEING_STAMPS = 5
-"""How many stamps in a row must agree before a pause or a jump of the clock is believed."""
-
-NEAR_NS = 1_000_000_000
-"""Stamps nearer than this to the newest one tell of no pause or jump, nanoseconds."""
-
 
 @dataclass(frozen=True, slots=True)
 class VelocityEvent:

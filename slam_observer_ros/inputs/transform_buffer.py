@@ -12,10 +12,10 @@ import logging
 
 import numpy as np
 
+from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import AGREEING_STAMPS, NEAR_NS
 from slam_observer_ros.geometry import paths, se3
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class _Track:
     is_static: bool
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
-    behind_ns: list[int] = field(default_factory=list)
+    strays: StrayStamps = field(default_factory=StrayStamps)
 
     def insert(self, stamp_ns: int, pose: FloatArray) -> None:
         if not self.is_static:
@@ -54,11 +54,11 @@ class _Track:
         seem too old.
         """
         if not self.stamps_ns or stamp_ns >= self.stamps_ns[-1] - NEAR_NS:
-            self.behind_ns = []
-        elif not self.behind_ns or stamp_ns > self.behind_ns[-1]:
-            self.behind_ns.append(stamp_ns)
-        if len(self.behind_ns) >= AGREEING_STAMPS:
-            self.stamps_ns, self.poses, self.behind_ns = [], [], []
+            self.strays.clear()
+            return
+        last_ns = self.strays.last_ns
+        if (last_ns is None or stamp_ns > last_ns) and self.strays.add(stamp_ns):
+            self.stamps_ns, self.poses = [], []
 
     def pose_at(self, stamp_ns: int) -> FloatArray | None:
         """Interpolate the pose (4, 4); None outside of what is known."""
