@@ -43,7 +43,10 @@ def summed_noise(Ad: FloatArray, covariances: FloatArray) -> FloatArray:
 
 
 def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -> FloatArray:
-    """Return poses at a ``share`` (…) of the way: positions in a line, one axis of rotation, as tf2."""
+    """Return poses at a ``share`` (…), 0 to 1, of the way between two, as tf2 has them.
+
+    Positions are in a line, rotations about one axis.
+    """
     R, share = start[..., :3, :3], np.asarray(share)[..., None]
     turn = so3.log(transpose(R) @ end[..., :3, :3])
     shift = end[..., :3, 3] - start[..., :3, 3]

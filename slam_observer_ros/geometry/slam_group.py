@@ -102,7 +102,7 @@ def configuration(Xi: TotalState) -> TotalState:
 
 
 def same_configuration(Xi: TotalState, other: TotalState, tolerance_m: float) -> bool:
-    """Return whether two states differ by a change of reference frame only, to ``tolerance_m`` (13)."""
+    """Return whether two states, to ``tolerance_m``, differ by a change of frame only (13)."""
     difference = configuration(Xi).p - configuration(other).p
     return bool(np.all(np.abs(difference) <= tolerance_m))
 
