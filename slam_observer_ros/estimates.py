@@ -36,28 +36,17 @@ def point_share(counts: Counter[str], name: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """The state at ``stamp_ns``, right after an observation was used.
+    """The state at ``stamp_ns``, right after an observation of m known landmarks was used.
 
-    Attributes
-    ----------
-    pose : FloatArray
-        (4, 4) estimated pose, body to world.
-    ids : IntArray
-        (m,) ids of the known landmarks that were seen.
-    residuals : FloatArray
-        (m, 3) their residuals r_i before the correction, metres, along the world's axes.
-    rejected : BoolArray
-        (m,) whether they were too far off to be used.
-    lyapunov : float
-        L (34) of these residuals, of rejected ones, too; k_i is ``gain_k`` whatever the gains.
-
+    Residuals are those before the correction, along the world's axes; the rejected ones were too
+    far off to be used. ``lyapunov`` is L (34) of them all; k_i is ``gain_k`` whatever the gains.
     """
 
     stamp_ns: int
-    pose: FloatArray
-    ids: IntArray
-    residuals: FloatArray
-    rejected: BoolArray
+    pose: FloatArray  # (4, 4) body to world
+    ids: IntArray  # (m,)
+    residuals: FloatArray  # (m, 3) r_i, metres
+    rejected: BoolArray  # (m,)
     lyapunov: float
 
 
@@ -102,19 +91,11 @@ class CalibrationEstimate:
 class Smoothed:
     """Trajectory and map, each pose estimated from all that was seen before and after.
 
-    Attributes
-    ----------
-    stamps_ns, poses : IntArray, FloatArray
-        (s,) stamps of the observations and (s, 4, 4) poses at these, body to world.
-    world_points, ids : FloatArray, IntArray
-        (n, 3) landmarks, metres, world, and (n,) their ids.
-    since : str
-        What happened before the first of them, so that no more is smoothed, in words.
-
+    ``since`` says in words what happened before the first of them, so that no more is smoothed.
     """
 
-    stamps_ns: IntArray
-    poses: FloatArray
-    world_points: FloatArray
-    ids: IntArray
+    stamps_ns: IntArray  # (s,) of the observations
+    poses: FloatArray  # (s, 4, 4) at these, body to world
+    world_points: FloatArray  # (n, 3) landmarks, metres, world
+    ids: IntArray  # (n,)
     since: str

@@ -1,9 +1,9 @@
 """Time-stamped events: what the estimator takes in, in the base frame, metres and radians.
 
 Each has ``stamp_ns``, its time of validity, and ``receive_ns``, when it was received by any clock
-that goes on steadily, or None. Covariances are in the event's own frame; where one is None, or all
-zero, it is unknown. ``moved`` brings an event into another frame. Arrays are not copied: who has
-added an event must not change them any more.
+that goes on steadily, or None. A covariance that is None, or all zero, is unknown. ``moved``
+brings an event into another frame. Arrays are not copied: who has added an event must not change
+them any more.
 """
 
 from __future__ import annotations
@@ -32,15 +32,12 @@ LAST_AUTOMATIC_ID = 2**24 - 1
 
 @dataclass(frozen=True, slots=True)
 class VelocityEvent:
-    """Body velocity, held from its stamp until the next one.
+    """Body velocity (Ω, v) as in the paper's (9), held from its stamp until the next one.
 
     Attributes
     ----------
-    body_velocity : FloatArray
-        (6,) angular then linear velocity (Ω, v) as in the paper's (9), rad/s and m/s.
     covariance : FloatArray or None
-        (6, 6) of ``body_velocity``, same order; a part, angular or linear, that is all zero is
-        unknown.
+        A part of it, angular or linear, that is all zero is unknown as well.
     is_mean : bool
         Whether it is the mean velocity until the next one, as between two poses. Otherwise its
         error goes on while no other comes.
@@ -48,16 +45,16 @@ class VelocityEvent:
     """
 
     stamp_ns: int
-    body_velocity: FloatArray
-    covariance: FloatArray | None = None
+    body_velocity: FloatArray  # (6,)
+    covariance: FloatArray | None = None  # (6, 6)
     receive_ns: int | None = None
     is_mean: bool = False
 
     def moved(self, pose: FloatArray) -> VelocityEvent:
-        """Return the velocity of the base whose sensor, at ``pose`` T (4, 4) in it, moves so.
+        """Return the velocity of the base, in which this event's frame has ``pose`` T (4, 4).
 
-        Both move as one rigid body, V_base = Ad_T V_sensor: where the sensor turns off the
-        base's origin, the linear velocity has a lever arm.
+        Both move as one rigid body, V_base = Ad_T V: where the frame turns off the base's origin,
+        the linear velocity has a lever arm.
         """
         Ad = se3.adjoint(pose)
         covariance = self.covariance
@@ -75,19 +72,11 @@ class AngularVelocityEvent:
 
     Held from its stamp until the next one, for the settings' ``velocity_timeout`` at most; where
     no :class:`VelocityEvent` is in force it says nothing.
-
-    Attributes
-    ----------
-    angular_velocity : FloatArray
-        (3,) rad/s.
-    covariance : FloatArray or None
-        (3, 3) rad²/s².
-
     """
 
     stamp_ns: int
-    angular_velocity: FloatArray
-    covariance: FloatArray | None = None
+    angular_velocity: FloatArray  # (3,)
+    covariance: FloatArray | None = None  # (3, 3)
     receive_ns: int | None = None
 
     def moved(self, pose: FloatArray) -> AngularVelocityEvent:
@@ -102,29 +91,14 @@ class AngularVelocityEvent:
 
 @dataclass(frozen=True, slots=True)
 class ObservationEvent:
-    """Landmarks seen at one instant.
-
-    Attributes
-    ----------
-    ids : IntArray
-        (m,) landmark ids, :data:`UNKNOWN_ID` where the sensor gives none.
-    points : FloatArray
-        (m, 3) positions.
-    covariances : FloatArray or None
-        (m, 3, 3) covariance of each point, m².
-    velocities : FloatArray or None
-        (m, 3) velocity of each landmark itself, m/s (the paper's v_i (19)); None for static ones.
-    sensor : FloatArray or None
-        (m, 3) where each was measured from: noise grows with the distance from there. None for
-        the base itself.
-
-    """
+    """Landmarks seen at one instant."""
 
     stamp_ns: int
-    ids: IntArray
-    points: FloatArray
-    covariances: FloatArray | None = None
-    velocities: FloatArray | None = None
+    ids: IntArray  # (m,) UNKNOWN_ID where the sensor gives none
+    points: FloatArray  # (m, 3)
+    covariances: FloatArray | None = None  # (m, 3, 3) of each point
+    velocities: FloatArray | None = None  # (m, 3) of each landmark itself (the paper's v_i (19))
+    # (m, 3) where each was measured from, by default from the base: noise grows with the distance.
     sensor: FloatArray | None = None
     receive_ns: int | None = None
 
@@ -177,7 +151,7 @@ def is_automatic(ids: IntArray) -> BoolArray:
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:
-    """Return the observation without what leaves the plane z = 0; lines of sight stay."""
+    """Return the observation in the plane z = 0; lines of sight stay."""
     points = event.points * _PLANAR_POINT
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
     sensor = points - event.lines_of_sight if event.points[:, 2].any() else event.sensor
@@ -185,7 +159,7 @@ def flatten(event: ObservationEvent) -> ObservationEvent:
 
 
 def flatten_velocities(body_velocities: FloatArray) -> FloatArray:
-    """Return velocities (…, 6) without what leaves the plane z = 0 or turns out of it."""
+    """Return velocities (…, 6) in the plane z = 0."""
     flat: FloatArray = body_velocities * _PLANAR_VELOCITY
     return flat
 

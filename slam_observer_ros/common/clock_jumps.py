@@ -17,10 +17,7 @@ class StrayStamps:
         self.last_ns: int | None = None
 
     def add(self, stamp_ns: int) -> bool:
-        """Count a stamp; return whether ``AGREEING_STAMPS`` have come, and begin with none again.
-
-        Equal stamps count once: they may be of one message.
-        """
+        """Count a stamp, once if it is repeated; clear them and return True if enough agree."""
         self._stamps_ns.add(stamp_ns)
         self.last_ns = stamp_ns
         is_enough = len(self._stamps_ns) >= AGREEING_STAMPS
@@ -29,6 +26,6 @@ class StrayStamps:
         return is_enough
 
     def clear(self) -> None:
-        """Forget them, as one in time or one that does not agree has come."""
+        """Forget them, as a stamp has come that does not agree."""
         self._stamps_ns.clear()
         self.last_ns = None

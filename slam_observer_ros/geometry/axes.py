@@ -17,6 +17,7 @@ class Axes(Immutable):
         Axes of the pose error ε = (Ω, v), and how many these are.
     point : int
         Leading axes of a point, 2 or 3.
+
     """
 
     def __init__(self, pose: slice, point: int) -> None:

@@ -201,7 +201,7 @@ class _Joined:
     def write(
         self, first: int, events: list[tuple[VelocityEvent, AngularVelocityEvent | None]]
     ) -> None:
-        """Fill in rows from ``first`` on, which are zero; then they never change: others see them."""
+        """Fill in rows from ``first`` on, once: others may see them."""
         rows = slice(first, first + len(events))
         self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
         stamps_ns = np.array([velocity.stamp_ns for velocity, _ in events], dtype=np.int64)

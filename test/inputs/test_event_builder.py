@@ -127,7 +127,7 @@ def everything_placed():
 @pytest.mark.parametrize('frame', ['map', '/map'])
 def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
     event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
-    reason = "told in 'map', which is estimated from these very landmarks: publish them in the"
+    reason = "given in 'map', which is estimated from these very landmarks: publish them in the"
     base_frame = BaseFrame(InputSettings(), everything_placed())
     with pytest.raises(TransformError, match=reason):
         base_frame.observation(event, frame)
