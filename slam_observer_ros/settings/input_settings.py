@@ -85,6 +85,7 @@ class InputSettings:
         ------
         ParameterError
             If the map's frame has no name.
+
         """
         names = ('map_frame', 'odom_frame', 'base_frame', 'sensor_frame')
         plain = replace(self, **{name: getattr(self, name).lstrip('/') for name in names})

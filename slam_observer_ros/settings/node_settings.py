@@ -82,6 +82,7 @@ class ObserverNodeSettings(InputSettings):
         ParameterError
             If map or base has no name, or two of map, odometry and base have the same; it says
             what to do.
+
         """
         plain = self.with_plain_frames()
         plain.check_named('base_frame')

@@ -23,6 +23,7 @@ def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
     ParameterError
         If one is a former name of ours, or one of ours with a single mistake. With more of them
         it may well be another node's: ``base_frame_id`` comes near, too.
+
     """
     others = [name for name in written if name not in ours]
     refuse_renamed(name for name in others if RENAMED.get(name) in ours)

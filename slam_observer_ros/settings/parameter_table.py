@@ -53,6 +53,7 @@ class Parameter:
         Whether the value is fixed once the node runs.
     basic : bool
         Whether a robot needs it first; all others are advanced.
+
     """
 
     name: str
