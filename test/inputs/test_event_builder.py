@@ -43,7 +43,7 @@ class Wheel:
             events += self.builder.add(message, self.now_ns)
         return events
 
-    def place(self, stamp_ns):
+    def insert_transform(self, stamp_ns):
         self.transforms.insert('base_link', 'wheel', stamp_ns, WHEEL)
 
 
@@ -76,7 +76,7 @@ def test_velocities_wait_again_for_a_late_transform_that_has_begun_to_come(log):
     wheel = Wheel(0.1)
     events = wheel.send(20)
     for _ in range(20):
-        wheel.place(wheel.now_ns - 30 * MS)
+        wheel.insert_transform(wheel.now_ns - 30 * MS)
         events += wheel.send(1)
     stamps_ns = [event.stamp_ns for event in events]
     assert stamps_ns == list(range(20 * MS, 20 * MS * (len(events) + 1), 20 * MS))
@@ -90,13 +90,13 @@ def test_a_transform_that_always_comes_too_late_changes_nothing(log):
     wheel = Wheel(0.1)
     events = []
     for _ in range(40):
-        wheel.place(wheel.now_ns - 150 * MS)
+        wheel.insert_transform(wheel.now_ns - 150 * MS)
         events += wheel.send(1)
     assert_array_equal([event.body_velocity for event in events], [V] * len(events))
     assert [record.levelname for record in log.records] == ['WARNING']
 
 
-def test_what_too_many_wait_behind_is_dropped_and_told():
+def test_what_too_many_wait_behind_is_dropped_and_reported():
     drops = []
     transforms = TransformBuffer()
     builder = EventBuilder(BaseFrame(InputSettings(), transforms), 10.0, 0.5, drops.append)

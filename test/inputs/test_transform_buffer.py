@@ -98,7 +98,7 @@ def test_what_was_replaced_takes_no_part_in_what_lies_between():
     assert_allclose(buffer.lookup('odom', 'base', SECOND * 3 // 2), moved)
 
 
-def test_of_static_transforms_the_one_told_last_holds_whatever_its_stamp():
+def test_of_static_transforms_the_last_one_given_holds_whatever_its_stamp():
     buffer = TransformBuffer()
     for stamp_ns in (5 * SECOND, 7 * SECOND, 3 * SECOND):
         placed = se3.pose(np.eye(3), np.full(3, 1e-9 * stamp_ns))
@@ -114,7 +114,7 @@ def test_of_static_transforms_the_one_told_last_holds_whatever_its_stamp():
         ([np.nan, 2.0, 3.0], NO_TURN, 'a coordinate is NaN or infinite'),
     ],
 )
-def test_one_bad_transform_of_a_message_is_left_out_and_told_once(
+def test_one_bad_transform_of_a_message_is_left_out_and_reported_once(
     caplog, position, quaternion, reason
 ):
     transforms = [
@@ -134,7 +134,7 @@ def test_one_bad_transform_of_a_message_is_left_out_and_told_once(
     assert f"A transform on /tf of frame 'gripper' is not used: {reason}" in record.getMessage()
 
 
-def test_a_transform_of_a_frame_to_itself_changes_nothing_and_is_told_once(caplog):
+def test_a_transform_of_a_frame_to_itself_changes_nothing_and_is_reported_once(caplog):
     buffer = TransformBuffer()
     for _ in range(3):
         buffer.insert('odom', 'base', SECOND, np.eye(4))

@@ -348,7 +348,7 @@ def test_a_file_without_parameters_is_refused_in_one_line(tmp_path, text, expect
     assert '\n' not in str(error.value)
 
 
-def test_what_is_wrong_with_a_file_is_told_with_its_line(tmp_path):
+def test_what_is_wrong_with_a_file_is_reported_with_its_line(tmp_path):
     path = write(tmp_path, '/**:\n  ros__parameters:\n    gain_k: [1.0\n    gain_l: 2.0\n')
     with pytest.raises(ParameterError, match=r"expected ',' or '\]', but got ':' in line 4$"):
         read_parameter_file(path)
@@ -377,11 +377,11 @@ def test_off_in_a_file_is_no_false(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('numbers', 'is_told'), [('[0.2, 0, 0.4]', True), ('[0.2, 0.0]', False), ('[1, 2]', False)]
+    ('numbers', 'is_reported'), [('[0.2, 0, 0.4]', True), ('[0.2, 0.0]', False), ('[1, 2]', False)]
 )
-def test_a_list_that_the_node_can_not_read_is_told(tmp_path, numbers, is_told):
+def test_a_list_that_the_node_can_not_read_is_reported(tmp_path, numbers, is_reported):
     path = write(tmp_path, f'/**: {{ros__parameters: {{sensor_pose: {numbers}}}}}')
-    assert mixed_lists(read_parameter_file(path)) == ['sensor_pose'] * is_told
+    assert mixed_lists(read_parameter_file(path)) == ['sensor_pose'] * is_reported
 
 
 @pytest.mark.parametrize(
