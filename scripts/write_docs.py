@@ -86,26 +86,6 @@ SIMULATED = {
 }
 
 
-MAIN_PARAMETERS = (
-    'gains',
-    'two_d_mode',
-    'angular_velocity_noise',
-    'linear_velocity_noise',
-    'observation_model',
-    'velocity_type',
-    'landmarks_type',
-    'map_frame',
-    'odom_frame',
-    'base_frame',
-    'sensor_frame',
-    'publish_tf',
-    'reorder_window',
-    'map_file',
-    'localization_mode',
-)
-"""What a new robot most often needs."""
-
-
 @dataclass(frozen=True)
 class Topic:
     """What a node has on a topic or service."""
@@ -127,7 +107,7 @@ def main() -> int:
     """Write the tables, or check them; return the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     choice = parser.add_mutually_exclusive_group()
-    choice.add_argument('--check', action='store_true', help='only tell which pages are stale')
+    choice.add_argument('--check', action='store_true', help='only say which pages are stale')
     choice.add_argument('--json', action='store_true', help='only print what the nodes publish')
     options = parser.parse_args()
     observer = interface_of(ObserverNode, *SUBSCRIBE_AT_ONCE)
@@ -196,10 +176,12 @@ def tables(observer: Interface, simulator: Interface) -> dict[str, str]:
         'outputs': topic_table('topic', observer.published, OUTPUTS),
         'services': topic_table('service', observer.services, SERVICES),
         'simulator-outputs': topic_table('topic', simulator.published, SIMULATED),
-        'main-parameters': parameter_table(main_parameters()),
-        'estimator-parameters': parameter_table(table(Settings)),
-        'input-parameters': parameter_table(table(InputSettings)),
-        'observer-node-parameters': parameter_table(own_parameters()),
+        'first-parameters': parameter_table(
+            row for row in (*table(Settings), *table(ObserverNodeSettings)) if row.basic
+        ),
+        **two_tables('estimator', table(Settings)),
+        **two_tables('input', table(InputSettings)),
+        **two_tables('observer-node', own_parameters()),
         'scenario-parameters': parameter_table(table(Scenario)),
         'simulator-node-parameters': parameter_table(table(SimulatorNodeSettings)),
     }
@@ -235,16 +217,18 @@ def expect_same_names(found: Iterable[str], described: Iterable[str]) -> None:
         raise SystemExit(f'{name} {what}: {__file__}')
 
 
-def main_parameters() -> list[Parameter]:
-    """Return the rows of MAIN_PARAMETERS, in their order."""
-    rows = {row.name: row for row in (*table(Settings), *table(ObserverNodeSettings))}
-    return [rows[name] for name in MAIN_PARAMETERS]
-
-
 def own_parameters() -> list[Parameter]:
     """Return the rows that the observer node adds to those of its inputs."""
     inherited = table(InputSettings)
     return [row for row in table(ObserverNodeSettings) if row not in inherited]
+
+
+def two_tables(name: str, parameters: Sequence[Parameter]) -> dict[str, str]:
+    """Return the table of what a robot needs first, and that of the advanced parameters."""
+    return {
+        f'{name}-parameters': parameter_table(row for row in parameters if row.basic),
+        f'{name}-parameters-advanced': parameter_table(r for r in parameters if not r.basic),
+    }
 
 
 def parameter_table(parameters: Iterable[Parameter]) -> str:

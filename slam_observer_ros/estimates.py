@@ -1,42 +1,52 @@
-"""What the estimator gives out: after each observation, and in hindsight."""
+"""What the estimator gives out: updates, calibration, smoothed run, names of its counts."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 import math
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
+UNUSED_POINTS = {
+    'rejected_landmark': 'rejected',
+    'unknown_id': 'without id',
+    'repeated_id': 'of a repeated id',
+    'reserved_id': 'of a reserved id',
+    'unmapped_landmark': 'not mapped',
+}
+"""Names under which observed points that are not used are counted, and what they are."""
+
+MAX_REJECTED = 0.1
+"""Share of the points beyond which they are more than a sensor's outliers."""
+
 IMPLAUSIBLE = 4.0
-"""Standard deviations as stated by which no calibration is off: something else is wrong."""
+"""Stated standard deviations by which no calibration is off: something else is wrong."""
+
+
+def used_points(counts: Counter[str]) -> int:
+    """Return how many points were used, from :attr:`.Estimator.counts`."""
+    return counts['observed_point'] - sum(counts[name] for name in UNUSED_POINTS)
+
+
+def point_share(counts: Counter[str], name: str) -> float:
+    """Return the share of the points that ``name`` counts, from :attr:`.Estimator.counts`."""
+    return counts[name] / max(counts['observed_point'], 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """The state right after an observation was used.
+    """The state at ``stamp_ns``, right after an observation of m known landmarks was used.
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the state, nanoseconds.
-    pose : FloatArray
-        (4, 4) estimated pose, body to world.
-    ids : IntArray
-        (m,) ids of the known landmarks that were seen.
-    residuals : FloatArray
-        (m, 3) their residuals r_i before the correction, metres, along the world's axes.
-    rejected : BoolArray
-        (m,) whether they were too far off to be used.
-    lyapunov : float
-        L (34) of these residuals, of rejected ones, too; k_i is ``gain_k`` whatever the gains.
-
+    Residuals are those before the correction, along the world's axes; the rejected ones were too
+    far off to be used. ``lyapunov`` is L (34) of them all; k_i is ``gain_k`` whatever the gains.
     """
 
     stamp_ns: int
-    pose: FloatArray
-    ids: IntArray
-    residuals: FloatArray
-    rejected: BoolArray
+    pose: FloatArray  # (4, 4) body to world
+    ids: IntArray  # (m,)
+    residuals: FloatArray  # (m, 3) r_i, metres
+    rejected: BoolArray  # (m,)
     lyapunov: float
 
 
@@ -44,19 +54,10 @@ class Update:
 class CalibrationEstimate:
     """What was found out about one property of the velocity.
 
-    Attributes
-    ----------
-    name : str
-        Which: ``angular_scale_z``, ``linear_bias_x``, ``velocity_delay`` and so on.
-    value, deviation : float
-        Estimate and its standard deviation; of a scale, the factor that the velocity is
-        multiplied by.
-    unit : str
-        Unit of both; '' for a factor.
-    nominal, stated : float
-        What it was taken for at the start, and the standard deviation that the settings state;
-        infinite where it may drift away from there.
-
+    ``name`` is ``angular_scale_z``, ``linear_bias_x``, ``velocity_delay`` and so on; a scale is
+    the factor that the velocity is multiplied by, its ``unit`` is ''. ``nominal`` is the value at
+    the start, ``stated`` the standard deviation that the settings state, infinite where the value
+    may drift away from there.
     """
 
     name: str
@@ -67,7 +68,7 @@ class CalibrationEstimate:
     stated: float = math.inf
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """What is wrong if it is further from nominal than the settings can mean; else ''."""
         times = abs(self.value - self.nominal) / self.stated
         if times <= IMPLAUSIBLE:
@@ -90,23 +91,11 @@ class CalibrationEstimate:
 class Smoothed:
     """Trajectory and map, each pose estimated from all that was seen before and after.
 
-    Attributes
-    ----------
-    stamps_ns : IntArray
-        (s,) stamps of the observations, nanoseconds.
-    poses : FloatArray
-        (s, 4, 4) poses at these stamps, body to world.
-    world_points : FloatArray
-        (n, 3) landmarks, metres, world.
-    ids : IntArray
-        (n,) their ids.
-    since : str
-        What happened before the first of them, so that there is no hindsight of more, in words.
-
+    ``since`` says in words what happened before the first of them, so that no more is smoothed.
     """
 
-    stamps_ns: IntArray
-    poses: FloatArray
-    world_points: FloatArray
-    ids: IntArray
+    stamps_ns: IntArray  # (s,) of the observations
+    poses: FloatArray  # (s, 4, 4) at these, body to world
+    world_points: FloatArray  # (n, 3) landmarks, metres, world
+    ids: IntArray  # (n,)
     since: str

@@ -1,6 +1,9 @@
-"""Time-stamped events: what the estimator takes in.
+"""Time-stamped events: what the estimator takes in, in the base frame, metres and radians.
 
-Their arrays are not copied: who has added an event must not change them any more.
+Each has ``stamp_ns``, its time of validity, and ``receive_ns``, when it was received by any clock
+that goes on steadily, or None. A covariance that is None, or all zero, is unknown. ``moved``
+brings an event into another frame. Arrays are not copied: who has added an event must not change
+them any more.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry import se3
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
@@ -25,29 +29,15 @@ FIRST_AUTOMATIC_ID = 10_000_000
 LAST_AUTOMATIC_ID = 2**24 - 1
 """They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
 
-AGREEING_STAMPS = 5
-"""How many stamps in a row must agree before a pause or a jump of the clock is believed."""
-
-NEAR_NS = 1_000_000_000
-"""Stamps nearer than this to the newest one tell of no pause or jump, nanoseconds."""
-
 
 @dataclass(frozen=True, slots=True)
 class VelocityEvent:
-    """Body velocity, held from its stamp until the next one.
+    """Body velocity (Ω, v) as in the paper's (9), held from its stamp until the next one.
 
     Attributes
     ----------
-    stamp_ns : int
-        Time of validity, nanoseconds.
-    body_velocity : FloatArray
-        (6,) angular then linear velocity (Ω, v) as in the paper's (9), in the base frame,
-        rad/s and m/s.
     covariance : FloatArray or None
-        (6, 6) covariance of ``body_velocity``, same order and units squared; None if unknown. A
-        part, angular or linear, of which it is all zero is unknown as well.
-    receive_ns : int or None
-        When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
+        A part of it, angular or linear, that is all zero is unknown as well.
     is_mean : bool
         Whether it is the mean velocity until the next one, as between two poses. Otherwise its
         error goes on while no other comes.
@@ -55,75 +45,78 @@ class VelocityEvent:
     """
 
     stamp_ns: int
-    body_velocity: FloatArray
-    covariance: FloatArray | None = None
+    body_velocity: FloatArray  # (6,)
+    covariance: FloatArray | None = None  # (6, 6)
     receive_ns: int | None = None
     is_mean: bool = False
+
+    def moved(self, pose: FloatArray) -> VelocityEvent:
+        """Return the velocity of the base, in which this event's frame has ``pose`` T (4, 4).
+
+        Both move as one rigid body, V_base = Ad_T V: where the frame turns off the base's origin,
+        the linear velocity has a lever arm.
+        """
+        Ad = se3.adjoint(pose)
+        covariance = self.covariance
+        if covariance is not None:
+            is_linear_known = covariance[3:, 3:].any()
+            covariance = Ad @ covariance @ Ad.T
+            if not is_linear_known:  # what the lever arm adds to it would pass for all of it
+                covariance[3:] = covariance[:, 3:] = 0.0
+        return replace(self, body_velocity=Ad @ self.body_velocity, covariance=covariance)
 
 
 @dataclass(frozen=True, slots=True)
 class AngularVelocityEvent:
-    """Angular velocity that takes the place of other velocities' angular part, as of an IMU.
+    """Angular velocity in place of other velocities' angular part, as of an IMU.
 
-    It does so from its stamp until the next one, for the settings' ``velocity_timeout`` at most.
-    Where no :class:`VelocityEvent` is in force it says nothing.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Time of validity, nanoseconds.
-    angular_velocity : FloatArray
-        (3,) in the base frame, rad/s.
-    covariance : FloatArray or None
-        (3, 3) its covariance, rad²/s²; None, or all zero, if unknown.
-    receive_ns : int or None
-        When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
-
+    Held from its stamp until the next one, for the settings' ``velocity_timeout`` at most; where
+    no :class:`VelocityEvent` is in force it says nothing.
     """
 
     stamp_ns: int
-    angular_velocity: FloatArray
-    covariance: FloatArray | None = None
+    angular_velocity: FloatArray  # (3,)
+    covariance: FloatArray | None = None  # (3, 3)
     receive_ns: int | None = None
+
+    def moved(self, pose: FloatArray) -> AngularVelocityEvent:
+        """Return it along the axes of the frame in which its own has ``pose`` (4, 4)."""
+        R, covariance = pose[:3, :3], self.covariance
+        return replace(
+            self,
+            angular_velocity=R @ self.angular_velocity,
+            covariance=None if covariance is None else R @ covariance @ R.T,
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class ObservationEvent:
-    """Landmarks seen at one instant.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Time of validity, nanoseconds.
-    ids : IntArray
-        (m,) landmark ids, :data:`UNKNOWN_ID` where the sensor gives none.
-    points : FloatArray
-        (m, 3) positions in the base frame, metres.
-    covariances : FloatArray or None
-        (m, 3, 3) covariance of each point in the base frame, m²; None if unknown, and all zero
-        for a point of which it is.
-    velocities : FloatArray or None
-        (m, 3) velocity of each landmark itself, expressed in the base frame, m/s (the paper's
-        v_i (19)); None for static landmarks.
-    sensor : FloatArray or None
-        (m, 3) where each was measured from, in the base frame, metres: noise grows with the
-        distance from there. None for the base itself.
-    receive_ns : int or None
-        When it was received, by any clock that goes on steadily, nanoseconds; None if unknown.
-
-    """
+    """Landmarks seen at one instant."""
 
     stamp_ns: int
-    ids: IntArray
-    points: FloatArray
-    covariances: FloatArray | None = None
-    velocities: FloatArray | None = None
+    ids: IntArray  # (m,) UNKNOWN_ID where the sensor gives none
+    points: FloatArray  # (m, 3)
+    covariances: FloatArray | None = None  # (m, 3, 3) of each point
+    velocities: FloatArray | None = None  # (m, 3) of each landmark itself (the paper's v_i (19))
+    # (m, 3) where each was measured from, by default from the base: noise grows with the distance.
     sensor: FloatArray | None = None
     receive_ns: int | None = None
 
+    def moved(self, pose: FloatArray) -> ObservationEvent:
+        """Return it in the frame in which its own has ``pose`` (4, 4)."""
+        R = pose[:3, :3]
+        sensor = np.zeros_like(self.points) if self.sensor is None else self.sensor
+        return replace(
+            self,
+            points=se3.transform(pose, self.points),
+            covariances=None if self.covariances is None else R @ self.covariances @ R.T,
+            velocities=None if self.velocities is None else se3.rotate(pose, self.velocities),
+            sensor=se3.transform(pose, sensor),
+        )
+
     @property
     def lines_of_sight(self) -> FloatArray:
-        """(m, 3) from the sensor to the points, metres, axes of the base frame."""
+        """(m, 3) from the sensor to the points."""
         return self.points if self.sensor is None else self.points - self.sensor
 
     def repeated_ids(self) -> list[int]:
@@ -134,7 +127,7 @@ class ObservationEvent:
         return [landmark_id for landmark_id, count in Counter(ids).items() if count > 1]
 
     def select(self, mask: BoolArray) -> ObservationEvent:
-        """Return the part of it that ``mask`` (m,) picks."""
+        """Return the points that ``mask`` (m,) picks."""
         if mask.all():
             return self
         return replace(
@@ -158,7 +151,7 @@ def is_automatic(ids: IntArray) -> BoolArray:
 
 
 def flatten(event: ObservationEvent) -> ObservationEvent:
-    """Return the observation without what leaves the plane z = 0; lines of sight stay."""
+    """Return the observation in the plane z = 0; lines of sight stay."""
     points = event.points * _PLANAR_POINT
     velocities = None if event.velocities is None else event.velocities * _PLANAR_POINT
     sensor = points - event.lines_of_sight if event.points[:, 2].any() else event.sensor
@@ -166,7 +159,7 @@ def flatten(event: ObservationEvent) -> ObservationEvent:
 
 
 def flatten_velocities(body_velocities: FloatArray) -> FloatArray:
-    """Return velocities (…, 6) without what leaves the plane z = 0 or turns out of it."""
+    """Return velocities (…, 6) in the plane z = 0."""
     flat: FloatArray = body_velocities * _PLANAR_VELOCITY
     return flat
 

@@ -20,7 +20,13 @@ from slam_observer_ros.settings.parameter_file import (
     names_of_others,
     read_parameter_file,
 )
-from slam_observer_ros.settings.parameter_table import from_parameters, Parameter, table, Value
+from slam_observer_ros.settings.parameter_table import (
+    Dataclass,
+    from_parameters,
+    Parameter,
+    table,
+    Value,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -31,23 +37,29 @@ _ROS_NAMES = ('use_sim_time', 'qos_overrides.', 'start_type_description_service'
 """Parameters that every ROS node has; a name that ends with a dot stands for all below it."""
 
 
-def add_settings_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config``, ``--gains`` and ``--set``."""
-    gains = next(row for row in table(Settings) if row.name == 'gains')
+def add_settings_options(parser: argparse.ArgumentParser, *others: type[Dataclass]) -> None:
+    """Add ``--config``, ``--gains`` and ``--set``, with the names in the tables that it takes."""
+    rows = [*table(Settings), *(row for other in others for row in table(other))]
+    gains = next(row for row in rows if row.name == 'gains')
     group = parser.add_argument_group('estimator')
     group.add_argument(
         '--config',
         metavar='FILE',
         help="the observer node's parameter file, or the name of one that comes with the package",
     )
-    group.add_argument('--gains', choices=gains.choices, help='gain design')
+    group.add_argument('--gains', choices=gains.choices, help='what sets the gains')
     group.add_argument(
         '--set',
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='set any other parameter of the estimator; may be given several times',
+        help='set a parameter; may be given several times',
     )
+    basic, advanced = (
+        ', '.join(row.name for row in rows if row.basic == is_basic) for is_basic in (True, False)
+    )
+    parser.add_argument_group('parameters that a robot needs first', basic)
+    parser.add_argument_group('advanced parameters', advanced)
 
 
 def read_settings(

@@ -12,16 +12,7 @@ class ParameterError(SlamObserverError):
 
 
 class InvalidEventError(SlamObserverError):
-    """An event can't be used and is dropped whole.
-
-    Parameters
-    ----------
-    reason : str
-        Short key under which the event is counted, for example ``'not_finite'``.
-    message : str
-        What is wrong, for the log.
-
-    """
+    """An event can't be used and is dropped whole, and counted under the key ``reason``."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -33,7 +24,7 @@ class SmoothingError(SlamObserverError):
 
 
 class MessageError(SlamObserverError):
-    """A ROS message is malformed or lacks a field that is needed."""
+    """A ROS message is malformed or has not a field that is needed."""
 
 
 class RecordingError(SlamObserverError):

@@ -10,14 +10,7 @@ from pathlib import Path
 
 
 def destination(path: Path) -> Path:
-    """Return which file to replace so that ``path`` has new content; links stay what they are.
-
-    Raises
-    ------
-    OSError
-        If there is something, and it is no file: a pipe, a device or a link to itself.
-
-    """
+    """Return which file to replace for new content; links stay. What is no file is an OSError."""
     target = Path(os.path.realpath(path))
     if target.is_symlink() or (target.exists() and not target.is_file()):
         raise FileExistsError(errno.EEXIST, 'it is there, and no regular file', str(path))
@@ -26,14 +19,7 @@ def destination(path: Path) -> Path:
 
 @contextmanager
 def unfinished_file(path: Path) -> Iterator[Path]:
-    """Give a file to write, which becomes ``path`` at the end, or goes if there is an error.
-
-    Raises
-    ------
-    OSError
-        If ``path`` can't be replaced.
-
-    """
+    """Give a file to write that becomes ``path`` at the end, or goes if there is an error."""
     target = destination(path)
     unfinished = target.with_name(f'.{target.name}.{os.getpid()}')
     try:

@@ -13,8 +13,8 @@ CHOICES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'BLIS_N
 def use_one_thread() -> None:
     """Let numpy and SciPy, once imported, compute in one thread, unless the environment says more.
 
-    The matrices here are small: several threads wait for each other longer than they compute, on
-    a busy machine ten times longer, and take the processor from the robot's other programs.
+    The matrices are small: several threads wait for each other longer than they compute, up to
+    ten times on a busy machine, and take the processor from the robot's other programs.
     """
     if not any(name in os.environ for name in CHOICES):
         threadpool_limits(1)

@@ -1,4 +1,4 @@
-"""Types shared by the whole package: arrays, and what never changes."""
+"""Arrays, and what never changes."""
 
 from __future__ import annotations
 

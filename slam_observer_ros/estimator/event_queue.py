@@ -7,20 +7,21 @@ from hashlib import blake2b
 import heapq
 from typing import TypeAlias
 
+from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import AGREEING_STAMPS, Event, NEAR_NS, ObservationEvent
+from slam_observer_ros.events import Event, ObservationEvent
 
 Key: TypeAlias = tuple[int, bool, bytes]
 
 RECENT = 1000
-"""Events that tell how far ahead of their reception stamps are.
+"""Events from which it is known how far ahead of their reception stamps are.
 
-More than inputs keep while the node is busy: those were received late, and tell of no delay.
+More than inputs keep while the node is busy: those were received late, and show no delay.
 """
 
 HELD_UP_NS = 250_000_000
-"""Stamps far behind that are received so soon after one in time tell of no jump of the clock."""
+"""Stamps far behind that are received so soon after one in time are of no jump of the clock."""
 
 MIN_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
@@ -40,10 +41,10 @@ class EventQueue:
     events come that seldom. How long it may be is not limited by ``max_jump_ns`` if nothing was
     received for as long: then it was a silence, not the clock.
 
-    Stamps behind all others are refused. ``AGREEING_STAMPS`` in a row tell that the clock has
-    jumped back, but only where those of one kind of event go back themselves, as a sensor that is
-    always too late goes on from its own last stamp, and not right after an event that is in time:
-    then they were held up on the way, and come in a burst.
+    Stamps behind all others are refused. ``AGREEING_STAMPS`` in a row are a jump of the clock,
+    but only where those of one kind of event go back themselves, as a sensor that is always too
+    late goes on from its own last stamp, and not right after an event that is in time: then they
+    were held up on the way, and come in a burst.
 
     Parameters
     ----------
@@ -66,19 +67,15 @@ class EventQueue:
         self._max_jump_ns = max_jump_ns
         self._reach_ns = window_ns + late_limit_ns
         self._near_ns = max(self._reach_ns, NEAR_NS)
-        self._heap: list[tuple[Key, Event]] = []
-        self._known: set[Key] = set()
-        self._most_known = MIN_KNOWN
-        self._strays: set[int] = set()
-        self._stray_ns = 0
+        # How far ahead a stamp may be that is believed at once.
+        self._usual_ns = min(self._near_ns, max_jump_ns)
+        self._events = _SortedEvents()
+        self._reception = _Reception()
+        self._strays = StrayStamps()
         # Newest stamp of each kind of event that was not ahead of all others.
         self._newest_of_kind_ns: dict[type, int] = {}
         # The newest stamp that is taken, believed or not.
         self._lead_ns = 0
-        # How far ahead a stamp may be that is believed at once.
-        self._usual_ns = min(self._near_ns, max_jump_ns)
-        self._ahead_of_reception_ns: deque[int] = deque(maxlen=RECENT)
-        self._in_time_receive_ns: int | None = None
         self.newest_ns: int | None = None
 
     def push(self, event: Event) -> bool:
@@ -91,89 +88,66 @@ class EventQueue:
             is already known (``'duplicate'``).
 
         """
-        stamp_ns = event.stamp_ns
         if self.newest_ns is None:
-            self.newest_ns = self._lead_ns = stamp_ns
-        ahead_ns = stamp_ns - self.newest_ns
+            self.newest_ns = self._lead_ns = event.stamp_ns
+        ahead_ns = event.stamp_ns - self.newest_ns
         too_late = ahead_ns < -self._reach_ns
         if -self._near_ns <= ahead_ns <= self._usual_ns:
             if too_late:
                 raise _refusal(ahead_ns)
-            self._insert(event)
-            self._note_reception(event)
-            self._note_kind(event)
-            self._strays.clear()
-            self._believe(max(self.newest_ns, stamp_ns))
+            self._take_in_time(event, self.newest_ns)
             return False
-        too_early = stamp_ns > self._lead_ns + self._max_jump_ns and not self._was_silent(event)
-        if too_late or too_early:
-            is_no_jump = too_late and (self._note_kind(event) or self._is_held_up(event))
-            if not is_no_jump and self._count_stray(stamp_ns):
+        if too_late or self._is_too_early(event):
+            # One that is no sign of a jump is not counted.
+            is_no_jump = too_late and (self._is_newest_of_kind(event) or self._is_held_up(event))
+            if not is_no_jump and self._count_stray(event.stamp_ns, self.newest_ns):
                 return True
             raise _refusal(ahead_ns)
-        self._insert(event)
-        self._lead_ns = max(self._lead_ns, stamp_ns)
-        if self._count_stray(stamp_ns):
-            self._note_reception(event)
-            self._believe(self._lead_ns)
+        self._take_ahead(event, self.newest_ns)
         return False
 
     def pop_ready(self) -> list[Event]:
         """Give out, in order, the events that have left the window."""
-        return self._pop_until((self.newest_ns or 0) - self._window_ns)
+        return self._events.pop_until((self.newest_ns or 0) - self._window_ns)
 
     def pop_believed(self) -> list[Event]:
         """Give out, in order, all events but those with a stamp that waits for others."""
-        return self._pop_until(self.newest_ns or 0)
+        return self._events.pop_until(self.newest_ns or 0)
 
     def pop_all(self) -> list[Event]:
         """Give out all events that are left, in order."""
-        return [heapq.heappop(self._heap)[1] for _ in range(len(self._heap))]
+        return self._events.pop_all()
 
-    def _pop_until(self, stamp_ns: int) -> list[Event]:
-        events = []
-        while self._heap and self._heap[0][0][0] <= stamp_ns:
-            events.append(heapq.heappop(self._heap)[1])
-        return events
+    def _take_in_time(self, event: Event, newest_ns: int) -> None:
+        self._events.insert(event, newest_ns - self._reach_ns)
+        self._reception.note(event)
+        self._is_newest_of_kind(event)
+        self._strays.clear()
+        self._believe(max(newest_ns, event.stamp_ns), newest_ns)
 
-    def _insert(self, event: Event) -> None:
-        key = _key(event)
-        if key in self._known:
-            raise InvalidEventError('duplicate', 'this event is already known')
-        self._known.add(key)
-        heapq.heappush(self._heap, (key, event))
-        if len(self._known) > self._most_known:
-            self._forget_old()
+    def _take_ahead(self, event: Event, newest_ns: int) -> None:
+        """Keep an event far ahead; believe its stamp if enough agree."""
+        self._events.insert(event, newest_ns - self._reach_ns)
+        self._lead_ns = max(self._lead_ns, event.stamp_ns)
+        if self._count_stray(event.stamp_ns, newest_ns):
+            self._reception.note(event)
+            self._believe(self._lead_ns, newest_ns)
 
-    def _forget_old(self) -> None:
-        """Forget events so old that they would be refused as too late; O(1) for each event."""
-        oldest_ns = (self.newest_ns or 0) - self._reach_ns
-        self._known = {key for key in self._known if key[0] >= oldest_ns}
-        self._most_known = max(2 * len(self._known), MIN_KNOWN)
-
-    def _note_reception(self, event: Event) -> None:
-        if event.receive_ns is not None:
-            self._ahead_of_reception_ns.append(event.stamp_ns - event.receive_ns)
-            self._in_time_receive_ns = event.receive_ns
-
-    def _was_silent(self, event: Event) -> bool:
-        """Return whether the time of reception has gone on as far as the stamp, or nearly."""
-        if event.receive_ns is None or not self._ahead_of_reception_ns:
-            return False
-        expected_ns = event.receive_ns + max(self._ahead_of_reception_ns)
-        return event.stamp_ns <= expected_ns + self._max_jump_ns
-
-    def _believe(self, newest_ns: int) -> None:
-        step_ns = newest_ns - (self.newest_ns or 0)
+    def _believe(self, stamp_ns: int, newest_ns: int) -> None:
+        step_ns = stamp_ns - newest_ns
         if step_ns > 0:
             self._usual_ns = min(max(self._near_ns, 2 * step_ns), self._max_jump_ns)
-        self.newest_ns = self._lead_ns = newest_ns
+        self.newest_ns = self._lead_ns = stamp_ns
 
-    def _note_kind(self, event: Event) -> bool:
-        """Note the newest stamp of each kind of event; return whether this one is, as the first.
+    def _is_too_early(self, event: Event) -> bool:
+        """Return whether a stamp is further ahead than a pause, or silence, can explain."""
+        if event.stamp_ns <= self._lead_ns + self._max_jump_ns:
+            return False
+        expected_ns = self._reception.expected_ns(event)
+        return expected_ns is None or event.stamp_ns > expected_ns + self._max_jump_ns
 
-        Else those of its kind have gone back.
-        """
+    def _is_newest_of_kind(self, event: Event) -> bool:
+        """Note the stamp if it is the newest of its kind; if not, that kind has gone back."""
         kind = type(event)
         is_newest = event.stamp_ns > self._newest_of_kind_ns.get(kind, event.stamp_ns - 1)
         if is_newest:
@@ -182,25 +156,72 @@ class EventQueue:
 
     def _is_held_up(self, event: Event) -> bool:
         """Return whether an event was received right after one that was in time."""
-        if event.receive_ns is None or self._in_time_receive_ns is None:
-            return False
-        return 0 <= event.receive_ns - self._in_time_receive_ns < HELD_UP_NS
+        since_ns = self._reception.since_in_time_ns(event)
+        return since_ns is not None and 0 <= since_ns < HELD_UP_NS
 
-    def _count_stray(self, stamp_ns: int) -> bool:
-        """Count a stamp far from the newest one; return whether enough have agreed on it now.
+    def _count_stray(self, stamp_ns: int, newest_ns: int) -> bool:
+        """Count a stamp far from the newest one; return whether enough agree with it now."""
+        if (last_ns := self._strays.last_ns) is not None:
+            same_side = (stamp_ns > newest_ns) == (last_ns > newest_ns)
+            if not (same_side and abs(stamp_ns - last_ns) <= self._max_jump_ns):
+                self._strays.clear()
+        return self._strays.add(stamp_ns)
 
-        Events of one stamp count once: they may be of one message.
-        """
-        newest_ns = self.newest_ns or 0
-        same_side = (stamp_ns > newest_ns) == (self._stray_ns > newest_ns)
-        if not (same_side and abs(stamp_ns - self._stray_ns) <= self._max_jump_ns):
-            self._strays.clear()
-        self._strays.add(stamp_ns)
-        self._stray_ns = stamp_ns
-        if len(self._strays) < AGREEING_STAMPS:
-            return False
-        self._strays.clear()
-        return True
+
+class _SortedEvents:
+    """Events in stamp order, each of them once."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[Key, Event]] = []
+        self.known: set[Key] = set()
+        self._most_known = MIN_KNOWN
+
+    def insert(self, event: Event, oldest_ns: int) -> None:
+        """Add an event; raise InvalidEventError if it is known. None before ``oldest_ns`` come."""
+        key = _key(event)
+        if key in self.known:
+            raise InvalidEventError('duplicate', 'this event is already known')
+        self.known.add(key)
+        heapq.heappush(self._heap, (key, event))
+        if len(self.known) > self._most_known:  # O(1) for each event
+            self.known = {key for key in self.known if key[0] >= oldest_ns}
+            self._most_known = max(2 * len(self.known), MIN_KNOWN)
+
+    def pop_until(self, stamp_ns: int) -> list[Event]:
+        """Give out the events up to a stamp."""
+        events = []
+        while self._heap and self._heap[0][0][0] <= stamp_ns:
+            events.append(heapq.heappop(self._heap)[1])
+        return events
+
+    def pop_all(self) -> list[Event]:
+        """Give out all events."""
+        return [heapq.heappop(self._heap)[1] for _ in range(len(self._heap))]
+
+
+class _Reception:
+    """When events that were believed were received, beside their stamps."""
+
+    def __init__(self) -> None:
+        self._ahead_ns: deque[int] = deque(maxlen=RECENT)
+        self._last_ns: int | None = None
+
+    def note(self, event: Event) -> None:
+        if event.receive_ns is not None:
+            self._ahead_ns.append(event.stamp_ns - event.receive_ns)
+            self._last_ns = event.receive_ns
+
+    def expected_ns(self, event: Event) -> int | None:
+        """Return the newest stamp that can be received when this event was; None if unknown."""
+        if event.receive_ns is None or not self._ahead_ns:
+            return None
+        return event.receive_ns + max(self._ahead_ns)
+
+    def since_in_time_ns(self, event: Event) -> int | None:
+        """Return how long after the last one noted an event was received; None if unknown."""
+        if event.receive_ns is None or self._last_ns is None:
+            return None
+        return event.receive_ns - self._last_ns
 
 
 def _key(event: Event) -> Key:

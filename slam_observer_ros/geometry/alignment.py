@@ -17,27 +17,13 @@ _ROUNDING = 1e-14
 def rigid_alignment(
     source: FloatArray, target: FloatArray, weights: FloatArray | None = None
 ) -> FloatArray:
-    """Find the rigid motion that brings ``source`` closest to ``target`` in least squares.
+    """Return T (4, 4) with target ≈ T source in least squares, for points (n, 3), n ≥ 1, metres.
 
     A proper rotation even where a reflection would fit better. What the points leave open stays
     as it is: of all best rotations the one nearest to the identity is returned, so collinear
     points cause no roll about their line, and one point is only shifted. Sets that are both flat
     in z turn about the vertical only, as turned over they would be their own mirror images.
-
-    Parameters
-    ----------
-    source : FloatArray
-        (n, 3) points to be moved, metres; at least one.
-    target : FloatArray
-        (n, 3) points to be met, in the same order, metres.
-    weights : FloatArray, optional
-        (n,) how much each squared distance counts, positive; by default all the same.
-
-    Returns
-    -------
-    FloatArray
-        (4, 4) transform T with ``target ≈ T source``.
-
+    ``weights`` (n,) > 0 say how much each squared distance counts; all the same by default.
     """
     weights = np.ones(len(source)) if weights is None else weights
     source_centre = np.average(source, axis=0, weights=weights)

@@ -1,4 +1,4 @@
-"""Which coordinates a gain design estimates: all of 3D, or those of planar motion."""
+"""The coordinates that a filter estimates: all of 3D, or those of planar motion."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ class Axes(Immutable):
 
     Attributes
     ----------
-    pose : slice
-        Axes of the pose error ε = (Ω, v).
-    p : int
-        How many these are.
+    pose, p : slice, int
+        Axes of the pose error ε = (Ω, v), and how many these are.
     point : int
         Leading axes of a point, 2 or 3.
 

@@ -9,7 +9,7 @@ from slam_observer_ros.common.types import FloatArray
 
 
 def transpose(M: FloatArray) -> FloatArray:
-    """Transpose each matrix of a stack: shape (..., m, n) to (..., n, m)."""
+    """Transpose each matrix of a stack (…, m, n)."""
     transposed: FloatArray = M.swapaxes(-1, -2)
     return transposed
 
@@ -23,11 +23,7 @@ def symmetric(P: FloatArray) -> FloatArray:
 def solve(S: FloatArray, right: FloatArray) -> FloatArray:
     """Return S⁻¹ b for S (q, q) and b (q, …), as `numpy.linalg.solve` does at twice the cost.
 
-    Raises
-    ------
-    LinAlgError
-        If S is singular.
-
+    A singular S raises LinAlgError.
     """
     if not right.size:  # which SciPy does not take
         return right
@@ -76,7 +72,7 @@ def diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
 
 
 def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
-    """Return covariances (..., d, d) without variances that would drown all others in rounding.
+    """Return covariances (…, d, d) without variances that would drown all others in rounding.
 
     Standard deviations are at most ``largest`` (d,); the correlations stay.
     """

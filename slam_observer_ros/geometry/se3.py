@@ -1,4 +1,7 @@
-"""Poses SE(3) as 4×4 homogeneous matrices (3); twists (Ω, v), angular part first (9)."""
+"""Poses T (…, 4, 4), homogeneous matrices (3); twists ξ = (Ω, v) (…, 6), angular part first (9).
+
+A twist here is times a time: rad and m.
+"""
 
 from __future__ import annotations
 
@@ -23,21 +26,7 @@ _IDENTITY = np.eye(4)
 
 
 def pose(R: FloatArray, x: FloatArray) -> FloatArray:
-    """Homogeneous matrix [[R, x], [0, 1]] (3).
-
-    Parameters
-    ----------
-    R : FloatArray, shape (..., 3, 3)
-        Rotation matrix.
-    x : FloatArray, shape (..., 3)
-        Translation, m.
-
-    Returns
-    -------
-    FloatArray, shape (..., 4, 4)
-        Pose.
-
-    """
+    """Return the pose [[R, x], [0, 1]] (3) of a rotation R and a translation x (…, 3)."""
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3] = R
     T[..., :3, 3] = x
@@ -46,57 +35,19 @@ def pose(R: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def from_rpy(values: tuple[float, ...]) -> FloatArray:
-    """Pose of a position and angles about fixed axes, as URDF has it.
-
-    Parameters
-    ----------
-    values : tuple of float
-        x y z in metres, then roll pitch yaw in radians.
-
-    Returns
-    -------
-    FloatArray, shape (4, 4)
-        Pose.
-
-    """
+    """Return the pose of x y z and roll pitch yaw about fixed axes, as URDF has them."""
     roll, pitch, yaw = np.diag(values[3:])
     return pose(so3.exp(yaw) @ so3.exp(pitch) @ so3.exp(roll), np.array(values[:3]))
 
 
 def inverse(T: FloatArray) -> FloatArray:
-    """Inverse pose [[Rᵀ, −Rᵀ x], [0, 1]].
-
-    Parameters
-    ----------
-    T : FloatArray, shape (..., 4, 4)
-        Pose.
-
-    Returns
-    -------
-    FloatArray, shape (..., 4, 4)
-        Inverse pose.
-
-    """
+    """Return T⁻¹ = [[Rᵀ, −Rᵀ x], [0, 1]]."""
     R_transposed = transpose(T[..., :3, :3])
     return pose(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
 
 
 def transform(T: FloatArray, points: FloatArray) -> FloatArray:
-    """Move points: R p + x, the homogeneous product T p̄.
-
-    Parameters
-    ----------
-    T : FloatArray, shape (..., 4, 4)
-        Pose.
-    points : FloatArray, shape (..., n, 3)
-        Points, m.
-
-    Returns
-    -------
-    FloatArray, shape (..., n, 3)
-        Points in the frame that T maps to, m.
-
-    """
+    """Move points (…, n, 3): R p + x, the homogeneous product T p̄."""
     moved = rotate(T, points)
     # In place: a second array of 10 000 points or more costs several times the sum itself.
     moved += T[..., None, :3, 3]
@@ -104,90 +55,28 @@ def transform(T: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def rotate(T: FloatArray, directions: FloatArray) -> FloatArray:
-    """Turn directions: R v, the homogeneous product with a zero in the fourth entry (6).
-
-    Parameters
-    ----------
-    T : FloatArray, shape (..., 4, 4)
-        Pose.
-    directions : FloatArray, shape (..., n, 3)
-        Velocities or differences of points.
-
-    Returns
-    -------
-    FloatArray, shape (..., n, 3)
-        Directions in the frame that T maps to.
-
-    """
+    """Turn directions (…, n, 3): R v, the product T v⃗ with a zero in the fourth entry (6)."""
     return directions @ transpose(T[..., :3, :3])
 
 
 def hat(xi: FloatArray) -> FloatArray:
-    """Matrix (Ω, v)_∧ = [[Ω_×, v], [0, 0]] of a twist (9).
-
-    Parameters
-    ----------
-    xi : FloatArray, shape (..., 6)
-        Twist (Ω, v).
-
-    Returns
-    -------
-    FloatArray, shape (..., 4, 4)
-        Element of se(3).
-
-    """
+    """Return the matrix (Ω, v)_∧ = [[Ω_×, v], [0, 0]] (…, 4, 4) of a twist (9)."""
     return (xi @ _HAT).reshape((*xi.shape[:-1], 4, 4))
 
 
 def vee(V: FloatArray) -> FloatArray:
-    """Twist of a matrix of se(3): the inverse of `hat`.
-
-    Parameters
-    ----------
-    V : FloatArray, shape (..., 4, 4)
-        Element of se(3).
-
-    Returns
-    -------
-    FloatArray, shape (..., 6)
-        Twist (Ω, v).
-
-    """
+    """Return the twist of a matrix of se(3): the inverse of `hat`."""
     return np.concatenate([so3.vee(V), V[..., :3, 3]], axis=-1)
 
 
 def flatten(T: FloatArray) -> FloatArray:
-    """Pose at the same x, y and yaw, with no height, roll and pitch.
-
-    Parameters
-    ----------
-    T : FloatArray, shape (4, 4)
-        Pose.
-
-    Returns
-    -------
-    FloatArray, shape (4, 4)
-        Pose in the plane z = 0.
-
-    """
+    """Return the pose (4, 4) at the same x, y and yaw, with no height, roll and pitch."""
     yaw = np.arctan2(T[1, 0], T[0, 0])
     return pose(so3.exp(np.array([0.0, 0.0, yaw])), T[:3, 3] * np.array([1.0, 1.0, 0.0]))
 
 
 def project(M: FloatArray) -> FloatArray:
-    """Orthogonal (Frobenius) projection onto se(3): [[(M₁ − M₁ᵀ) / 2, m₂], [0, 0]] (10).
-
-    Parameters
-    ----------
-    M : FloatArray, shape (..., 4, 4)
-        Any matrix.
-
-    Returns
-    -------
-    FloatArray, shape (..., 4, 4)
-        Element of se(3).
-
-    """
+    """Project (…, 4, 4) orthogonally onto se(3): [[(M₁ − M₁ᵀ) / 2, m₂], [0, 0]] (10)."""
     V = np.zeros_like(M)
     V[..., :3, :3] = 0.5 * (M[..., :3, :3] - transpose(M[..., :3, :3]))
     V[..., :3, 3] = M[..., :3, 3]
@@ -195,19 +84,7 @@ def project(M: FloatArray) -> FloatArray:
 
 
 def exp(xi: FloatArray) -> FloatArray:
-    """Return the pose I + V + b V² + c V³ of V = (Ω, v)_∧, with b and c as in `so3`.
-
-    Parameters
-    ----------
-    xi : FloatArray, shape (..., 6)
-        Twist times time (Ω, v), rad and m.
-
-    Returns
-    -------
-    FloatArray, shape (..., 4, 4)
-        Pose.
-
-    """
+    """Return the pose I + V + b V² + c V³ of V = (Ω, v)_∧, with b and c as in `so3`."""
     V = hat(xi)
     theta_squared, a, b = so3.coefficients(xi[..., :3])
     # 1 − a cancels near zero, but V³ = O(θ²) takes the error back to rounding.
@@ -217,75 +94,28 @@ def exp(xi: FloatArray) -> FloatArray:
 
 
 def log(T: FloatArray) -> FloatArray:
-    """Twist (φ, J(φ)⁻¹ x) of a pose, |φ| ≤ π: the inverse of `exp`.
-
-    Parameters
-    ----------
-    T : FloatArray, shape (..., 4, 4)
-        Pose.
-
-    Returns
-    -------
-    FloatArray, shape (..., 6)
-        Twist (Ω, v), rad and m.
-
-    """
+    """Return the twist (φ, J(φ)⁻¹ x) of a pose, |φ| ≤ π: the inverse of `exp`."""
     phi = so3.log(T[..., :3, :3])
     v = so3.left_jacobian_inverse(phi) @ T[..., :3, 3:]
     return np.concatenate([phi, v[..., 0]], axis=-1)
 
 
 def adjoint(T: FloatArray) -> FloatArray:
-    """Matrix of Ad_T V = T V T⁻¹ on twists (Ω, v): [[R, 0], [x_× R, R]].
-
-    Parameters
-    ----------
-    T : FloatArray, shape (..., 4, 4)
-        Pose.
-
-    Returns
-    -------
-    FloatArray, shape (..., 6, 6)
-        Adjoint matrix.
-
-    """
+    """Return the matrix (…, 6, 6) of Ad_T V = T V T⁻¹ on twists: [[R, 0], [x_× R, R]]."""
     R = T[..., :3, :3]
     return _lower_triangular(R, so3.hat(T[..., :3, 3]) @ R)
 
 
 def left_jacobian(xi: FloatArray) -> FloatArray:
-    """Left Jacobian [[J, 0], [Q, J]] of SE(3): exp(ξ + δ) = exp(J(ξ) δ) exp(ξ) to first order.
+    """Return [[J, 0], [Q, J]] (…, 6, 6) with exp(ξ + δ) = exp(J(ξ) δ) exp(ξ) to first order.
 
     Q is the derivative of J(φ) = I + b K + c K² of SO(3) along v: twists are dual vectors φ + ε v.
-
-    Parameters
-    ----------
-    xi : FloatArray, shape (..., 6)
-        Twist times time (Ω, v), rad and m.
-
-    Returns
-    -------
-    FloatArray, shape (..., 6, 6)
-        Left Jacobian.
-
     """
     return _lower_triangular(so3.left_jacobian(xi[..., :3]), _jacobian_coupling(xi))
 
 
 def left_jacobian_inverse(xi: FloatArray) -> FloatArray:
-    """Inverse of `left_jacobian` for |Ω| < 2π: [[J⁻¹, 0], [−J⁻¹ Q J⁻¹, J⁻¹]].
-
-    Parameters
-    ----------
-    xi : FloatArray, shape (..., 6)
-        Twist times time (Ω, v), rad and m.
-
-    Returns
-    -------
-    FloatArray, shape (..., 6, 6)
-        Inverse left Jacobian.
-
-    """
+    """Return [[J⁻¹, 0], [−J⁻¹ Q J⁻¹, J⁻¹]], the inverse of `left_jacobian` for |Ω| < 2π."""
     J_inverse = so3.left_jacobian_inverse(xi[..., :3])
     return _lower_triangular(J_inverse, -J_inverse @ _jacobian_coupling(xi) @ J_inverse)
 

@@ -1,8 +1,7 @@
 """The group SLAM_n(3), the spaces it acts on, its actions, and the lifted SLAM kinematics.
 
 The paper writes A p̄ for points and A v⃗ for directions; here these are `se3.transform` and
-`se3.rotate`. All functions take n = 0, 1 or many landmarks and any leading axes.
-
+`se3.rotate`. All functions take n = 0, 1 or many landmarks and any leading axes; metres, rad, s.
 Of these the package only uses `exp`, at each correction by Riccati gains that map. The rest is
 what the paper states; tests hold :class:`slam_observer_ros.observer.observer.Observer` against it.
 """
@@ -22,70 +21,40 @@ _IDENTITY = np.eye(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlamElement:
-    """Element X = (A, a_1, …, a_n) of SLAM_n(3), or a stack of them.
+    """Element X = (A, a_1, …, a_n) of SLAM_n(3), or a stack of them: a pose and translations."""
 
-    Attributes
-    ----------
-    A : FloatArray, shape (..., 4, 4)
-        Pose part.
-    a : FloatArray, shape (..., n, 3)
-        Translations of the landmarks, m.
-
-    """
-
-    A: FloatArray
-    a: FloatArray
+    A: FloatArray  # (…, 4, 4)
+    a: FloatArray  # (…, n, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TotalState:
     """Raw coordinates Ξ = (P, p_1, …, p_n) in the total space T_n(3), or a stack of them.
 
-    Attributes
-    ----------
-    P : FloatArray, shape (..., 4, 4)
-        Pose of the robot, body → world.
-    p : FloatArray, shape (..., n, 3)
-        Landmarks in the world frame, m.
-
+    P is the robot's pose, body → world, and p are the landmarks in the world frame.
     """
 
-    P: FloatArray
-    p: FloatArray
+    P: FloatArray  # (…, 4, 4)
+    p: FloatArray  # (…, n, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlamVelocity:
     """Input u = (V, v_1, …, v_n) of the SLAM kinematics, in body coordinates (19).
 
-    Attributes
-    ----------
-    V : FloatArray, shape (..., 6)
-        Twist (Ω, v) of the robot, rad/s and m/s.
-    v : FloatArray, shape (..., n, 3)
-        Velocities of the landmarks themselves, m/s; zero in a static scene.
-
+    V is the twist (Ω, v) of the robot; v are velocities of the landmarks, zero in a static scene.
     """
 
-    V: FloatArray
-    v: FloatArray
+    V: FloatArray  # (…, 6)
+    v: FloatArray  # (…, n, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tangent:
-    """Time derivative of a `TotalState` or of a `SlamElement`, as matrices.
+    """Time derivative of a `TotalState` or `SlamElement`: matrices Ṗ or Ȧ, vectors ṗ_i or ȧ_i."""
 
-    Attributes
-    ----------
-    pose_rate : FloatArray, shape (..., 4, 4)
-        Ṗ or Ȧ.
-    point_rates : FloatArray, shape (..., n, 3)
-        ṗ_i or ȧ_i, m/s.
-
-    """
-
-    pose_rate: FloatArray
-    point_rates: FloatArray
+    pose_rate: FloatArray  # (…, 4, 4)
+    point_rates: FloatArray  # (…, n, 3)
 
 
 def identity(n: int) -> SlamElement:
@@ -109,19 +78,6 @@ def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
 
     With held body velocity and landmark velocities, `compose(X, exp(V dt, v dt))` solves the
     lifted kinematics exactly over dt.
-
-    Parameters
-    ----------
-    Delta : FloatArray, shape (..., 6)
-        Twist (Ω_Δ, v_Δ), rad and m.
-    d : FloatArray, shape (..., n, 3)
-        Translations, m.
-
-    Returns
-    -------
-    SlamElement
-        Element of SLAM_n(3).
-
     """
     phi, v = Delta[..., :3], Delta[..., 3:, None]
     J = so3.left_jacobian(phi)
@@ -136,7 +92,7 @@ def alpha(S: FloatArray, Xi: TotalState) -> TotalState:
 
 
 def output(Xi: TotalState) -> FloatArray:
-    """Observations y_i = P⁻¹ p_i of the landmarks in the body frame, shape (..., n, 3), m (15)."""
+    """Observations y_i = P⁻¹ p_i of the landmarks in the body frame (15)."""
     return se3.transform(se3.inverse(Xi.P), Xi.p)
 
 
@@ -146,25 +102,13 @@ def configuration(Xi: TotalState) -> TotalState:
 
 
 def same_configuration(Xi: TotalState, other: TotalState, tolerance_m: float) -> bool:
-    """Tell whether two raw states differ by a change of reference frame only (13).
-
-    Parameters
-    ----------
-    Xi, other : TotalState
-        Raw states with the same number of landmarks.
-    tolerance_m : float
-        Largest difference allowed in any coordinate of the representatives, m.
-
-    """
+    """Return whether two states, to ``tolerance_m``, differ by a change of frame only (13)."""
     difference = configuration(Xi).p - configuration(other).p
     return bool(np.all(np.abs(difference) <= tolerance_m))
 
 
 def phi_total(X: SlamElement, Xi: TotalState) -> TotalState:
-    """Right action Φ((A, a_i), (P, p_i)) = (P A, p_i + R_P a_i) on the total space.
-
-    It is what (24) calls Φ_X.
-    """
+    """Right action Φ((A, a_i), (P, p_i)) = (P A, p_i + R_P a_i) on the total space, (24)."""
     return TotalState(Xi.P @ X.A, Xi.p + se3.rotate(Xi.P, X.a))
 
 

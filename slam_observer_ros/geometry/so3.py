@@ -1,4 +1,4 @@
-"""Rotations SO(3) as 3×3 matrices; rotation vectors φ = θ·axis in radians; quaternions xyzw.
+"""Rotations R (…, 3, 3); rotation vectors φ (…, 3), rad; quaternions xyzw (…, 4), as ROS has them.
 
 With K = φ_× and θ = |φ|, all maps are polynomials in K whose coefficients are
 
@@ -29,53 +29,20 @@ _ZERO_GUARD = 1e-300
 
 
 def hat(phi: FloatArray) -> FloatArray:
-    """Skew matrix φ_× with φ_× w = φ × w (7).
-
-    Parameters
-    ----------
-    phi : FloatArray, shape (..., 3)
-        Vector.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3, 3)
-        Skew-symmetric matrix.
-
-    """
+    """Return the skew matrix φ_× (…, 3, 3) with φ_× w = φ × w (7)."""
     # One small product with the basis of so(3) costs a third of six indexed assignments.
     return (phi @ _HAT).reshape((*phi.shape[:-1], 3, 3))
 
 
 def vee(K: FloatArray) -> FloatArray:
-    """Vector of a skew matrix: the inverse of `hat`.
-
-    Parameters
-    ----------
-    K : FloatArray, shape (..., 3, 3)
-        Skew-symmetric matrix; only the entries (2, 1), (0, 2), (1, 0) are read.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3)
-        Vector.
-
-    """
+    """Return the vector of a skew matrix, the inverse of `hat`; reads (2, 1), (0, 2), (1, 0)."""
     return K[..., (2, 0, 1), (1, 2, 0)]
 
 
 def coefficients(phi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return θ², a = sin θ / θ and b = (1 − cos θ) / θ², exact to rounding at any angle.
+    """Return θ² (≥ 1e-300, as it may divide), a and b, exact to rounding at any angle.
 
-    Parameters
-    ----------
-    phi : FloatArray, shape (..., 3)
-        Rotation vector, rad.
-
-    Returns
-    -------
-    tuple of three FloatArray, shape (..., 1, 1)
-        θ² (at least 1e-300, so that it may divide), a, b; shaped to scale matrices.
-
+    Each is (…, 1, 1), to scale matrices.
     """
     theta_squared = phi[..., None, :] @ phi[..., :, None] + _ZERO_GUARD
     half = 0.5 * np.sqrt(theta_squared)
@@ -84,40 +51,17 @@ def coefficients(phi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def exp(phi: FloatArray) -> FloatArray:
-    """Rotation matrix of a rotation vector (Rodrigues): R = I + a K + b K².
-
-    Parameters
-    ----------
-    phi : FloatArray, shape (..., 3)
-        Rotation vector, rad.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3, 3)
-        Rotation matrix.
-
-    """
+    """Return the rotation R = I + a K + b K² of a rotation vector (Rodrigues)."""
     K = hat(phi)
     _, a, b = coefficients(phi)
     return _IDENTITY + a * K + b * (K @ K)
 
 
 def log(R: FloatArray) -> FloatArray:
-    """Rotation vector of a rotation matrix, |φ| ≤ π: the inverse of `exp`.
+    """Return the rotation vector of R, |φ| ≤ π, the inverse of `exp`; at π either sign is right.
 
     It goes through the quaternion (v, w), φ = 2 atan2(|v|, w) v / |v|, which is well conditioned
     from the identity to half a turn, where the trace and the skew part of R are not.
-
-    Parameters
-    ----------
-    R : FloatArray, shape (..., 3, 3)
-        Rotation matrix.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3)
-        Rotation vector, rad. At exactly half a turn either sign of the axis is right.
-
     """
     quaternion = to_quaternion(R)
     v, w = quaternion[..., :3], quaternion[..., 3:]
@@ -126,20 +70,9 @@ def log(R: FloatArray) -> FloatArray:
 
 
 def left_jacobian(phi: FloatArray) -> FloatArray:
-    """Left Jacobian J = ∫₀¹ exp(s φ) ds = I + b K + c K².
+    """Return J = ∫₀¹ exp(s φ) ds = I + b K + c K².
 
     exp(φ + δ) = exp(J δ) exp(φ) to first order in δ.
-
-    Parameters
-    ----------
-    phi : FloatArray, shape (..., 3)
-        Rotation vector, rad.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3, 3)
-        Left Jacobian.
-
     """
     K = hat(phi)
     theta_squared, a, b = coefficients(phi)
@@ -149,59 +82,24 @@ def left_jacobian(phi: FloatArray) -> FloatArray:
 
 
 def left_jacobian_inverse(phi: FloatArray) -> FloatArray:
-    """Inverse of `left_jacobian` for |φ| < 2π: J⁻¹ = I − K/2 + (1 − a / 2b) K² / θ².
-
-    Parameters
-    ----------
-    phi : FloatArray, shape (..., 3)
-        Rotation vector, rad.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3, 3)
-        Inverse left Jacobian.
-
-    """
+    """Return J⁻¹ = I − K/2 + (1 − a / 2b) K² / θ² of `left_jacobian`, for |φ| < 2π."""
     K = hat(phi)
     theta_squared, a, b = coefficients(phi)
     return _IDENTITY - 0.5 * K + ((1.0 - 0.5 * a / b) / theta_squared) * (K @ K)
 
 
 def from_quaternion(quaternion: FloatArray) -> FloatArray:
-    """Rotation matrix of a quaternion: R = I + 2 w v_× + 2 v_×².
-
-    Parameters
-    ----------
-    quaternion : FloatArray, shape (..., 4)
-        Quaternion xyzw (the order of ROS); of any length but zero.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3, 3)
-        Rotation matrix.
-
-    """
+    """Return R = I + 2 w v_× + 2 v_×² of a quaternion of any length but zero."""
     unit: FloatArray = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     K = hat(unit[..., :3])
     return _IDENTITY + 2.0 * unit[..., 3:, None] * K + 2.0 * (K @ K)
 
 
 def to_quaternion(R: FloatArray) -> FloatArray:
-    """Return the unit quaternion q = (v, w) of a rotation matrix.
+    """Return the unit quaternion q = (v, w), w ≥ 0, of a rotation.
 
     4 q qᵀ = [[R + Rᵀ + (1 − tr R) I, (R − Rᵀ)^∨], [·, 1 + tr R]]. Each row is a multiple of q, and
     the one with the largest diagonal entry (at least 1) is well conditioned at any angle.
-
-    Parameters
-    ----------
-    R : FloatArray, shape (..., 3, 3)
-        Rotation matrix.
-
-    Returns
-    -------
-    FloatArray, shape (..., 4)
-        Quaternion xyzw (the order of ROS) with w ≥ 0.
-
     """
     R_transposed = transpose(R)
     trace = np.trace(R, axis1=-2, axis2=-1)[..., None]
@@ -217,20 +115,9 @@ def to_quaternion(R: FloatArray) -> FloatArray:
 
 
 def normalise(R: FloatArray) -> FloatArray:
-    """Take the drift of rounding off a rotation matrix: R (3 I − RᵀR) / 2.
+    """Take the drift of rounding off a rotation: R (3 I − RᵀR) / 2.
 
     One Newton step towards the polar factor: an orthogonality error ε becomes about ε². For
     matrices that come from repeated products, not for arbitrary ones.
-
-    Parameters
-    ----------
-    R : FloatArray, shape (..., 3, 3)
-        Matrix close to a rotation.
-
-    Returns
-    -------
-    FloatArray, shape (..., 3, 3)
-        Rotation matrix.
-
     """
     return 0.5 * R @ (3.0 * _IDENTITY - transpose(R) @ R)

@@ -59,19 +59,9 @@ class EventBuilder:
     """Makes events in the base frame of measurements, in the order in which these come.
 
     What needs a transform that is not known yet waits for it. After the timeout velocities are
-    taken to be those of the base until their transform is known, and all else is dropped.
-
-    Parameters
-    ----------
-    base_frame : BaseFrame
-        Brings measurements into the base frame.
-    transform_timeout_s : float
-        How long a measurement waits, seconds.
-    velocity_timeout_s : float
-        How long a velocity holds, seconds: poses further apart give none.
-    on_drop : callable
-        Called with why a measurement is dropped; :func:`drop_reason` tells the key to count it.
-
+    taken to be those of the base until their transform is known, and all else is dropped:
+    ``on_drop`` is called with the reason, and :func:`drop_reason` gives the key to count it by.
+    Poses further apart than the velocity's timeout give no velocity.
     """
 
     def __init__(
@@ -91,14 +81,8 @@ class EventBuilder:
     def add(self, measured: Measured, now_ns: int) -> list[Event]:
         """Take a measurement; return the event that comes of it, unless it has to wait.
 
-        Parameters
-        ----------
-        measured : Measured
-            With the stamp that its event will have. Of poses, which are an odometry's, the
-            differences are used.
-        now_ns : int
-            Time of reception by any clock that goes on steadily, nanoseconds.
-
+        Of poses, an odometry's, the differences are used. ``now_ns`` is the time of reception by
+        any clock that goes on steadily.
         """
         if isinstance(measured, PoseMessage):
             velocity = self._difference(measured)
@@ -117,7 +101,7 @@ class EventBuilder:
         waiting, self._waiting = self._waiting, deque()
         return [event for item, _ in waiting for event in self._attempt(item, item.deadline_ns)]
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Drop what waits, as after a jump of the clock."""
         self._waiting.clear()
 

@@ -1,8 +1,8 @@
-"""Frames of recorded or received messages: measurements brought into the base frame."""
+"""Where sensors are: measurements brought into the base frame."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -14,12 +14,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
-from slam_observer_ros.sensor_models.extrinsics import (
-    move_observation,
-    move_velocity,
-    turn_angular_velocity,
-)
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.input_settings import InputSettings, Pose6
 
 EventT = TypeVar('EventT', ObservationEvent, VelocityEvent, AngularVelocityEvent)
 
@@ -30,8 +25,8 @@ def insert_transforms(
     """Put the transforms of a message on /tf or /tf_static into a buffer, without the bad ones."""
     good = []
     for transform in transforms:
-        if trouble := transform.trouble:
-            buffer.refuse(transform.child_frame_id, trouble)
+        if problem := transform.trouble:
+            buffer.refuse(transform.child_frame_id, problem)
         else:
             good.append(transform)
     for transform, pose in zip(good, pose_stack(good), strict=True):
@@ -48,17 +43,10 @@ class TransformSource(Protocol):
     """Where transforms come from."""
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
-        """Return the pose (4, 4) of frame ``source`` in frame ``target``.
-
-        Raises
-        ------
-        TransformError
-            If it is not known at that time.
-
-        """
+        """Return the pose (4, 4) of ``source`` in ``target``; TransformError if unknown then."""
 
     def parent_of(self, frame: str) -> str | None:
-        """Return the frame that this one is told in; None if none is."""
+        """Return the parent of a frame; None if it has none."""
 
     def newest_ns(self, target: str, source: str) -> int | None:
         """Return the newest stamp at which both frames are known, nanoseconds; None if never."""
@@ -68,28 +56,11 @@ class TransformSource(Protocol):
 
 
 class BaseFrame:
-    """Brings measurements into the base frame.
+    """Brings measurements into the base frame, whose ``name`` it knows.
 
-    A message without frame is taken to be in the base frame already.
-
-    Parameters
-    ----------
-    settings : InputSettings
-        Frames, and the pose of the sensor if it isn't on /tf.
-    transforms : TransformSource
-        Where the sensors are.
-
-    Attributes
-    ----------
-    name : str
-        Name of the base frame.
-
-    Raises
-    ------
-    ParameterError
-        If the map's frame has no name, or an angle of ``sensor_pose`` is beyond 2π, as those in
-        degrees are.
-
+    A message without frame is taken to be in the base frame already. What needs a transform that
+    is not known (yet) raises a TransformError. A map's frame without name is a ParameterError,
+    and so is an angle of ``sensor_pose`` beyond 2π, as those in degrees are.
     """
 
     def __init__(self, settings: InputSettings, transforms: TransformSource) -> None:
@@ -100,40 +71,18 @@ class BaseFrame:
         self._world_frames = {self._map_frame, settings.odom_frame} - {''}
         self._sensor_frame = settings.sensor_frame
         self._tag_frame_prefix = settings.tag_frame_prefix
-        self._sensor_pose: FloatArray | None = None
-        if any(settings.sensor_pose):
-            angles_rad = list(settings.sensor_pose[3:])
-            if np.max(np.abs(angles_rad)) > 2.0 * np.pi:
-                raise ParameterError(
-                    "parameter 'sensor_pose': roll, pitch and yaw are radians, which "
-                    f'{angles_rad} are not'
-                )
-            self._sensor_pose = se3.from_rpy(settings.sensor_pose)
+        self._sensor_pose = _sensor_pose(settings.sensor_pose)
 
     def observation(self, event: ObservationEvent, frame_id: str) -> ObservationEvent:
-        """Return landmarks, which were measured in a frame, in the base frame.
-
-        Raises
-        ------
-        TransformError
-            If the sensor's pose is not known (yet), or the landmarks are told in the map's frame.
-
-        """
+        """Return landmarks in the base frame; those measured in the map's frame are refused."""
         if self._sensor_pose is not None:
-            return move_observation(event, self._sensor_pose)
+            return event.moved(self._sensor_pose)
         frame_id = self._sensor_frame or frame_id
         self._refuse_map_frame(frame_id)
-        return self._moved(move_observation, event, frame_id)
+        return self._moved(event, frame_id)
 
     def tags(self, detections: TagDetections) -> ObservationEvent:
-        """Return where /tf has the fiducials of a detection message, in the base frame.
-
-        Raises
-        ------
-        TransformError
-            If one of them is not known (yet), or the detections are told in the map's frame.
-
-        """
+        """Return where /tf has the fiducials of a detection message, in the base frame."""
         camera_frame = self._sensor_frame or detections.frame_id
         self._refuse_map_frame(camera_frame)
         points = [
@@ -145,46 +94,27 @@ class BaseFrame:
         return self.observation(event, camera_frame)
 
     def velocity(self, event: VelocityEvent, frame_id: str) -> VelocityEvent:
-        """Return the velocity of the base, given that of a frame on the robot.
-
-        Raises
-        ------
-        TransformError
-            If the pose of that frame is not known (yet), or it is no part of the robot.
-
-        """
+        """Return the velocity of the base, given that of a frame that moves with the robot."""
         if frame_id.lstrip('/') in self._world_frames:
             raise TransformError(f"'{frame_id}' does not move with the robot")
-        return self._moved(move_velocity, event, frame_id)
+        return self._moved(event, frame_id)
 
     def angular_velocity(self, event: AngularVelocityEvent, frame_id: str) -> AngularVelocityEvent:
-        """Return an angular velocity in the base frame's axes.
-
-        Raises
-        ------
-        TransformError
-            If the sensor's pose is not known (yet).
-
-        """
-        return self._moved(turn_angular_velocity, event, frame_id)
+        """Return an angular velocity in the base frame's axes."""
+        return self._moved(event, frame_id)
 
     def _refuse_map_frame(self, frame_id: str) -> None:
         """Refuse landmarks that the estimate itself would bring to where it has them."""
         if frame_id.lstrip('/') == self._map_frame != '':
             raise TransformError(
-                f"landmarks are told in '{self._map_frame}', which is estimated from these very "
+                f"landmarks are given in '{self._map_frame}', which is estimated from these very "
                 "landmarks: publish them in the sensor's frame"
             )
 
-    def _moved(
-        self,
-        move: Callable[[EventT, FloatArray], EventT],
-        event: EventT,
-        frame_id: str,
-    ) -> EventT:
+    def _moved(self, event: EventT, frame_id: str) -> EventT:
         if frame_id.lstrip('/') in ('', self.name):
             return event
-        return move(event, self._transforms.lookup(self.name, frame_id, event.stamp_ns))
+        return event.moved(self._transforms.lookup(self.name, frame_id, event.stamp_ns))
 
     def _tag_position(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
         """Return where a tag is in the camera's frame (3,), under either of its names."""
@@ -193,3 +123,13 @@ class BaseFrame:
         except TransformError:
             frame = f'{self._tag_frame_prefix}{number}'
             return self._transforms.lookup(camera, frame, stamp_ns)[:3, 3]
+
+
+def _sensor_pose(values: Pose6) -> FloatArray | None:
+    """Return the sensor's pose (4, 4) of the settings; None if they give none."""
+    angles_rad = list(values[3:])
+    if np.max(np.abs(angles_rad)) > 2.0 * np.pi:
+        raise ParameterError(
+            f"parameter 'sensor_pose': roll, pitch and yaw are radians, which {angles_rad} are not"
+        )
+    return se3.from_rpy(values) if any(values) else None

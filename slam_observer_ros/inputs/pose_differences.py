@@ -24,13 +24,8 @@ class PoseDifferences:
     """Turns poses of the base in a smooth frame, as odometry gives them, into velocities.
 
     The velocity from one pose to the next has the stamp of the first: held until the second, it
-    leads exactly there. It is known one period late, which the reorder window must cover.
-
-    Parameters
-    ----------
-    timeout_ns : int
-        Poses further apart than this give no velocity, nanoseconds.
-
+    leads exactly there. It is known one period late, which the reorder window must cover. Poses
+    further apart than ``timeout_ns`` give none.
     """
 
     def __init__(self, timeout_ns: int) -> None:
@@ -40,12 +35,7 @@ class PoseDifferences:
     def add(self, stamp_ns: int, pose: FloatArray) -> VelocityEvent | None:
         """Take a pose (4, 4); return the velocity since the one before, if there is one.
 
-        Raises
-        ------
-        InvalidEventError
-            If the pose has jumped, with the reason :data:`POSE_JUMP`; the next velocity is from
-            there.
-
+        A jump is an InvalidEventError, reason :data:`POSE_JUMP`; the next velocity is from there.
         """
         last, self._last = self._last, (stamp_ns, pose)
         if last is None or not 0 < stamp_ns - last[0] <= self._timeout_ns:

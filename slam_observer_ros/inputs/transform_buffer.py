@@ -1,7 +1,8 @@
-"""What /tf and /tf_static have told of late, and the transform between any two frames at a time.
+"""The latest of /tf and /tf_static, and the transform between any two frames at a time.
 
 The semantics are tf2's: each frame has one parent, dynamic transforms are interpolated between
-their stamps and never extrapolated, static ones hold at all times.
+their stamps and never extrapolated, static ones hold at all times. A slash that leads, as ROS 1
+had it, is ignored.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ import logging
 
 import numpy as np
 
+from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import AGREEING_STAMPS, NEAR_NS
 from slam_observer_ros.geometry import paths, se3
 
 logger = logging.getLogger(__name__)
 
 HISTORY_NS = 10_000_000_000
-"""How far back transforms are kept, nanoseconds; tf2's default."""
+"""How far back transforms are kept; tf2's default."""
 
 ALWAYS_NS = 2**63 - 1
-"""Newest stamp of what is static, nanoseconds."""
+"""Newest stamp of what is static."""
 
 
 @dataclass(slots=True)
@@ -35,15 +36,15 @@ class _Track:
     is_static: bool
     stamps_ns: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
-    behind_ns: list[int] = field(default_factory=list)
+    strays: StrayStamps = field(default_factory=StrayStamps)
 
     def insert(self, stamp_ns: int, pose: FloatArray) -> None:
         if not self.is_static:
             self._follow_jump(stamp_ns)
-        place = 0 if self.is_static else bisect_left(self.stamps_ns, stamp_ns)
-        is_known = self.is_static or self.stamps_ns[place : place + 1] == [stamp_ns]
-        self.stamps_ns[place : place + is_known] = [stamp_ns]
-        self.poses[place : place + is_known] = [pose]
+        position = 0 if self.is_static else bisect_left(self.stamps_ns, stamp_ns)
+        is_known = self.is_static or self.stamps_ns[position : position + 1] == [stamp_ns]
+        self.stamps_ns[position : position + is_known] = [stamp_ns]
+        self.poses[position : position + is_known] = [pose]
         outdated = bisect_left(self.stamps_ns, self.stamps_ns[-1] - HISTORY_NS)
         del self.stamps_ns[:outdated], self.poses[:outdated]
 
@@ -54,11 +55,11 @@ class _Track:
         seem too old.
         """
         if not self.stamps_ns or stamp_ns >= self.stamps_ns[-1] - NEAR_NS:
-            self.behind_ns = []
-        elif not self.behind_ns or stamp_ns > self.behind_ns[-1]:
-            self.behind_ns.append(stamp_ns)
-        if len(self.behind_ns) >= AGREEING_STAMPS:
-            self.stamps_ns, self.poses, self.behind_ns = [], [], []
+            self.strays.clear()
+            return
+        last_ns = self.strays.last_ns
+        if (last_ns is None or stamp_ns > last_ns) and self.strays.add(stamp_ns):
+            self.stamps_ns, self.poses = [], []
 
     def pose_at(self, stamp_ns: int) -> FloatArray | None:
         """Interpolate the pose (4, 4); None outside of what is known."""
@@ -85,20 +86,7 @@ class TransformBuffer:
     def insert(
         self, parent: str, child: str, stamp_ns: int, pose: FloatArray, *, is_static: bool = False
     ) -> None:
-        """Take a transform; one of a frame to itself says nothing, and is refused.
-
-        Parameters
-        ----------
-        parent, child : str
-            Frame names; a leading slash, as ROS 1 had it, is ignored.
-        stamp_ns : int
-            Time of validity, nanoseconds.
-        pose : FloatArray
-            (4, 4) pose of ``child`` in ``parent``.
-        is_static : bool
-            Whether it holds at all times.
-
-        """
+        """Take the pose (4, 4) of ``child`` in ``parent``; one of a frame to itself is refused."""
         parent, child = parent.lstrip('/'), child.lstrip('/')
         if parent == child:
             self.refuse(child, 'it is to the frame itself')
@@ -109,7 +97,7 @@ class TransformBuffer:
         track.insert(stamp_ns, pose)
 
     def refuse(self, child: str, reason: str) -> None:
-        """Tell, once for each frame, why a transform is not used."""
+        """Log, once for each frame, why a transform is not used."""
         if child not in self._refused:
             self._refused.add(child)
             logger.warning("A transform on /tf of frame '%s' is not used: %s.", child, reason)
@@ -119,26 +107,19 @@ class TransformBuffer:
         self._tracks = {child: track for child, track in self._tracks.items() if track.is_static}
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
-        """Return the pose (4, 4) of frame ``source`` in frame ``target``.
-
-        Raises
-        ------
-        TransformError
-            If the frames are not connected, or not at that time.
-
-        """
+        """Return the pose (4, 4) of ``source`` in ``target``; TransformError if unknown then."""
         target_chain, source_chain = self._chains(target, source)
         return se3.inverse(self._pose(target_chain, stamp_ns)) @ self._pose(source_chain, stamp_ns)
 
     def parent_of(self, frame: str) -> str | None:
-        """Return the frame that this one is told in; None if none is."""
+        """Return the parent of a frame; None if it has none."""
         track = self._tracks.get(frame.lstrip('/'))
         return None if track is None else track.parent
 
     def newest_ns(self, target: str, source: str) -> int | None:
-        """Return the newest stamp at which both frames are known, nanoseconds.
+        """Return the newest stamp at which both frames are known; None if they are not connected.
 
-        None if they are not connected; :data:`ALWAYS_NS` if all between them is static.
+        :data:`ALWAYS_NS` if all between them is static.
         """
         try:
             chains = self._chains(target, source)

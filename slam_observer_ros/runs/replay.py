@@ -16,8 +16,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.counts import used_points
-from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimates import Update, used_points
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory

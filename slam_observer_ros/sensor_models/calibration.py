@@ -28,8 +28,8 @@ NOMINAL = np.repeat([1.0, 0.0], [6, 7])
 """(13,) what they are where the velocity is right; scales as factors 1 + s."""
 
 MIN_DELAY_S = -0.2
-"""An odometry's velocity, averaged over the time before its stamp, shows in observations before
-that. How the robot moves so much later is not known yet when it is needed: without a limit the
+"""Below zero as an odometry's velocity, averaged over the time before its stamp, shows earlier.
+How the robot moves so much later is not known yet when it is needed: without a limit the
 estimate, which can't make up for it, would stray ever further.
 """
 
@@ -37,30 +37,10 @@ UNITS = ('',) * 6 + ('rad/s',) * 3 + ('m/s',) * 3 + ('s',)
 
 
 class Calibration:
-    """Estimates of scale s, bias b and delay τ: of those whose uncertainty is not zero.
+    """Estimates of those c entries of scale s, bias b and delay τ whose uncertainty is not 0.
 
-    Parameters
-    ----------
-    settings : Settings
-        Uncertainties at the start and drifts.
-    axes : Axes
-        Axes of the pose that are estimated at all.
-
-    Attributes
-    ----------
-    axes : Axes
-        The same.
-    count : int
-        c, how many entries of s, b and τ are estimated.
-    initial_variances : FloatArray
-        (c,) variances at the start.
-    drift_covariance : FloatArray
-        (c, c) by how much their covariance grows per second.
-    drifts : bool
-        Whether any of them grows.
-    delay_error_ns : int
-        Standard deviation of τ at the start, nanoseconds; 0 where it is not estimated.
-
+    ``initial_variances`` (c,) grow by ``drift_covariance`` (c, c) a second, if one ``drifts``;
+    ``delay_error_ns`` is the standard deviation of τ at the start, 0 where it is not estimated.
     """
 
     def __init__(self, settings: Settings, axes: Axes) -> None:
@@ -74,7 +54,7 @@ class Calibration:
         self._scales = int(np.sum(self._estimated < 6))
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._all: FloatArray = NOMINAL.copy()
-        self.count = len(self._estimated)
+        self.count = len(self._estimated)  # c
         self.delay_error_ns = to_ns(settings.velocity_delay_error)
         self.initial_variances = errors[self._estimated] ** 2
         self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
@@ -87,7 +67,7 @@ class Calibration:
         return values
 
     def estimates(self, variances: FloatArray) -> list[CalibrationEstimate]:
-        """Return the estimates with what the gains know of them: ``variances`` (c,)."""
+        """Return the estimates with ``variances`` (c,), what the filter knows of them."""
         stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
         return [
             CalibrationEstimate(
@@ -103,18 +83,12 @@ class Calibration:
 
     @property
     def delay_ns(self) -> int:
-        """Delay τ, nanoseconds; where it is negative the latest velocity is held for longer.
-
-        From ``MIN_DELAY_S`` to ``MAX_DELAY_S``.
-        """
+        """Delay τ in its limits; where it is negative the latest velocity is held for longer."""
         return to_ns(float(self._all[DELAY]))
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so.
-
-        Wheels that stand don't turn the robot, however unlike they are, and no gyroscope gives
-        zero on all axes.
-        """
+        """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so."""
+        # Wheels that stand turn no robot, however unlike, and no gyroscope gives zero on all axes.
         biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
         return body_velocities * self._all[:6] + biases
 

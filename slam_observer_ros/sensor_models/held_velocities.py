@@ -11,34 +11,15 @@ from slam_observer_ros.common.types import BoolArray, FloatArray
 
 @dataclass(frozen=True, slots=True)
 class HeldVelocities:
-    """k velocities that cover an interval of time.
+    """k velocities that cover an interval of time. Columns of two: angular and linear part."""
 
-    Attributes
-    ----------
-    body_velocities : FloatArray
-        (k, 6) the velocities (Ω, v), rad/s and m/s.
-    covariances : FloatArray
-        (k, 6, 6) covariances of them, zero where unknown.
-    is_stated : BoolArray
-        (k, 2) whether the covariance of the angular and of the linear part is known.
-    dt_s : FloatArray
-        (k,) seconds that each was held.
-    gap_s : FloatArray
-        (k,) seconds without a known velocity, as it had timed out; ``dt_s`` is zero then.
-    before_s : FloatArray
-        (k, 2) seconds that the angular and the linear part of each had been held for before.
-    usual_s : FloatArray
-        (2,) seconds that angular and linear parts are held for as a rule; infinite if unknown.
-
-    """
-
-    body_velocities: FloatArray
-    covariances: FloatArray
-    is_stated: BoolArray
-    dt_s: FloatArray
-    gap_s: FloatArray
-    before_s: FloatArray
-    usual_s: FloatArray
+    body_velocities: FloatArray  # (k, 6)
+    covariances: FloatArray  # (k, 6, 6), zero where unknown
+    is_stated: BoolArray  # (k, 2) whether the covariance is known
+    dt_s: FloatArray  # (k,) how long each was held
+    gap_s: FloatArray  # (k,) with dt_s zero: how long none was known, as it had timed out
+    before_s: FloatArray  # (k, 2) how long each had been held for before
+    usual_s: FloatArray  # (2,) how long they are held for as a rule; infinite if unknown
 
     @classmethod
     def unknown(cls, gap_s: FloatArray) -> HeldVelocities:
@@ -55,7 +36,7 @@ class HeldVelocities:
         )
 
     def with_gaps_apart(self) -> HeldVelocities:
-        """Return the same with each gap as a piece of its own, from where it leaves the robot."""
+        """Return the same with each gap as a piece of its own."""
         has_gap = (self.gap_s > 0.0) & (self.dt_s > 0.0)
         rows = np.repeat(np.arange(len(has_gap)), 1 + has_gap)
         is_gap = np.append(False, rows[1:] == rows[:-1]) | (self.dt_s[rows] == 0.0)

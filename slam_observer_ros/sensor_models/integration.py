@@ -32,10 +32,7 @@ def transition_covariance(
     start_ns: int,
     end_ns: int,
 ) -> FloatArray:
-    """Return the covariance (6, 6) of w in exp(w) Φ, with Φ the :func:`transition`.
-
-    Along the body's axes at the start.
-    """
+    """Return the covariance (6, 6) of w in exp(w) Φ, Φ the `transition`, axes of the start."""
     held = _held(velocities, calibration, start_ns, end_ns)
     Ad = se3.adjoint(_path(np.eye(4), held, calibration))
     return paths.summed_noise(Ad, noise.covariances(held))
@@ -52,9 +49,8 @@ def integrate(
 ) -> Motion:
     """Return how Â, ``A`` (4, 4) at ``start_ns``, moves on to ``end_ns``.
 
-    ``at_start`` (6,) is the mean velocity around that stamp which the motion before this one
-    ended with, or None if there was none. As each motion begins like the last one ended, what the
-    delay's error does to all of them depends on their two ends alone.
+    ``at_start`` (6,) is the mean velocity with which the motion before ended, or None. As each
+    begins like the last one ended, the delay's error shows in their two ends alone.
     """
     held = _held(velocities, calibration, start_ns, end_ns)
     at_ends = None
@@ -91,8 +87,8 @@ def _path(start: FloatArray, held: HeldVelocities, calibration: Calibration) -> 
 def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int) -> FloatArray:
     """Return the mean velocity (6,) around a stamp, as far as its delay may reach.
 
-    The velocity at the very stamp would pass its own noise off as a turn to tell time by. In a
-    mean there is less noise. What is yet to come of it, the latest velocity stands in for.
+    The velocity at the very stamp would pass its own noise off as a turn to read the time from; a
+    mean has less noise. What is yet to come of it, the latest velocity stands in for.
     """
     reach_ns, centre_ns = calibration.delay_error_ns, stamp_ns - calibration.delay_ns
     return velocities.mean(centre_ns - reach_ns, centre_ns + reach_ns)

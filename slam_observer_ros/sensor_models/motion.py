@@ -1,4 +1,4 @@
-"""A motion of the robot, as the filters are given it."""
+"""A motion of the robot, as a filter is given it."""
 
 from __future__ import annotations
 
@@ -12,35 +12,17 @@ from slam_observer_ros.sensor_models.calibration import Calibration
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion from one instant of the state to the next, in k pieces of held velocity.
+    """Motion from one instant of the state to the next, in k pieces of held velocity."""
 
-    Attributes
-    ----------
-    path : FloatArray
-        (k + 1, 4, 4) Â before, between and after the pieces.
-    measured_velocities : FloatArray
-        (k, 6) velocities (Ω, v) as measured, rad/s and m/s.
-    dt_s : FloatArray
-        (k,) seconds that each velocity was held.
-    covariances : FloatArray
-        (k, 6, 6) covariance of each piece, body frame, rad² and m².
-    duration_s : float
-        Seconds in all, with those without a known velocity.
-    at_ends : FloatArray or None
-        (2, 6) measured velocities around the start and the end, rad/s and m/s; None where what
-        moved does not depend on the delay of the velocities.
-    calibration : Calibration
-        The calibration that led along the path.
-
-    """
-
-    path: FloatArray
-    measured_velocities: FloatArray
-    dt_s: FloatArray
-    covariances: FloatArray
-    duration_s: float
+    path: FloatArray  # (k + 1, 4, 4) Â before, between and after the pieces
+    measured_velocities: FloatArray  # (k, 6)
+    dt_s: FloatArray  # (k,) how long each was held
+    covariances: FloatArray  # (k, 6, 6) of each piece, rad² and m²
+    duration_s: float  # in all, with the time without a known velocity
+    # (2, 6) measured velocities around the start and the end; None where what moved does not
+    # depend on the delay of the velocities.
     at_ends: FloatArray | None
-    calibration: Calibration
+    calibration: Calibration  # which led along the path
 
     @cached_property
     def noise(self) -> FloatArray:

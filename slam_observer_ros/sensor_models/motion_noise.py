@@ -10,31 +10,25 @@ from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.settings.estimator_settings import Settings
 
 MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
-"""Standard deviations of a velocity (Ω, v), rad/s and m/s, beyond which a message only says
-'unknown': no robot turns or moves as fast.
+"""Standard deviations of a velocity beyond which a message only says 'unknown'.
+
+No robot turns or moves as fast.
 """
 
 MAX_GAP_ERRORS = np.repeat([np.pi, 1000.0], 3)
-"""Standard deviations of a motion in one gap, rad and m, beyond which it is as unknown as it can
-be: more would only drown all else that is known in rounding.
+"""Standard deviations of a motion in one gap, rad and m: it is as unknown as it can be.
+
+More would only drown all else that is known in rounding.
 """
 
 SPEED_WINDOW_S = 1.0
-"""Time over which a velocity is averaged to tell how large an error in proportion to it is."""
+"""Time over which a velocity is averaged, as its error may be in proportion to it."""
 
 _IDENTITY_6 = np.eye(6)
 
 
 class MotionNoise(Immutable):
-    """How far motions may be off.
-
-    Parameters
-    ----------
-    settings : Settings
-        Noise densities of the velocity, its error in proportion to speed, and how the robot may
-        move where no velocity is known.
-
-    """
+    """How far motions may be off: noise densities of the settings, or covariances of messages."""
 
     def __init__(self, settings: Settings) -> None:
         s = settings
@@ -45,32 +39,22 @@ class MotionNoise(Immutable):
         self._has_scale = bool(self._scale.any())
 
     def covariances(self, held: HeldVelocities) -> FloatArray:
-        """Return what k motions may be off by: (k, 6, 6), body frame, rad² and m².
-
-        *A velocity in force* has white noise: of the stated density, and proportional to speed.
-        The speed is the mean over :data:`SPEED_WINDOW_S`, or over all of ``held`` if that is
-        shorter; in a single message it is noisy itself, and its square too large. The density is
-        that of errors which are new in each message. Held for t, longer than the usual T, one of
-        them has moved the robot by t/T times as much: its variance is t²/T, not t. Slip goes on as
-        before.
-
-        *A velocity with a covariance of its own* has one error for as long as it is held, and
-        another in the next message: held for t it has moved the robot by t times the error,
-        however many motions that was cut into. Its angular and its linear part may be of two
-        messages, one of them without a covariance.
-
-        *In a gap* the robot may do anything that ``unknown_*_motion`` allows, within
-        :data:`MAX_GAP_ERRORS`.
-        """
+        """Return what k motions may be off by: (k, 6, 6), rad² and m²."""
         dt_s, some_are_stated = held.dt_s[:, None], held.is_stated.any()
+        # White noise of the stated density, and in proportion to the mean speed: a single message
+        # is noisy itself, and its square too large.
         variances = self._density_squared * _white_s(held)
         if self._has_scale:
             variances += (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2 * dt_s
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
+        # In a gap the robot may do anything that is allowed.
         if held.gap_s.any():
             variances += np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
         covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
+        # A stated covariance is that of one error for as long as the velocity is held, and of
+        # another in the next message: held for t it has moved the robot by t times the error,
+        # however many motions that was cut into. Of angular and linear part one may have none.
         if some_are_stated:
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
             grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
@@ -80,9 +64,10 @@ class MotionNoise(Immutable):
 
 
 def _white_s(held: HeldVelocities) -> FloatArray:
-    """Return what the variances of motions are, over their density: dt, or more of it.
+    """Return variances over their density: (k, 6), or (k, 1) if one for all axes.
 
-    (k, 6), or (k, 1) where it is one for all axes.
+    The density is that of errors which are new in each message. Held for t, longer than the
+    usual T, one of them has moved the robot by t/T times as much: t²/T, not t. Slip is as before.
     """
     dt_s = held.dt_s[:, None]
     until_s = held.before_s + dt_s

@@ -1,4 +1,4 @@
-"""Noise of observed points, from the settings or from the messages."""
+"""Noise of observed points, from the settings or from the messages: covariances (m, 3, 3), m²."""
 
 from __future__ import annotations
 
@@ -10,40 +10,31 @@ from slam_observer_ros.geometry.matrices import limited
 from slam_observer_ros.settings.estimator_settings import Settings
 
 RESOLUTION_M = 1e-4
-"""Standard deviation that no coordinate of an observed point falls short of, metres.
+"""Standard deviation that each coordinate of an observed point has at least.
 
 What claims to be better is lost in rounding beside a pose that may be off by a kilometre.
 """
 
 RELATIVE_RESOLUTION = 1e-6
-"""The same as a share of the distance, for messages with points in single precision or better."""
+"""The same as a share of the distance, for points in single precision or better."""
 
 MAX_ERROR_M = 1e3
-"""Standard deviation of an observed point beyond which a message only says 'unknown', metres."""
+"""Standard deviation of an observed point beyond which a message only says 'unknown'."""
 
 MIN_SHARE = 1e-6
 """Least variance of an observed point in any direction, as a share of its total variance."""
 
 MIN_INTERVAL_S = 1e-3
-"""Observations that are less apart count as so far apart, seconds: two cameras may see at once."""
+"""Observations that are less apart count as so far apart: two cameras may see at once."""
 
 _TINY = np.finfo(np.float64).tiny
 _IDENTITY = np.eye(3)
 
 
 class ObservationNoise(Immutable):
-    """How far observed points may be off.
+    """How far observed points may be off, as ``observation_model`` and its figures say.
 
-    Parameters
-    ----------
-    settings : Settings
-        ``observation_model`` and the figures that belong to it.
-
-    Attributes
-    ----------
-    error_time_s : float
-        Correlation time of the errors, see :func:`repetition_factors`.
-
+    ``error_time_s`` is the correlation time of the errors, see :func:`repetition_factors`.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -53,11 +44,11 @@ class ObservationNoise(Immutable):
     def covariances(
         self, event: ObservationEvent, lines_of_sight: FloatArray | None = None
     ) -> FloatArray:
-        """Return what an observation's points may be off by: (m, 3, 3), body frame, m².
+        """Return what an observation's points may be off by, metres squared.
 
-        All of them can be inverted, even if a message or a point at the sensor itself says that
-        some direction is known exactly. ``lines_of_sight`` (m, 3) lead from the sensor to where
-        points of unknown covariance should be; default where they were measured.
+        All can be inverted, even if a message or a point at the sensor itself says that some
+        direction is known exactly. ``lines_of_sight`` (m, 3) lead from the sensor to where points
+        of unknown covariance should be; default where they were measured.
         """
         lines_of_sight = event.lines_of_sight if lines_of_sight is None else lines_of_sight
         if event.covariances is None:
@@ -73,10 +64,7 @@ class ObservationNoise(Immutable):
         return covariances
 
     def at(self, lines_of_sight: FloatArray) -> FloatArray:
-        """Return what the settings say of points that a message has no covariances for.
-
-        ``lines_of_sight`` (m, 3) lead to them from the sensor, metres, body frame.
-        """
+        """Return what the settings say of points along ``lines_of_sight`` (m, 3)."""
         s = self._settings
         if s.observation_model == 'cartesian':
             each = np.broadcast_to(s.point_noise**2 * _IDENTITY, (len(lines_of_sight), 3, 3))
@@ -95,17 +83,10 @@ class ObservationNoise(Immutable):
 def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
     """Return by what factors (m,) the variances of observations grow if their errors last.
 
-    An error with the correlation time t_e is c = e^(−dt/t_e) times what it was ``dt_s`` before,
-    plus new noise. n observations of one thing then weigh as much as one, and n − 1 whose variance
-    is (1 + c)/(1 − c) times as large: exactly so if they come at a steady rate.
-
-    Parameters
-    ----------
-    dt_s : FloatArray
-        (m,) seconds since each landmark was seen before; infinite if it was not.
-    error_time_s : float
-        t_e, seconds; with 0 all errors are new.
-
+    An error with the correlation time t_e is c = e^(−dt/t_e) times what it was ``dt_s`` (m,)
+    before, or infinitely long ago, plus new noise. n observations of one thing then weigh as much
+    as one, and n − 1 whose variance is (1 + c)/(1 − c) times as large: exactly so if they come at
+    a steady rate. With t_e = 0 all errors are new.
     """
     if error_time_s == 0.0:
         return np.ones(len(dt_s))
@@ -115,7 +96,7 @@ def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
 
 
 def _invertible(covariances: FloatArray) -> FloatArray:
-    """Return covariances (m, 3, 3) of which no direction is known exactly, m²."""
+    """Return covariances (m, 3, 3) of which no direction is known exactly."""
     least = RESOLUTION_M**2 + MIN_SHARE * covariances.trace(axis1=1, axis2=2)
     invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
     return invertible
@@ -124,7 +105,7 @@ def _invertible(covariances: FloatArray) -> FloatArray:
 def _along_and_across(
     lines_of_sight: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
 ) -> FloatArray:
-    """Return covariances (m, 3, 3) with given variances along and across the line of sight.
+    """Return covariances with given variances along and across the line of sight.
 
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """

@@ -18,7 +18,7 @@ NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
 """Stamp of a velocity that timed out before time began, nanoseconds."""
 
 BLOCK, BLOCKS = 64, 16
-"""The last 16 times 64 periods of a sensor tell how long its messages are in force as a rule.
+"""The last 16 times 64 periods show how long messages of a sensor are in force as a rule.
 
 So many that they have pauses in them where these are usual, as of commands.
 """
@@ -30,14 +30,9 @@ FIRST_CAPACITY = 64
 class VelocityHistory:
     """Velocity events in stamp order, joined with the angular velocities of another sensor.
 
-    Parameters
-    ----------
-    timeout_ns : int
-        How long a velocity is held at most, nanoseconds. Where the other sensor's angular one was
-        older when an event came, the velocity's own angular part counts.
-    is_planar : bool
-        Whether what leaves the plane z = 0 or turns out of it does not count.
-
+    A velocity is held for ``timeout_ns`` at most. Where the other sensor's angular one was older
+    when an event came, the velocity's own angular part counts. With ``is_planar`` only what is in
+    the plane z = 0 counts.
     """
 
     def __init__(self, timeout_ns: int, is_planar: bool = False) -> None:
@@ -75,10 +70,10 @@ class VelocityHistory:
 
     def latest(self, stamp_ns: int) -> FloatArray | None:
         """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
-        place, joined = bisect_right(self._stamps_ns, stamp_ns) - 1, self._written()
-        if stamp_ns - joined.since_ns[place, 1] > self._timeout_ns:
+        row, joined = bisect_right(self._stamps_ns, stamp_ns) - 1, self._written()
+        if stamp_ns - joined.since_ns[row, 1] > self._timeout_ns:
             return None
-        return self._counting(joined.body_velocities[place])
+        return self._counting(joined.body_velocities[row])
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
@@ -122,7 +117,6 @@ class VelocityHistory:
         return slice(first, last), begins, np.minimum(np.maximum(timed_out, begins), ends), ends
 
     def _usual_s(self) -> FloatArray:
-        """Return for how long the angular and the linear part are held as a rule (2,)."""
         linear_s = self._periods.usual_s
         angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
         return np.array([angular_s, linear_s])
@@ -173,23 +167,13 @@ class _Periods:
 class _Joined:
     """Velocities in force from one event to the next, each of one message or two.
 
-    Attributes
-    ----------
-    body_velocities : FloatArray
-        (c, 6) the velocities, rad/s and m/s.
-    covariances : FloatArray
-        (c, 6, 6) their covariances, zero where unknown.
-    is_stated : BoolArray
-        (c, 2) whether the covariance of the angular and of the linear part is known.
-    since_ns : IntArray
-        (c, 2) stamps of the messages that the angular and the linear part are of, nanoseconds.
-
+    Columns of two: angular and linear part, with the stamp of the message that each is of.
     """
 
-    body_velocities: FloatArray
-    covariances: FloatArray
-    is_stated: BoolArray
-    since_ns: IntArray
+    body_velocities: FloatArray  # (c, 6)
+    covariances: FloatArray  # (c, 6, 6), zero where unknown
+    is_stated: BoolArray  # (c, 2)
+    since_ns: IntArray  # (c, 2)
 
     @classmethod
     def with_room_for(cls, capacity: int) -> _Joined:
@@ -217,10 +201,7 @@ class _Joined:
     def write(
         self, first: int, events: list[tuple[VelocityEvent, AngularVelocityEvent | None]]
     ) -> None:
-        """Fill in rows from ``first`` on, which are zero: velocities, and what goes with them.
-
-        Rows that are filled in never change, so that others may look at them.
-        """
+        """Fill in rows from ``first`` on, once: others may see them."""
         rows = slice(first, first + len(events))
         self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
         stamps_ns = np.array([velocity.stamp_ns for velocity, _ in events], dtype=np.int64)

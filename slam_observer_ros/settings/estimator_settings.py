@@ -1,4 +1,4 @@
-"""The estimator's settings: one table for the node, YAML files, the command line and the docs."""
+"""The estimator's settings: one table for the node, YAML files, the command line and docs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,16 @@ MAX_DELAY_S = 1.0
 class Settings(Immutable):
     """Settings of the estimator; each field is a parameter."""
 
-    gains: str = parameter('riccati', 'Gain design', choices=('constant', 'scheduled', 'riccati'))
+    gains: str = parameter(
+        'riccati',
+        'What sets the gains: two numbers (constant), the full covariance (riccati), or a part '
+        'of it, for thousands of landmarks (scheduled)',
+        choices=('constant', 'scheduled', 'riccati'),
+        basic=True,
+    )
+    two_d_mode: bool = parameter(
+        False, 'Whether motion and map are planar: z, roll and pitch stay exactly zero', basic=True
+    )
     gain_k: float = parameter(
         4.0,
         "Constant gains: k of the paper's (30), with metres: how fast the pose follows the "
@@ -63,6 +72,7 @@ class Settings(Immutable):
         unit='s',
         minimum=0.0,
         maximum=10.0,
+        basic=True,
     )
     late_limit: float = parameter(
         2.0,
@@ -81,8 +91,8 @@ class Settings(Immutable):
     )
     on_time_jump: str = parameter(
         'reset',
-        'What happens when the clock jumps, as in a recording that is looped: reset, the run '
-        'starts again; hold, pose and map are kept',
+        'What happens when the clock jumps, as in a recording that is looped: reset forgets the '
+        'run, hold keeps pose and map',
         choices=('reset', 'hold'),
     )
     angular_velocity_noise: Vector3 = parameter(
@@ -90,12 +100,14 @@ class Settings(Immutable):
         'White noise of the angular velocity x y z: standard deviation of the angle after 1 s',
         unit='rad/√s',
         minimum=0.0,
+        basic=True,
     )
     linear_velocity_noise: Vector3 = parameter(
         (0.02, 0.02, 0.02),
         'White noise of the linear velocity x y z: standard deviation of the distance after 1 s',
         unit='m/√s',
         minimum=0.0,
+        basic=True,
     )
     angular_scale_noise: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -129,9 +141,14 @@ class Settings(Immutable):
         'range_bearing',
         'Which noise figures apply to landmarks whose message has no covariance',
         choices=('range_bearing', 'cartesian', 'stereo'),
+        basic=True,
     )
     range_noise: float = parameter(
-        0.1, 'Range and bearing: standard deviation of the range', unit='m', minimum=1e-4
+        0.1,
+        'Range and bearing: standard deviation of the range',
+        unit='m',
+        minimum=1e-4,
+        basic=True,
     )
     range_scale_noise: float = parameter(
         0.0,
@@ -139,10 +156,18 @@ class Settings(Immutable):
         minimum=0.0,
     )
     bearing_noise: float = parameter(
-        0.03, 'Range and bearing: standard deviation of each angle', unit='rad', minimum=1e-6
+        0.03,
+        'Range and bearing: standard deviation of each angle',
+        unit='rad',
+        minimum=1e-6,
+        basic=True,
     )
     point_noise: float = parameter(
-        0.05, 'Cartesian: standard deviation of each coordinate', unit='m', minimum=1e-4
+        0.05,
+        'Cartesian: standard deviation of each coordinate',
+        unit='m',
+        minimum=1e-4,
+        basic=True,
     )
     stereo_focal_length: float = parameter(500.0, 'Stereo: focal length', unit='px', minimum=1.0)
     stereo_baseline: float = parameter(0.2, 'Stereo: baseline', unit='m', minimum=1e-3)
@@ -209,9 +234,6 @@ class Settings(Immutable):
         unit='m/s',
         minimum=0.0,
     )
-    two_d_mode: bool = parameter(
-        False, 'Whether motion and map are planar: z, roll and pitch stay exactly zero'
-    )
     huber_threshold: float = parameter(
         1.345,
         'Scheduled and Riccati gains: standard deviations of noise beyond which an observation '
@@ -234,7 +256,7 @@ class Settings(Immutable):
     )
     max_rejections: int = parameter(
         5,
-        'Scheduled and Riccati gains: rejections in a row, all at one place, after which a '
+        'Scheduled and Riccati gains: rejections in a row, all at one position, after which a '
         'landmark is taken to have moved; one more than it was seen, if that is fewer',
         minimum=1,
     )
@@ -270,8 +292,8 @@ class Settings(Immutable):
     )
     hindsight_window: int = parameter(
         3000,
-        'Riccati gains: observations after which smoothing restarts from the current estimate; '
-        '0 to smooth all of them, the default of replay --smooth',
+        'Riccati gains: most observations that are smoothed together; the next ones go on from '
+        'the estimate then; 0 for all together, the default of replay --smooth',
         minimum=0,
     )
     localization_mode: str = parameter(
@@ -280,6 +302,7 @@ class Settings(Immutable):
         'are refined within their covariance (constant gains know none), with no new ones added; '
         'fixed, exact and at rest',
         choices=('off', 'uncertain', 'fixed'),
+        basic=True,
     )
     set_initial_pose: bool = parameter(
         False,

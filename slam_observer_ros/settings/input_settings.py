@@ -48,19 +48,25 @@ class InputSettings:
             'AprilTagDetectionArray',
             ON_TF,
         ),
+        basic=True,
     )
     tag_frame_prefix: str = parameter(
         'tag_', "Name of a fiducial's frame before its id; family:id, as of apriltag_ros, fits too"
     )
-    map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks')
+    map_frame: str = parameter('map', 'Frame of the estimated pose and landmarks', basic=True)
     odom_frame: str = parameter(
         'odom',
         'Odometry frame: if /tf has odom_frame to base_frame, map_frame to odom_frame is '
         'published; empty for never',
+        basic=True,
     )
-    base_frame: str = parameter('base_link', 'Frame of the robot, whose pose is estimated')
+    base_frame: str = parameter(
+        'base_link', 'Frame of the robot, whose pose is estimated', basic=True
+    )
     sensor_frame: str = parameter(
-        '', "Frame of the landmarks; empty takes each message's own, base_frame needs no transform"
+        '',
+        "Frame of the landmarks; empty takes each message's own, base_frame needs no transform",
+        basic=True,
     )
     sensor_pose: Pose6 = parameter(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),

@@ -16,6 +16,7 @@ class ObserverNodeSettings(InputSettings):
         AUTO,
         'Message type on twist; auto takes the type found on the topic',
         choices=(AUTO, 'Twist', 'TwistStamped', 'TwistWithCovarianceStamped', 'Odometry'),
+        basic=True,
     )
     twist_qos: str = parameter(
         'best_effort',
@@ -55,7 +56,7 @@ class ObserverNodeSettings(InputSettings):
         maximum=1000.0,
     )
     publish_tf: bool = parameter(
-        True, 'Whether map_frame to odom_frame or base_frame is published on /tf'
+        True, 'Whether map_frame to odom_frame or base_frame is published on /tf', basic=True
     )
     invert_tf: bool = parameter(
         False, 'Whether the transform on /tf is published as its inverse, with map_frame below'
@@ -64,7 +65,9 @@ class ObserverNodeSettings(InputSettings):
         2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
     )
     map_file: str = parameter(
-        '', 'Map to load at the start: one saved earlier, or surveyed landmarks; empty for none'
+        '',
+        'Map to load at the start: one saved earlier, or surveyed landmarks; empty for none',
+        basic=True,
     )
     map_path: str = parameter(
         '', 'File of ~/save_map, ~/load_map and autosave_map', read_only=False
@@ -72,7 +75,7 @@ class ObserverNodeSettings(InputSettings):
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
 
     def with_checked_frames(self) -> ObserverNodeSettings:
-        """Return the settings with plain frames that can be told apart.
+        """Return the settings with plain frames that differ.
 
         Raises
         ------

@@ -10,7 +10,7 @@ import yaml
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.yaml_errors import reason_of, UniqueKeys
-from slam_observer_ros.settings.parameter_table import suggestion
+from slam_observer_ros.settings.parameter_table import refuse_renamed, RENAMED, suggestion
 
 OBSERVER_NODE = 'observer_node'
 
@@ -21,11 +21,12 @@ def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
     Raises
     ------
     ParameterError
-        If one is one of ours with a single mistake. With more of them it may well be another
-        node's: ``base_frame_id`` comes near, too.
+        If one is a former name of ours, or one of ours with a single mistake. With more of them
+        it may well be another node's: ``base_frame_id`` comes near, too.
 
     """
     others = [name for name in written if name not in ours]
+    refuse_renamed(name for name in others if RENAMED.get(name) in ours)
     for name in others:
         if near := suggestion(name, [our for our in ours if _is_misspelt(name, our)]):
             raise ParameterError(f"unknown parameter '{name}'{near}")
@@ -38,13 +39,8 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     The file has the usual form ``<node or /**>: ros__parameters: {name: value}``, the node maybe
     below its namespaces; nested mappings become dotted names. Sections of other nodes are left
     out. In the names of sections ``*`` stands for one name, and ``**`` for any number of them.
-
-    Raises
-    ------
-    ParameterError
-        If the file can't be read, is not YAML, has a key twice, or holds no parameters for this
-        package, or those of several robots.
-
+    What is not readable, not YAML, has a key twice, no parameters for this package, or those of
+    several robots, is a ParameterError.
     """
     sections = [(name, body) for name, body in _read_sections(path) if _fits(name, _node_of(name))]
     if not sections:

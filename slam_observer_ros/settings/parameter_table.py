@@ -1,7 +1,7 @@
 """Typed parameter tables: each parameter is written down once, as a dataclass field.
 
 A settings dataclass whose fields are made by :func:`parameter` is the table. From it come the ROS
-parameter descriptors, the check of YAML files, the command-line options and the README's tables.
+parameter descriptors, the check of YAML files, the command-line options and the docs' tables.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ from slam_observer_ros.common.errors import ParameterError
 
 Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
+
+
+RENAMED: dict[str, str] = {}
+"""Former names of parameters, and what these are called now: old files are refused with it."""
 
 
 class Dataclass(Protocol):
@@ -41,14 +45,14 @@ class Parameter:
         Default; its type is the parameter's type.
     description : str
         One sentence for descriptors, help texts and tables.
-    unit : str
-        Unit, empty for a pure number.
     minimum, maximum : float
         Inclusive bounds of a number or of every entry of a vector.
     choices : tuple of str
         Allowed values of a string; empty for any.
     read_only : bool
         Whether the value is fixed once the node runs.
+    basic : bool
+        Whether a robot needs it first; all others are advanced.
 
     """
 
@@ -60,16 +64,12 @@ class Parameter:
     maximum: float = math.inf
     choices: tuple[str, ...] = ()
     read_only: bool = True
+    basic: bool = False
 
     def check(self, value: object) -> Value:
         """Return ``value`` in this parameter's type.
 
-        Raises
-        ------
-        ParameterError
-            If the type is wrong or the value is out of range; the message names the parameter,
-            what it got and what it takes.
-
+        A ParameterError names the parameter, what it got and what it takes.
         """
         default = self.default
         if isinstance(default, bool):
@@ -135,11 +135,9 @@ def parameter(
     maximum: float = math.inf,
     choices: tuple[str, ...] = (),
     read_only: bool = True,
+    basic: bool = False,
 ) -> Any:
-    """Return a dataclass field that is also a row of the parameter table.
-
-    Parameters are those of :class:`Parameter`; its name is the field's.
-    """
+    """Return a dataclass field that is a row of the table: a :class:`Parameter` of its name."""
     row = {
         'description': description,
         'unit': unit,
@@ -147,6 +145,7 @@ def parameter(
         'maximum': maximum,
         'choices': choices,
         'read_only': read_only,
+        'basic': basic,
     }
     return dataclasses.field(default=default, metadata=row)
 
@@ -162,15 +161,11 @@ def table(settings_class: type[Dataclass]) -> tuple[Parameter, ...]:
 def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object]) -> SettingsT:
     """Return settings built from a mapping of names to values; missing names keep defaults.
 
-    Raises
-    ------
-    ParameterError
-        If a name is not in the table or a value does not fit it.
-
+    A name that is not in the table, or a value that does not fit it, is a ParameterError.
     """
     rows = {row.name: row for row in table(settings_class)}
-    unknown = sorted(set(values) - set(rows))
-    if unknown:
+    if unknown := sorted(set(values) - set(rows)):
+        refuse_renamed(unknown)
         raise ParameterError(f"unknown parameter '{unknown[0]}'{suggestion(unknown[0], rows)}")
     return settings_class(**{name: rows[name].check(value) for name, value in values.items()})
 
@@ -178,11 +173,7 @@ def from_parameters(settings_class: type[SettingsT], values: Mapping[str, object
 def checked(settings: SettingsT) -> SettingsT:
     """Return settings that were built in Python, with their values checked as those of a file are.
 
-    Raises
-    ------
-    ParameterError
-        If a value does not fit the table, or these are no settings.
-
+    What does not fit the table, or is no settings, is a ParameterError.
     """
     if not dataclasses.is_dataclass(settings):
         raise ParameterError(f'settings are wanted, not a {type(settings).__name__}')
@@ -196,16 +187,14 @@ def changed_names(settings: Dataclass) -> list[str]:
     ]
 
 
+def refuse_renamed(names: Iterable[str]) -> None:
+    """Raise a ParameterError that gives the new name if one of the names is a former one."""
+    for name in names:
+        if name in RENAMED:
+            raise ParameterError(f"'{name}' is now '{RENAMED[name]}'")
+
+
 def suggestion(name: str, names: Collection[str]) -> str:
-    """Return the end of a message that asks for the nearest of ``names``; empty if none is near.
-
-    Parameters
-    ----------
-    name : str
-        What was written.
-    names : Collection of str
-        What may be meant.
-
-    """
+    """Return the end of a message that asks for the nearest of ``names``; '' if none is near."""
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     return f"; did you mean '{near[0]}'?" if near else ''

@@ -12,7 +12,6 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import transpose
-from slam_observer_ros.sensor_models.extrinsics import move_observation
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.matching import point_covariances
@@ -48,10 +47,8 @@ def carried_forward(
     # The sensor with it, so that it was measured from as far.
     sensor = shifts if event.sensor is None else event.sensor + shifts
     shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
-    moved = move_observation(shifted, back)
-    Q = transition_covariance(
-        velocities, calibration, state.motion_noise, event.stamp_ns, state_ns
-    )
+    moved = shifted.moved(back)
+    Q = transition_covariance(velocities, calibration, state.motion_noise, *interval)
     C = back[:3, :3] @ SPATIAL.output_matrix(points)
     shared = len(points) * C @ Q @ transpose(C)
     rows = state.landmarks.rows_of(event.ids)

@@ -18,7 +18,6 @@ from tum_files import read_tum
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.map_file import read_map
-from slam_observer_ros.sensor_models.extrinsics import move_observation
 from slam_observer_ros.simulation import Scenario, Simulation
 
 CAMERA = se3.from_rpy((0.2, 0.0, 0.4, -np.pi / 2, 0.0, -np.pi / 2))
@@ -99,7 +98,7 @@ def record(path, *topics):
             velocity = ros.twist_stamped(event.body_velocity, stamp_ns=event.stamp_ns)
             messages.append((now_ns, '/twist', velocity))
         elif isinstance(event, ObservationEvent):
-            seen = move_observation(event, se3.inverse(CAMERA))
+            seen = event.moved(se3.inverse(CAMERA))
             for topic in topics:
                 delay_ns = TF_DELAY_NS if topic == '/tf' else 0
                 messages.append((now_ns + delay_ns, topic, MESSAGES[topic](seen)))

@@ -156,7 +156,7 @@ class TestMovingMounts:
         ended = slam_observer('replay', path, '--json')
         assert ended.json['dropped'] == {'no_transform': 20}
         assert ended.json['landmarks'] == 0
-        reason = "landmarks are told in 'map', which is estimated from these very landmarks"
+        reason = "landmarks are given in 'map', which is estimated from these very landmarks"
         assert ended.errors.count(reason) == 1
 
     @pytest.fixture

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 
+from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.common.errors import MapError, ParameterError
-from slam_observer_ros.counts import used_points
+from slam_observer_ros.estimates import used_points
 from slam_observer_ros.estimator import event_warnings
 from slam_observer_ros.estimator.checks import MAX_MEASURED
 from slam_observer_ros.estimator.estimator import Estimator
@@ -23,7 +24,6 @@ from slam_observer_ros.evaluation.consistency import average_nees
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import (
-    AGREEING_STAMPS,
     AngularVelocityEvent,
     FIRST_AUTOMATIC_ID,
     LAST_AUTOMATIC_ID,

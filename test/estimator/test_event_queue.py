@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.estimator.event_queue import EventQueue, MIN_KNOWN
 from slam_observer_ros.events import (
-    AGREEING_STAMPS,
     AngularVelocityEvent,
     ObservationEvent,
     VelocityEvent,
@@ -112,7 +112,7 @@ def test_two_sensors_may_see_landmarks_at_one_instant(of_another):
 
 def test_what_is_known_of_an_event_does_not_grow_with_its_points():
     queue = filled(observation(3, range(10_000)))
-    ((_, _, content),) = queue._known
+    ((_, _, content),) = queue._events.known
     assert len(content) < 100
 
 
@@ -121,7 +121,7 @@ def test_keys_of_old_events_are_forgotten():
     for k in range(2000):
         queue.push(velocity(SECOND // 100 * k))
         queue.pop_ready()
-    assert len(queue._known) <= MIN_KNOWN
+    assert len(queue._events.known) <= MIN_KNOWN
 
 
 def test_however_many_events_came_since_a_late_one_that_comes_twice_is_refused():

@@ -17,7 +17,6 @@ from slam_observer_ros.evaluation.consistency import (
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.sensor_models.extrinsics import move_observation
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -86,7 +85,7 @@ def under_a_ceiling(settings, seed):
             seen = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < 1.7 * points[:, 2])
             roots = np.linalg.cholesky(ObservationNoise(settings).at(points[seen]))
             noisy = points[seen] + (roots @ rng.normal(size=(len(seen), 3, 1)))[:, :, 0]
-            estimator.add(move_observation(ObservationEvent(stamp_ns, seen, noisy), camera))
+            estimator.add(ObservationEvent(stamp_ns, seen, noisy).moved(camera))
     errors = pose_errors(estimator.pose, true_pose)
     return errors, estimator.pose_covariance, estimator.counts['rejected_landmark']
 

@@ -1,4 +1,4 @@
-"""Alignment recovers rigid motions, and leaves alone what the points don't tell."""
+"""Alignment recovers rigid motions, and leaves alone what the points leave open."""
 
 from __future__ import annotations
 

@@ -9,7 +9,8 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import PointCloud, PointCloud2
 
-from slam_observer_ros.events import AGREEING_STAMPS, ObservationEvent, VelocityEvent
+from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes.publishing.conversions import (

@@ -17,7 +17,6 @@ from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
-from slam_observer_ros.sensor_models.extrinsics import move_velocity
 from slam_observer_ros.settings.input_settings import InputSettings
 
 MS = 1_000_000
@@ -44,12 +43,12 @@ class Wheel:
             events += self.builder.add(message, self.now_ns)
         return events
 
-    def place(self, stamp_ns):
+    def insert_transform(self, stamp_ns):
         self.transforms.insert('base_link', 'wheel', stamp_ns, WHEEL)
 
 
 def of_base(stamp_ns):
-    return move_velocity(VelocityEvent(stamp_ns, V), WHEEL).body_velocity
+    return VelocityEvent(stamp_ns, V).moved(WHEEL).body_velocity
 
 
 @pytest.fixture
@@ -77,7 +76,7 @@ def test_velocities_wait_again_for_a_late_transform_that_has_begun_to_come(log):
     wheel = Wheel(0.1)
     events = wheel.send(20)
     for _ in range(20):
-        wheel.place(wheel.now_ns - 30 * MS)
+        wheel.insert_transform(wheel.now_ns - 30 * MS)
         events += wheel.send(1)
     stamps_ns = [event.stamp_ns for event in events]
     assert stamps_ns == list(range(20 * MS, 20 * MS * (len(events) + 1), 20 * MS))
@@ -91,13 +90,13 @@ def test_a_transform_that_always_comes_too_late_changes_nothing(log):
     wheel = Wheel(0.1)
     events = []
     for _ in range(40):
-        wheel.place(wheel.now_ns - 150 * MS)
+        wheel.insert_transform(wheel.now_ns - 150 * MS)
         events += wheel.send(1)
     assert_array_equal([event.body_velocity for event in events], [V] * len(events))
     assert [record.levelname for record in log.records] == ['WARNING']
 
 
-def test_what_too_many_wait_behind_is_dropped_and_told():
+def test_what_too_many_wait_behind_is_dropped_and_reported():
     drops = []
     transforms = TransformBuffer()
     builder = EventBuilder(BaseFrame(InputSettings(), transforms), 10.0, 0.5, drops.append)
@@ -128,7 +127,7 @@ def everything_placed():
 @pytest.mark.parametrize('frame', ['map', '/map'])
 def test_landmarks_that_the_estimate_itself_would_place_are_refused(frame):
     event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
-    reason = "told in 'map', which is estimated from these very landmarks: publish them in the"
+    reason = "given in 'map', which is estimated from these very landmarks: publish them in the"
     base_frame = BaseFrame(InputSettings(), everything_placed())
     with pytest.raises(TransformError, match=reason):
         base_frame.observation(event, frame)

@@ -16,7 +16,6 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import insert_transforms
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, HISTORY_NS, TransformBuffer
 from slam_observer_ros.messages.poses_and_velocities import decode_transforms
-from slam_observer_ros.sensor_models.extrinsics import move_observation, move_velocity
 
 NO_TURN = [0.0, 0.0, 0.0, 1.0]
 SECOND = 1_000_000_000
@@ -99,7 +98,7 @@ def test_what_was_replaced_takes_no_part_in_what_lies_between():
     assert_allclose(buffer.lookup('odom', 'base', SECOND * 3 // 2), moved)
 
 
-def test_of_static_transforms_the_one_told_last_holds_whatever_its_stamp():
+def test_of_static_transforms_the_last_one_given_holds_whatever_its_stamp():
     buffer = TransformBuffer()
     for stamp_ns in (5 * SECOND, 7 * SECOND, 3 * SECOND):
         placed = se3.pose(np.eye(3), np.full(3, 1e-9 * stamp_ns))
@@ -115,7 +114,7 @@ def test_of_static_transforms_the_one_told_last_holds_whatever_its_stamp():
         ([np.nan, 2.0, 3.0], NO_TURN, 'a coordinate is NaN or infinite'),
     ],
 )
-def test_one_bad_transform_of_a_message_is_left_out_and_told_once(
+def test_one_bad_transform_of_a_message_is_left_out_and_reported_once(
     caplog, position, quaternion, reason
 ):
     transforms = [
@@ -135,7 +134,7 @@ def test_one_bad_transform_of_a_message_is_left_out_and_told_once(
     assert f"A transform on /tf of frame 'gripper' is not used: {reason}" in record.getMessage()
 
 
-def test_a_transform_of_a_frame_to_itself_changes_nothing_and_is_told_once(caplog):
+def test_a_transform_of_a_frame_to_itself_changes_nothing_and_is_reported_once(caplog):
     buffer = TransformBuffer()
     for _ in range(3):
         buffer.insert('odom', 'base', SECOND, np.eye(4))
@@ -190,10 +189,10 @@ def test_a_moved_observation_is_of_the_same_points(sensor, body):
     points = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0]])
     covariances = np.array([np.diag([1.0, 2.0, 3.0])] * 2)
     event = ObservationEvent(0, np.array([1, 2]), points, covariances, points)
-    moved = move_observation(event, sensor)
+    moved = event.moved(sensor)
     world = se3.transform(body @ sensor, points)
     assert_allclose(se3.transform(body, moved.points), world, atol=1e-9)
-    back = move_observation(moved, se3.inverse(sensor))
+    back = moved.moved(se3.inverse(sensor))
     assert_allclose(back.covariances, covariances, atol=1e-9)
     assert_allclose(np.linalg.norm(moved.velocities, axis=1), np.linalg.norm(points, axis=1))
 
@@ -201,7 +200,7 @@ def test_a_moved_observation_is_of_the_same_points(sensor, body):
 @given(poses())
 def test_sensor_and_base_move_as_one_body(sensor):
     V = np.array([0.1, -0.2, 0.3, 1.0, 0.5, -0.4])
-    moved = move_velocity(VelocityEvent(0, V, np.eye(6)), sensor)
+    moved = VelocityEvent(0, V, np.eye(6)).moved(sensor)
     # Base, then sensor, after one second: the same whichever of the two was carried on.
     assert_allclose(se3.exp(moved.body_velocity) @ sensor, sensor @ se3.exp(V), atol=1e-9)
     assert np.linalg.eigvalsh(moved.covariance).min() > 0.0

@@ -29,7 +29,6 @@ from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes.intake.intake import transform_listener
 from slam_observer_ros.nodes.publishing.conversions import header_message
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.sensor_models.extrinsics import move_observation, move_velocity
 from slam_observer_ros.simulation import Scenario, Simulation
 
 pytestmark = pytest.mark.ros
@@ -47,8 +46,7 @@ SCENARIO = Scenario(
 
 def seen_from(sensor_pose, event):
     """Return an event as a sensor at this pose in the base frame measures it."""
-    move = move_velocity if isinstance(event, VelocityEvent) else move_observation
-    return move(event, se3.inverse(sensor_pose))
+    return event.moved(se3.inverse(sensor_pose))
 
 
 def run(ros, robot, on_pose=None):
@@ -161,7 +159,7 @@ class StillBody:
 
     def send(self, event):
         if isinstance(event, VelocityEvent):
-            event = move_velocity(event, WHEEL_POSE)
+            event = event.moved(WHEEL_POSE)
         self.robot.send(event)
 
 

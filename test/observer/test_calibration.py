@@ -357,14 +357,14 @@ def test_a_calibration_that_nobody_can_mean_is_told():
     """Yaw rates with the wrong sign, for which the scale makes up; real wheels are not."""
     wrong = drive(WHEELS, 60.0, scale=np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0]))
     angular, linear = estimate(wrong, WHEELS).calibration
-    assert angular.trouble.startswith('angular_scale_z is -')
-    assert 'times its stated error (0.1) from 1: are signs' in angular.trouble
-    assert not linear.trouble
+    assert angular.problem.startswith('angular_scale_z is -')
+    assert 'times its stated error (0.1) from 1: are signs' in angular.problem
+    assert not linear.problem
     right = estimate(drive(WHEELS, 60.0, scale=WHEEL_SCALE), WHEELS)
-    assert not any(part.trouble for part in right.calibration)
+    assert not any(part.problem for part in right.calibration)
 
 
 def test_a_bias_that_may_drift_is_plausible_wherever_it_is():
     drifts = replace(GYROSCOPE, angular_bias_error=(0.002,) * 3, calibration_drift=1.0)
     estimator = estimate(drive(drifts, 60.0, bias=5.0 * GYROSCOPE_BIAS), drifts)
-    assert not any(part.trouble for part in estimator.calibration)
+    assert not any(part.problem for part in estimator.calibration)

@@ -20,7 +20,6 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.extrinsics import move_observation, move_velocity
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition, transition_covariance
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
@@ -284,7 +283,7 @@ def test_the_part_of_a_velocity_whose_covariance_is_zero_has_the_settings_noise(
     stated[unknown] = 0.0
     sensor = se3.pose(np.eye(3), np.array([0.3, 0.1, 0.0]))
     history = VelocityHistory(10**9)
-    history.append(move_velocity(VelocityEvent(0, np.ones(6), stated), sensor))
+    history.append(VelocityEvent(0, np.ones(6), stated).moved(sensor))
     (Q,) = MotionNoise(Settings()).covariances(history.held(0, 10**8))
     (expected,) = MotionNoise(Settings()).covariances(held(np.ones((1, 6)), [0.1]))
     np.testing.assert_allclose(Q[unknown, unknown], expected[unknown, unknown])
@@ -358,11 +357,11 @@ def test_what_counts_is_the_way_from_the_sensor_wherever_that_sits(model, rng):
         se3.exp(rng.normal(size=6)),
     )
     event = ObservationEvent(0, np.arange(4), rng.normal(scale=3.0, size=(4, 3)))
-    moved, R = move_observation(event, sensor), sensor[:3, :3]
+    moved, R = event.moved(sensor), sensor[:3, :3]
     np.testing.assert_allclose(
         noise.covariances(moved), R @ noise.covariances(event) @ R.T, atol=1e-9
     )
-    back = move_observation(moved, se3.inverse(sensor))
+    back = moved.moved(se3.inverse(sensor))
     np.testing.assert_allclose(back.lines_of_sight, event.points, atol=1e-9)
 
 
@@ -419,7 +418,7 @@ def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor(ga
     estimator = Estimator(settings)
     for step in range(5):
         estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
-        event = move_observation(ObservationEvent(step * 10**8, np.arange(3), sights), sensor)
+        event = ObservationEvent(step * 10**8, np.arange(3), sights).moved(sensor)
         estimator.add(event)
     expected = observed(sights, **noise)
     np.testing.assert_allclose(estimator._slam.match(event).covariances, expected, rtol=0.01)

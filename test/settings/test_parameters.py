@@ -13,9 +13,14 @@ import yaml
 
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.settings import parameter_table
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
-from slam_observer_ros.settings.parameter_file import mixed_lists, read_parameter_file
+from slam_observer_ros.settings.parameter_file import (
+    mixed_lists,
+    names_of_others,
+    read_parameter_file,
+)
 from slam_observer_ros.settings.parameter_table import from_parameters, parameter, table
 from slam_observer_ros.simulation import Scenario
 
@@ -141,6 +146,33 @@ def test_an_unknown_name_is_refused_with_the_one_that_may_be_meant(written, mean
 
 def test_where_no_name_is_near_none_is_suggested():
     assert error_text({'xyzzy': 1}, Settings) == "unknown parameter 'xyzzy'"
+
+
+@pytest.fixture
+def renamed(monkeypatch):
+    monkeypatch.setitem(parameter_table.RENAMED, 'gain_design', 'gains')
+
+
+def test_a_former_name_is_refused_with_the_new_one(renamed):
+    assert error_text({'gain_design': 'constant'}, Settings) == "'gain_design' is now 'gains'"
+
+
+def test_a_former_name_in_a_file_is_refused_by_the_node_that_had_it_only(renamed):
+    with pytest.raises(ParameterError, match=r"^'gain_design' is now 'gains'$"):
+        names_of_others(['exposure', 'gain_design'], [row.name for row in table(Settings)])
+    others = [row.name for row in table(Scenario)]
+    assert names_of_others(['gain_design'], others) == ['gain_design']
+
+
+def test_no_former_name_is_in_use_and_each_new_one_is():
+    names = {row.name for settings_class in TABLES for row in table(settings_class)}
+    assert not names & set(parameter_table.RENAMED)
+    assert names >= set(parameter_table.RENAMED.values())
+
+
+def test_what_a_robot_needs_first_is_about_a_dozen_of_each():
+    for settings_class in (Settings, ObserverNodeSettings):
+        assert 5 <= sum(row.basic for row in table(settings_class)) <= 12
 
 
 junk = st.recursive(
@@ -316,7 +348,7 @@ def test_a_file_without_parameters_is_refused_in_one_line(tmp_path, text, expect
     assert '\n' not in str(error.value)
 
 
-def test_what_is_wrong_with_a_file_is_told_with_its_line(tmp_path):
+def test_what_is_wrong_with_a_file_is_reported_with_its_line(tmp_path):
     path = write(tmp_path, '/**:\n  ros__parameters:\n    gain_k: [1.0\n    gain_l: 2.0\n')
     with pytest.raises(ParameterError, match=r"expected ',' or '\]', but got ':' in line 4$"):
         read_parameter_file(path)
@@ -345,11 +377,11 @@ def test_off_in_a_file_is_no_false(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('numbers', 'is_told'), [('[0.2, 0, 0.4]', True), ('[0.2, 0.0]', False), ('[1, 2]', False)]
+    ('numbers', 'is_reported'), [('[0.2, 0, 0.4]', True), ('[0.2, 0.0]', False), ('[1, 2]', False)]
 )
-def test_a_list_that_the_node_can_not_read_is_told(tmp_path, numbers, is_told):
+def test_a_list_that_the_node_can_not_read_is_reported(tmp_path, numbers, is_reported):
     path = write(tmp_path, f'/**: {{ros__parameters: {{sensor_pose: {numbers}}}}}')
-    assert mixed_lists(read_parameter_file(path)) == ['sensor_pose'] * is_told
+    assert mixed_lists(read_parameter_file(path)) == ['sensor_pose'] * is_reported
 
 
 @pytest.mark.parametrize(

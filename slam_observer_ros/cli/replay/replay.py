@@ -96,7 +96,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     outputs.add_argument('--json', action='store_true', help='print one JSON object')
     add_force_option(parser)
-    add_settings_options(parser)
+    add_settings_options(parser, InputSettings)
     parser.set_defaults(run=run)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_observer_ros.cli.replay.replay_outcome import unused_messages
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.counts import MAX_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -186,8 +186,8 @@ def _warn_of_rejections(result: Replay) -> None:
 def _warn_of_calibration(result: Replay) -> None:
     """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
     for part in result.estimator.calibration:
-        if part.trouble:
-            logger.warning('%s', part.trouble)
+        if part.problem:
+            logger.warning('%s', part.problem)
 
 
 def _warn_of_unmapped(result: Replay) -> None:

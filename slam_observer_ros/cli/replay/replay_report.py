@@ -10,7 +10,7 @@ from pathlib import Path
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.replay.replay_checks import list_dropped
 from slam_observer_ros.cli.replay.replay_outcome import ReplayOutcome
-from slam_observer_ros.counts import point_share, UNUSED_POINTS, used_points
+from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.runs.replay import Replay
 

@@ -130,7 +130,7 @@ class Intake:
 
     def forget(self) -> None:
         """Drop what waits, and what is known of clocks, as after a jump of the clock."""
-        self._builder.forget()
+        self._builder.clear()
         for clock in self.clocks.values():
             clock.clear()
 

@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from slam_observer_ros.counts import MAX_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.nodes.intake.intake import Intake
@@ -149,7 +149,7 @@ class Diagnostics:
         warnings.append(self._rejections_warning(new))
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
-        warnings += [part.trouble for part in self._estimator.calibration]
+        warnings += [part.problem for part in self._estimator.calibration]
         warnings.append(self._outputs.trouble)
         if not self._estimator.is_localised:
             warnings.append('the place in the loaded map is not known yet: no pose is published')

@@ -1,0 +1,31 @@
+"""Stray stamps: one is an error, several that agree are a pause or a jump of the clock."""
+
+from __future__ import annotations
+
+AGREEING_STAMPS = 5
+"""How many stamps in a row must agree before a pause or a jump of the clock is believed."""
+
+NEAR_NS = 1_000_000_000
+"""Stamps nearer than this to the newest one are of no pause or jump, nanoseconds."""
+
+
+class StrayStamps:
+    """Stamps in a row that are far from the newest one, and agree with each other."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: set[int] = set()
+        self.last_ns: int | None = None
+
+    def add(self, stamp_ns: int) -> bool:
+        """Count a stamp, once if it is repeated; clear them and return True if enough agree."""
+        self._stamps_ns.add(stamp_ns)
+        self.last_ns = stamp_ns
+        is_enough = len(self._stamps_ns) >= AGREEING_STAMPS
+        if is_enough:
+            self.clear()
+        return is_enough
+
+    def clear(self) -> None:
+        """Forget them, as a stamp has come that does not agree."""
+        self._stamps_ns.clear()
+        self.last_ns = None
