@@ -15,18 +15,18 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
-from slam_observer_ros.messages.cloud_fields import read_field
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.point_cloud_layout import (
+from slam_observer_ros.messages.cloud_fields import (
     CloudField,
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,
     ID_NAME,
     POINT_FIELD_FLOAT32,
     POINT_NAMES,
+    read_field,
     UNKNOWN_UINT32_ID,
     VELOCITY_NAMES,
 )
+from slam_observer_ros.messages.measurement import Measurement
 
 MAX_UNKNOWN_POINTS = 500
 """Most points without id in a message: telling them apart costs their number cubed."""

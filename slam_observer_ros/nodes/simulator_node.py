@@ -17,14 +17,8 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_cloud2_message,
-    pose_message,
-    time_message,
-    twist_message,
-)
+from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.ros_parameters import declare_settings, read_settings
@@ -113,7 +107,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         elapsed_s = (time.monotonic() - self._start_wall_s) * self._settings.real_time_factor
         now_ns = self._start_ns + to_ns(elapsed_s)
         if self._publishes_clock:
-            self._clock_publisher.publish(Clock(clock=time_message(now_ns)))
+            self._clock_publisher.publish(Clock(clock=MESSAGES.time(now_ns)))
         while self._next is not None and self._next.arrival_ns <= now_ns:
             self._publish(self._next.event)
             self._next = next(self._deliveries, None)
@@ -136,17 +130,17 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
                 self._publish_true_pose(event)
 
     def _publish_velocity(self, event: VelocityEvent) -> None:
-        twist = twist_message(event.body_velocity)
-        if not self._settings.stamped:
-            self._twist.publish(twist)
-            return
-        header = header_message(event.stamp_ns, self._settings.base_frame)
-        self._twist.publish(TwistStamped(header=header, twist=twist))
+        stamp_ns, velocity = event.stamp_ns, event.body_velocity
+        if self._settings.stamped:
+            frame = self._settings.base_frame
+            self._twist.publish(MESSAGES.twist_stamped(stamp_ns, frame, velocity))
+        else:
+            self._twist.publish(MESSAGES.twist(velocity))
 
     def _publish_observation(self, event: ObservationEvent) -> None:
         contents = (event.stamp_ns, self._settings.base_frame, event.ids, event.points)
         if self._settings.landmarks_type == 'PointCloud2':
-            self._landmarks.publish(point_cloud2_message(*contents, velocities=event.velocities))
+            self._landmarks.publish(MESSAGES.point_cloud2(*contents, velocities=event.velocities))
         else:
             self._landmarks.publish(encode_point_cloud(*contents))
 
@@ -161,15 +155,15 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         )
 
     def _publish_true_pose(self, truth: PoseTruth) -> None:
-        header = header_message(truth.stamp_ns, self._settings.truth_frame)
-        self._true_pose.publish(PoseStamped(header=header, pose=pose_message(truth.pose)))
+        frame = self._settings.truth_frame
+        self._true_pose.publish(MESSAGES.pose_stamped(truth.stamp_ns, frame, truth.pose))
         if self._scenario.landmark_speed > 0.0:
             self._publish_true_landmarks(truth.stamp_ns)
 
     def _publish_true_landmarks(self, stamp_ns: int) -> None:
         truth = self._simulation.landmark_truth(stamp_ns)
         self._true_landmarks.publish(
-            point_cloud2_message(
+            MESSAGES.point_cloud2(
                 stamp_ns, self._settings.truth_frame, truth.ids, truth.world_points
             )
         )

@@ -29,17 +29,10 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.message_types import IMU
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
+from slam_observer_ros.nodes.intake import decoders, subscriptions
 from slam_observer_ros.nodes.intake.input_topics import open_inputs
-from slam_observer_ros.nodes.intake.intake import decoders
-from slam_observer_ros.nodes.intake.intake import subscriptions as inputs
 from slam_observer_ros.nodes.intake.subscriptions import Input
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_message,
-    pose_message,
-    twist_message,
-    vector_message,
-)
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -58,22 +51,22 @@ def true_pose(stamp_ns, start_ns):
 
 
 def odometry(stamp, start_ns, velocity=V):
-    message = Odometry(header=header_message(stamp, 'odom'), child_frame_id='base_link')
-    message.pose.pose = pose_message(true_pose(stamp, start_ns))
-    message.twist.twist = twist_message(velocity)
+    message = Odometry(header=MESSAGES.header(stamp, 'odom'), child_frame_id='base_link')
+    message.pose.pose = MESSAGES.pose(true_pose(stamp, start_ns))
+    message.twist.twist = MESSAGES.twist(velocity)
     return message
 
 
 def twist_with_covariance(stamp, _start_ns):
-    message = TwistWithCovarianceStamped(header=header_message(stamp, 'base_link'))
-    message.twist.twist = twist_message(V)
+    message = TwistWithCovarianceStamped(header=MESSAGES.header(stamp, 'base_link'))
+    message.twist.twist = MESSAGES.twist(V)
     message.twist.covariance = (np.eye(6) * 1e-4).ravel()
     return message
 
 
 def imu(stamp, _start_ns):
-    message = Imu(header=header_message(stamp, 'base_link'))
-    message.angular_velocity = vector_message(V[:3])
+    message = Imu(header=MESSAGES.header(stamp, 'base_link'))
+    message.angular_velocity = MESSAGES.vector(V[:3])
     return message
 
 
@@ -306,8 +299,8 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
                 ('odom', 'base_link', np.eye(4)),
                 stamp_ns=stamp,
             )
-            point = Pose(position=point_message(np.ones(3)))
-            header = header_message(stamp, 'base_link')
+            point = Pose(position=MESSAGES.point(np.ones(3)))
+            header = MESSAGES.header(stamp, 'base_link')
             poses.publish(PoseArray(header=header, poses=[point]))
             ros.spin_for(0.03)
         ros.spin_until(lambda: len(seen(maps)) == 2, 'two fiducials')
@@ -364,13 +357,13 @@ def test_optional_packages_are_named_when_they_are_missing(tmp_path):
 
 def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatch):
     clock = SimpleNamespace(now_s=1000.0)
-    monkeypatch.setattr(inputs, 'time', SimpleNamespace(monotonic=lambda: clock.now_s))
+    monkeypatch.setattr(subscriptions, 'time', SimpleNamespace(monotonic=lambda: clock.now_s))
     node, qos = Mock(), QoSProfile(depth=1)
     node.resolve_topic_name.return_value = '/twist'
     node.get_clock.return_value.now.return_value.nanoseconds = 0
     publisher = SimpleNamespace(topic_type=IMU, qos_profile=qos, node_name='driver')
     node.get_publishers_info_by_topic.return_value = [publisher]
-    source = inputs.Input(node, 'twist', {IMU: lambda raw, receive_ns: raw}, Mock(), qos)
+    source = Input(node, 'twist', {IMU: lambda raw, receive_ns: raw}, Mock(), qos)
     receive = node.create_subscription.call_args.args[2]
     warning = node.get_logger.return_value.warning
 

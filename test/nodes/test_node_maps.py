@@ -26,13 +26,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_cloud2_message,
-    pose_covariance_field,
-    pose_message,
-    twist_message,
-)
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPose
 from slam_observer_ros.nodes.services.map_services import free_name
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -81,11 +75,11 @@ class Robot:
         ids = np.array(list(ids), dtype=np.int64)
         points = se3.transform(se3.inverse(pose), self.points[ids])
         points += self.random.normal(scale=NOISE_M, size=points.shape)
-        twist = TwistStamped(header=header_message(time.time_ns(), 'base_link'))
-        twist.twist = twist_message(np.zeros(6))
+        twist = TwistStamped(header=MESSAGES.header(time.time_ns(), 'base_link'))
+        twist.twist = MESSAGES.twist(np.zeros(6))
         self.twist.publish(twist)
         self.ros.spin_for(0.1)
-        message = point_cloud2_message(time.time_ns(), 'base_link', ids, points)
+        message = MESSAGES.point_cloud2(time.time_ns(), 'base_link', ids, points)
         self.landmarks.publish(message)
         return message.header.stamp
 
@@ -134,9 +128,8 @@ def name_file(ros, path, must_succeed=True):
 
 
 def initial_pose(pose, frame_id='map', variances=(0.01,) * 6):
-    message = PoseWithCovarianceStamped(header=header_message(time.time_ns(), frame_id))
-    message.pose.pose = pose_message(pose)
-    message.pose.covariance = pose_covariance_field(np.diag(variances))
+    message = PoseWithCovarianceStamped(header=MESSAGES.header(time.time_ns(), frame_id))
+    message.pose = MESSAGES.pose_with_covariance(pose, np.diag(variances))
     return message
 
 
@@ -467,7 +460,7 @@ def test_without_ids_the_pose_in_a_map_is_asked_for(ros, robot, tmp_path):
 
     def see_without_ids():
         ids, points = np.full(3, UNKNOWN_ID), robot.points[2:5]
-        robot.landmarks.publish(point_cloud2_message(time.time_ns(), 'base_link', ids, points))
+        robot.landmarks.publish(MESSAGES.point_cloud2(time.time_ns(), 'base_link', ids, points))
         ros.spin_for(0.1)
 
     with running('observer_node', tmp_path / 'log', map_file=surveyed, **PARAMETERS) as node:

@@ -27,8 +27,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
-from slam_observer_ros.nodes.publishing.conversions import header_message
 from slam_observer_ros.nodes.publishing.diagnostics import Diagnostics as NodeDiagnostics
 from slam_observer_ros.nodes.publishing.diagnostics import MANY_UNUSED
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
@@ -493,7 +493,7 @@ class OneSidedRobot:
         ]
 
     def send(self):
-        header = header_message(time.time_ns(), 'base_link')
+        header = MESSAGES.header(time.time_ns(), 'base_link')
         for publisher in self.publishers:
             publisher.publish(publisher.msg_type(header=header))
         self.ros.spin_for(0.02)

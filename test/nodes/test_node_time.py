@@ -29,7 +29,7 @@ from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.intake.intake import Intake
-from slam_observer_ros.nodes.publishing.conversions import time_message
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -45,7 +45,7 @@ RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=1.5, initial_
 @pytest.fixture(scope='module')
 def clock(ros):
     publisher = ros.node.create_publisher(Clock, '/clock', 100)
-    yield lambda now_ns: publisher.publish(Clock(clock=time_message(now_ns)))
+    yield lambda now_ns: publisher.publish(Clock(clock=MESSAGES.time(now_ns)))
     ros.node.destroy_publisher(publisher)
 
 
@@ -125,7 +125,7 @@ def test_unstamped_velocity_waits_for_the_clock_to_begin(ros, clock, tmp_path):
         node.wait_for_output(r'no_clock.*/clock has not begun')
         assert not poses
         for step in range(1, 6):
-            own_clock.publish(Clock(clock=time_message(step * SECOND // 10)))
+            own_clock.publish(Clock(clock=MESSAGES.time(step * SECOND // 10)))
             ros.spin_for(0.05)
             robot.send(VelocityEvent(0, np.zeros(6)))
             ros.spin_for(0.05)
@@ -146,8 +146,8 @@ def test_a_clock_that_steps_back_a_little_has_not_jumped(ros, tmp_path):
 
         def play_a_second(start_ns):
             for stamp in range(start_ns, start_ns + SECOND, SECOND // 20):
-                own_clock.publish(Clock(clock=time_message(stamp)))
-                own_clock.publish(Clock(clock=time_message(stamp - 1_000_000)))
+                own_clock.publish(Clock(clock=MESSAGES.time(stamp)))
+                own_clock.publish(Clock(clock=MESSAGES.time(stamp - 1_000_000)))
                 robot.send(VelocityEvent(stamp, np.zeros(6)))
                 robot.send(ObservationEvent(stamp, np.array([1]), np.ones((1, 3))))
                 ros.spin_for(0.01)
@@ -156,7 +156,7 @@ def test_a_clock_that_steps_back_a_little_has_not_jumped(ros, tmp_path):
         play_a_second(101 * SECOND)
         ros.spin_until(lambda: landmark_count(maps), 'the map')
         assert 'The clock has jumped' not in node.output
-        own_clock.publish(Clock(clock=time_message(101 * SECOND + SECOND // 2)))
+        own_clock.publish(Clock(clock=MESSAGES.time(101 * SECOND + SECOND // 2)))
         node.wait_for_output('The clock has jumped')
 
 

@@ -11,11 +11,10 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.messages.cloud_fields import missing_ids, read_fields
+from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import CLOUD_DECODERS
-from slam_observer_ros.messages.point_cloud_layout import ID_NAME
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_odometry_pose,
     decode_odometry_twist,

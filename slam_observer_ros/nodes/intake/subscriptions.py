@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import importlib
 import time
 from typing import Any, Generic, TypeVar
 
@@ -12,10 +11,11 @@ from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from slam_observer_ros.common.errors import MessageError, ParameterError
+from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.intake.backlog import Backlog
+from slam_observer_ros.nodes.message_classes import message_class
 
 REPORT_PERIOD_S = 10.0
 """Shortest time between two reports about one topic."""
@@ -209,22 +209,3 @@ class Input(Generic[MessageT]):
                     f'service does not fit: {reason.strip()}'
                 )
         return ''
-
-
-def message_class(type_name: str) -> Any:
-    """Import the class of a message type such as ``vision_msgs/msg/Detection3DArray``.
-
-    Raises
-    ------
-    ParameterError
-        If its package is not installed.
-
-    """
-    package, _, name = type_name.split('/')
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), name)
-    except ImportError as error:
-        raise ParameterError(
-            f'{type_name} needs the package {package}: '
-            f'apt install ros-jazzy-{package.replace("_", "-")}'
-        ) from error

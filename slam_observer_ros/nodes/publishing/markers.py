@@ -9,11 +9,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.nodes.publishing.conversions import (
-    point_message,
-    quaternion_message,
-    vector_message,
-)
+from slam_observer_ros.nodes.message_classes import MESSAGES
 
 POINT_SIZE_M = 0.2
 TEXT_HEIGHT_M = 0.3
@@ -69,7 +65,7 @@ def no_markers(header: Header) -> MarkerArray:
 
 def _points(header: Header, points: FloatArray) -> Marker:
     marker = _marker(header, 'landmarks', Marker.SPHERE_LIST, GREEN, POINT_SIZE_M)
-    marker.points = [point_message(point) for point in points]
+    marker.points = [MESSAGES.point(point) for point in points]
     return marker
 
 
@@ -86,9 +82,9 @@ def _ellipsoids(
     for number, (point, size, turn) in enumerate(zip(points, sizes_m, axes, strict=False)):
         marker = _marker(header, 'uncertainties', Marker.SPHERE, PALE_GREEN, MIN_SIZE_M)
         marker.id = number
-        marker.pose.position = point_message(point)
-        marker.pose.orientation = quaternion_message(turn)
-        marker.scale = vector_message(np.maximum(size, MIN_SIZE_M))
+        marker.pose.position = MESSAGES.point(point)
+        marker.pose.orientation = MESSAGES.quaternion(turn)
+        marker.scale = MESSAGES.vector(np.maximum(size, MIN_SIZE_M))
         markers.append(marker)
     return markers
 
@@ -101,7 +97,7 @@ def _residual_lines(header: Header, estimator: Estimator) -> Marker:
         _, seen, rows = np.intersect1d(update.ids, estimator.landmark_ids, return_indices=True)
         ends = estimator.world_points[rows]
         lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
-        marker.points = [point_message(point) for point in lines]
+        marker.points = [MESSAGES.point(point) for point in lines]
     return marker
 
 
@@ -109,7 +105,7 @@ def _label(header: Header, number: int, landmark_id: int, point: FloatArray) -> 
     marker = _marker(header, 'ids', Marker.TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)
     marker.id = number
     marker.text = str(landmark_id)
-    marker.pose.position = point_message(point)
+    marker.pose.position = MESSAGES.point(point)
     marker.pose.position.z += TEXT_HEIGHT_M
     return marker
 

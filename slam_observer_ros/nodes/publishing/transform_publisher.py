@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.nodes.publishing.conversions import header_message, transform_message
+from slam_observer_ros.nodes.message_classes import MESSAGES
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -42,9 +41,5 @@ class TransformPublisher:
         """Publish the pose (4, 4) of frame ``child`` in frame ``parent``."""
         if self._publisher is None:
             return
-        transform = TransformStamped(
-            header=header_message(stamp_ns, parent),
-            child_frame_id=child,
-            transform=transform_message(pose),
-        )
+        transform = MESSAGES.transform_stamped(stamp_ns, parent, child, pose)
         self._publisher.publish(TFMessage(transforms=[transform]))
