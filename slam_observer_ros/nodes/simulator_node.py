@@ -23,6 +23,7 @@ from slam_observer_ros.nodes.publishing.transform_publisher import TransformPubl
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.ros_parameters import declare_settings, read_settings
 from slam_observer_ros.nodes.runner import run
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
 
@@ -41,8 +42,6 @@ ACKNOWLEDGED_S = 10.0
 SIMULATED_EPOCH_NS = 1_000_000_000
 """First stamp where /clock is simulated; zero would mean 'no time yet'."""
 
-WAIT_REPORT_PERIOD_S = 10.0
-
 
 class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
     """Publishes a :class:`Simulation` in real time, or faster or slower with ``/clock``."""
@@ -53,6 +52,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._settings = read_settings(self, SimulatorNodeSettings)
         self._scenario = read_settings(self, Scenario)
         self._create_publishers()
+        self._log = ThrottledLog(self)
         self._steady_clock = RosClock(clock_type=ClockType.STEADY_TIME)
         self._wait_timer = self.create_timer(TICK_S, self._wait, clock=self._steady_clock)
 
@@ -79,10 +79,10 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
             if publisher.get_subscription_count() < needed
         ]
         if lacking:
-            self.get_logger().info(
-                f'waiting for {needed} subscriber(s) on {" and ".join(lacking)}'
-                ' (parameter wait_for_subscribers)',
-                throttle_duration_sec=WAIT_REPORT_PERIOD_S,
+            topics = ' and '.join(lacking)
+            self._log.info(
+                topics,
+                f'waiting for {needed} subscriber(s) on {topics} (parameter wait_for_subscribers)',
             )
             return
         self.destroy_timer(self._wait_timer)

@@ -29,7 +29,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.message_types import IMU
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
-from slam_observer_ros.nodes.intake import decoders, subscriptions
+from slam_observer_ros.nodes.intake import decoders
 from slam_observer_ros.nodes.intake.input_topics import open_inputs
 from slam_observer_ros.nodes.intake.subscriptions import Input
 from slam_observer_ros.nodes.message_classes import MESSAGES
@@ -357,7 +357,7 @@ def test_optional_packages_are_named_when_they_are_missing(tmp_path):
 
 def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatch):
     clock = SimpleNamespace(now_s=1000.0)
-    monkeypatch.setattr(subscriptions, 'time', SimpleNamespace(monotonic=lambda: clock.now_s))
+    monkeypatch.setattr(time, 'monotonic', lambda: clock.now_s)
     node, qos = Mock(), QoSProfile(depth=1)
     node.resolve_topic_name.return_value = '/twist'
     node.get_clock.return_value.now.return_value.nanoseconds = 0

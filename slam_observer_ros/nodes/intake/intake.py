@@ -29,10 +29,8 @@ from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_trouble
 from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
-
-REPORT_PERIOD_S = 10.0
-"""Shortest time between two reports of one kind of drop."""
 
 SOURCES: dict[type[Event], str] = {
     VelocityEvent: 'twist',
@@ -87,7 +85,7 @@ class Intake:
             estimator.settings.velocity_timeout,
             self._drop_measured,
         )
-        self._quiet_until_s: dict[str, float] = {}
+        self._log = ThrottledLog(node)
         self._processing_s = 0.0
         self._processed = 0
         self.dropped: Counter[str] = Counter()
@@ -106,7 +104,7 @@ class Intake:
             return
         if timed is not measured:
             told = f'stamps are zero on {self._topics[source]}'
-            self._warn(told, f'{told}: the time of reception is taken instead')
+            self._log.warning(told, f'{told}: the time of reception is taken instead')
         self._use(self._builder.add(timed, time.monotonic_ns()))
 
     def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
@@ -196,7 +194,7 @@ class Intake:
         clock.add(stamp_ns, receive_ns)
         if not self._settings.correct_clock_offset:
             if clock.is_off:
-                self._warn(source, clock.trouble(self._topics[source], self._is_simulated))
+                self._log.warning(source, clock.trouble(self._topics[source], self._is_simulated))
         elif clock.correction_ns != before_ns:
             fate = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
             topic = self._topics[source]
@@ -204,10 +202,5 @@ class Intake:
 
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
-        self._warn(reason, f'dropped a message ({reason}, {self.dropped[reason]} so far): {text}')
-
-    def _warn(self, subject: str, text: str) -> None:
-        now_s = time.monotonic()
-        if now_s >= self._quiet_until_s.get(subject, now_s):
-            self._quiet_until_s[subject] = now_s + REPORT_PERIOD_S
-            self._node.get_logger().warning(text)
+        count = self.dropped[reason]
+        self._log.warning(reason, f'dropped a message ({reason}, {count} so far): {text}')

@@ -16,9 +16,7 @@ from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.intake.backlog import Backlog
 from slam_observer_ros.nodes.message_classes import message_class
-
-REPORT_PERIOD_S = 10.0
-"""Shortest time between two reports about one topic."""
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.
@@ -97,7 +95,7 @@ class Input(Generic[MessageT]):
         self._fault = ''
         self.backlog = Backlog()
         self.last_received_s: float | None = None
-        self._quiet_until_s = time.monotonic() + DISCOVERY_S
+        self._log = ThrottledLog(node, DISCOVERY_S)
         if len(decoders) == 1:
             self._subscribe(next(iter(decoders)))
 
@@ -130,7 +128,7 @@ class Input(Generic[MessageT]):
             self._subscribe(usable[0])
         self._fault = self._find_fault(publishers, usable)
         if trouble := self.trouble:
-            self._warn(trouble)
+            self._log.warning(self.topic, trouble)
 
     def close(self) -> None:
         """Stop receiving."""
@@ -169,7 +167,7 @@ class Input(Generic[MessageT]):
             message = self._decoders[self._type_name](raw, receive_ns)
         except MessageError as error:
             self.malformed += 1
-            self._warn(f"malformed message on '{self.topic}' dropped: {error}")
+            self._log.warning(self.topic, f"malformed message on '{self.topic}' dropped: {error}")
             return
         self._on_message(message, receive_ns)
 
@@ -185,13 +183,6 @@ class Input(Generic[MessageT]):
             if not clock.ros_time_is_active:
                 return received_ns
         return int(clock.now().nanoseconds)
-
-    def _warn(self, text: str) -> None:
-        # rclpy throttles by line of code, so one topic's report would silence the other's.
-        now_s = time.monotonic()
-        if now_s >= self._quiet_until_s:
-            self._quiet_until_s = now_s + REPORT_PERIOD_S
-            self._node.get_logger().warning(text)
 
     def _find_fault(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
         """Return why no publisher can be heard; empty if all can."""

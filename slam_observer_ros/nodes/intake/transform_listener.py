@@ -16,6 +16,7 @@ from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.poses_and_velocities import decode_transforms, pose_matrices
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
 try:
     import tf2_ros
@@ -42,6 +43,7 @@ class TopicTransforms:
     def __init__(self, node: Node, own: tuple[str, str]) -> None:
         self._node = node
         self._own = own
+        self._log = ThrottledLog(node)
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
         self.newest_ns = self._buffer.newest_ns
@@ -56,9 +58,7 @@ class TopicTransforms:
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
-                self._node.get_logger().warning(
-                    f"malformed message on '{topic}' dropped: {error}", throttle_duration_sec=10.0
-                )
+                self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
                 return
             others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
             insert_transforms(self._buffer, others, is_static=is_static)

@@ -14,6 +14,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 DISCOVERY_S = 2.0
@@ -28,9 +29,6 @@ LATE_NS = 500_000_000
 
 LOOK_PERIOD_S = 0.5
 """Time between two looks for another parent of the base."""
-
-REPORT_PERIOD_S = 10.0
-"""Shortest time between two reports of odometry that is behind."""
 
 
 class PoseBroadcaster:
@@ -70,6 +68,7 @@ class PoseBroadcaster:
         self._node = node
         self._settings = settings
         self._transforms = transforms
+        self._log = ThrottledLog(node)
         self._publisher = TransformPublisher(node, '/tf', RELIABLE_QOS)
         self._tolerance_ns = to_ns(settings.transform_tolerance)
         self._held_back_ns = to_ns(reorder_window_s)
@@ -167,7 +166,7 @@ class PoseBroadcaster:
 
     def _report(self, trouble: str) -> None:
         self.trouble = trouble
-        self._node.get_logger().warning(trouble, throttle_duration_sec=REPORT_PERIOD_S)
+        self._log.warning('/tf', trouble)
 
     def _publish_correction(self, newest_ns: int | None) -> None:
         """Publish the newest correction that the odometry known by now gives."""
