@@ -30,7 +30,7 @@ def insert_transforms(
     """Put the transforms of a message on /tf or /tf_static into a buffer, without the bad ones."""
     good = []
     for transform in transforms:
-        if trouble := transform.trouble:
+        if trouble := transform.problem:
             buffer.refuse(transform.child_frame_id, trouble)
         else:
             good.append(transform)

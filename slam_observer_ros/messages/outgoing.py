@@ -145,25 +145,9 @@ class OutgoingMessages:
     ) -> Any:
         """Make a sensor_msgs/PointCloud2: x y z float32, id uint32, and what else is given.
 
-        RViz and Foxglove display these fields. ``UNKNOWN_ID`` becomes 2³² - 1, as -1 has the same
-        bits.
-
-        Parameters
-        ----------
-        stamp_ns : int
-        frame_id : str
-        ids : IntArray
-        points : FloatArray
-        covariances : FloatArray or None
-            (n, 3, 3) covariances, m².
-        velocities : FloatArray or None
-            (n, 3) velocities of the landmarks themselves, m/s.
-
-        Raises
-        ------
-        MessageError
-            If an id doesn't fit into a uint32.
-
+        RViz and Foxglove display these fields. Covariances are (n, 3, 3), m², and velocities of
+        the landmarks themselves (n, 3), m/s. ``UNKNOWN_ID`` becomes 2³² - 1; any other id that
+        doesn't fit into a uint32 raises a MessageError.
         """
         records = _cloud_records(ids, points, covariances, velocities)
         fields = [
@@ -218,7 +202,7 @@ def encode_point_cloud(stamp_ns: int, frame_id: str, ids: IntArray, points: Floa
 
 
 def _covariance_field(covariance: FloatArray | None) -> FloatArray:
-    """Return 36 numbers, position first; −1 in the first place, as in Imu, if it is unknown."""
+    """Return 36 numbers, position first; −1 first, as in Imu, if it is unknown."""
     if covariance is None:
         return np.array([-1.0] + [0.0] * 35)
     field: FloatArray = covariance[_LINEAR_FIRST][:, _LINEAR_FIRST].ravel()

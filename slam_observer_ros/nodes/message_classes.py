@@ -13,14 +13,7 @@ from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 @cache
 def message_class(type_name: str) -> Any:
-    """Import the class of a type such as ``vision_msgs/msg/Detection3DArray``.
-
-    Raises
-    ------
-    ParameterError
-        If its package is not installed.
-
-    """
+    """Import a type such as ``sensor_msgs/msg/Imu``; ParameterError without its package."""
     package, _, name = type_name.split('/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)

@@ -27,20 +27,11 @@ from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
 
-QUEUE_DEPTH = 1000
-"""Deep enough that nothing is lost while a reliable reader falls behind for a moment."""
-
-TICK_S = 0.005
-"""Wall time between two looks at what is due."""
-
-MATCH_DELAY_S = 1.0
-"""A publisher knows of its reader before the reader can receive; wait so much longer."""
-
-ACKNOWLEDGED_S = 10.0
-"""How long the last messages may be on their way, as on a busy machine."""
-
-SIMULATED_EPOCH_NS = 1_000_000_000
-"""First stamp where /clock is simulated; zero would mean 'no time yet'."""
+QUEUE_DEPTH = 1000  # nothing is lost while a reliable reader falls behind for a moment
+TICK_S = 0.005  # wall time between two checks of what is due
+MATCH_DELAY_S = 1.0  # a publisher knows of its reader before the reader can receive
+ACKNOWLEDGED_S = 10.0  # how long the last messages may be on their way, as on a busy machine
+SIMULATED_EPOCH_NS = 1_000_000_000  # first stamp of a simulated /clock; zero means 'no time yet'
 
 
 class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
@@ -73,13 +64,13 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
     def _wait(self) -> None:
         """Start once the subscribers are there: the biased first sighting must not be missed."""
         needed = self._settings.wait_for_subscribers
-        lacking = [
+        missing = [
             publisher.topic_name
             for publisher in (self._twist, self._landmarks)
             if publisher.get_subscription_count() < needed
         ]
-        if lacking:
-            topics = ' and '.join(lacking)
+        if missing:
+            topics = ' and '.join(missing)
             self._log.info(
                 topics,
                 f'waiting for {needed} subscriber(s) on {topics} (parameter wait_for_subscribers)',
@@ -145,7 +136,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
             self._landmarks.publish(encode_point_cloud(*contents))
 
     def _publish_start(self) -> None:
-        """Tell where an estimate that starts at the identity lies in the true world."""
+        """Publish the pose, in the true world, of an estimate that starts at the identity."""
         self._start_transform = TransformPublisher(self, '/tf_static', LATCHED_QOS)
         self._start_transform.publish(
             self._start_ns,

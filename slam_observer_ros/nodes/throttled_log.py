@@ -13,14 +13,8 @@ REPORT_PERIOD_S = 10.0
 class ThrottledLog:
     """A node's log, with one line about each subject in ``REPORT_PERIOD_S``.
 
-    rclpy throttles by line of code: there one topic's report would silence another's.
-
-    Parameters
-    ----------
-    node : Node
-    quiet_s : float
-        How long nothing is logged at first.
-
+    rclpy throttles by line of code: there one topic's report would silence another's. Nothing is
+    logged in the first ``quiet_s`` seconds.
     """
 
     def __init__(self, node: Node, quiet_s: float = 0.0) -> None:

@@ -145,7 +145,7 @@ def test_the_largest_id_is_taken():
     assert cloud.width == 1
 
 
-def test_fiducials_on_tf_are_told_by_their_names():
+def test_fiducials_on_tf_are_known_by_their_names():
     seen = observed_tags(
         [
             transform('left', 'tag36h11:7', 1.0),

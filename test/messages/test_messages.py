@@ -201,7 +201,7 @@ class TestPointCloud:
         assert 'id' not in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
 
     @pytest.mark.parametrize('bad_id', [0.5, -2.0, np.nan, np.inf, 2.0**24])
-    def test_id_that_float32_cannot_tell_is_refused(self, bad_id):
+    def test_id_that_float32_cannot_hold_is_refused(self, bad_id):
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.array([1, bad_id])}))
         with pytest.raises(MessageError, match='not a whole number'):
             point_clouds.decode_point_cloud(raw)

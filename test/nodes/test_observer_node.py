@@ -46,7 +46,7 @@ def shared_observer(ros, tmp_path_factory):
 
 @pytest.fixture
 def observer(ros, shared_observer):
-    """Give a node that has forgotten what the test before told it."""
+    """Give a node that has forgotten what the test before sent."""
     ros.call(Trigger, '/observer_node/reset', Trigger.Request())
     return shared_observer
 

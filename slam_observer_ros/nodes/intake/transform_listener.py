@@ -28,16 +28,10 @@ TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCA
 
 
 class TopicTransforms:
-    """A listener of /tf and /tf_static of our own.
+    """A listener of /tf and /tf_static of our own; without tf2_msgs no transform is ever known.
 
-    Parameters
-    ----------
-    node : Node
-        Node that subscribes; without tf2_msgs no transform is ever known.
-    own : tuple of str
-        Parent and child of the transform that the node itself publishes where nobody else tells
-        the child's parent: heard back, it would take the place of another parent.
-
+    ``own`` are parent and child of the transform that the node itself publishes where nobody else
+    gives the child a parent: heard back, it would replace another parent.
     """
 
     def __init__(self, node: Node, own: tuple[str, str]) -> None:
@@ -67,14 +61,7 @@ class TopicTransforms:
 
 
 class Tf2Transforms:
-    """tf2_ros's buffer and listener.
-
-    Parameters
-    ----------
-    node : Node
-        Node that subscribes.
-
-    """
+    """tf2_ros's buffer and listener."""
 
     def __init__(self, node: Node) -> None:
         self._buffer = tf2_ros.Buffer()
@@ -112,9 +99,6 @@ class Tf2Transforms:
 
 
 def open_transforms(node: Node, own: tuple[str, str]) -> TransformSource:
-    """Return tf2_ros's buffer where ROS provides it, else a listener of our own.
-
-    ``own`` are parent and child of what the node itself may publish.
-    """
-    # tf2 keeps the parent of each stamp, so that one does not take the place of another.
+    """Return tf2_ros's buffer where ROS provides it, else :class:`TopicTransforms`."""
+    # tf2 keeps the parent of each stamp, so that one does not replace another.
     return TopicTransforms(node, own) if tf2_ros is None else Tf2Transforms(node)

@@ -20,28 +20,15 @@ WHITE = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
 PALE_GREEN = ColorRGBA(r=0.0, g=0.62, b=0.45, a=0.3)
 ORANGE = ColorRGBA(r=0.84, g=0.37, b=0.0, a=1.0)
 
-MAX_LABELS = 200
-"""Landmarks that get a text; more could not be read, and each is a message of its own."""
-
-ELLIPSOID_SIGMAS = 3.0
-"""Half axes of the ellipsoids, in standard deviations."""
-
-MIN_SIZE_M = 1e-3
-"""RViz complains about markers without a size."""
+MAX_LABELS = 200  # more could not be read, and each is a message of its own
+ELLIPSOID_SIGMAS = 3.0  # half axes, in standard deviations
+MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
 
 
 def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
     """Return markers that replace all earlier ones.
 
-    Points, ids, the last residuals and, where covariances are known, ellipsoids.
-
-    Parameters
-    ----------
-    header : Header
-        Map frame and stamp of the state.
-    estimator : Estimator
-        Whose map is drawn.
-
+    They are points, ids, the last residuals and, where covariances are known, ellipsoids.
     """
     points = estimator.world_points
     if not len(points):
@@ -59,7 +46,7 @@ def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
 
 
 def no_markers(header: Header) -> MarkerArray:
-    """Return what takes all earlier markers away."""
+    """Return what removes all earlier markers."""
     return MarkerArray(markers=[Marker(header=header, action=Marker.DELETEALL)])
 
 

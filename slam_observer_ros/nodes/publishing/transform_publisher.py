@@ -17,17 +17,9 @@ __all__ = ['TFMessage', 'TransformPublisher']
 
 
 class TransformPublisher:
-    """Publishes single transforms; without tf2_msgs it says so once and does nothing.
+    """Publishes single transforms on ``/tf``, or latched on ``/tf_static``.
 
-    Parameters
-    ----------
-    node : Node
-        Node that publishes.
-    topic : str
-        ``/tf`` or ``/tf_static``.
-    qos : QoSProfile
-        Volatile for the one, latched for the other.
-
+    Without tf2_msgs it logs so once and does nothing.
     """
 
     def __init__(self, node: Node, topic: str, qos: QoSProfile) -> None:

@@ -30,24 +30,12 @@ PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
 
 
-class Outputs:
-    """Publishers of the estimate.
+class EstimatePublisher:
+    """Publishes the estimate on ``TOPICS`` and /tf; ``transforms`` has others' odometry.
 
     Each message carries the stamp of the estimator's state, never the present time, and no stamp
-    is published twice, unless landmarks were forgotten. Nothing is published while the place in a
-    loaded map is unknown, but an empty map in place of one that is out.
-
-    Parameters
-    ----------
-    node : Node
-        Node that publishes.
-    settings : ObserverNodeSettings
-        Frames, rates and lengths.
-    estimator : Estimator
-        Where the estimate comes from.
-    transforms : TransformSource
-        Where others' odometry is.
-
+    is published twice, unless landmarks were forgotten. Nothing is published while the pose in a
+    loaded map is unknown, but an empty map instead of one that is out.
     """
 
     def __init__(
@@ -78,9 +66,9 @@ class Outputs:
             )
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why the transform is not published as it should be; empty while it is."""
-        return '' if self._broadcaster is None else self._broadcaster.trouble
+        return '' if self._broadcaster is None else self._broadcaster.problem
 
     def publish_state(self) -> None:
         """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
@@ -108,7 +96,7 @@ class Outputs:
         self._path_publisher.publish(Path(header=header, poses=list(self._path)))
         self._publish_landmarks(stamp_ns)
 
-    def renew_landmarks(self) -> None:
+    def replace_landmarks(self) -> None:
         """Replace map and markers, if any are out, as some of their landmarks are forgotten."""
         if self._slow_stamp_ns is None:
             return
@@ -127,16 +115,16 @@ class Outputs:
         if self._broadcaster is not None:
             self._broadcaster.repeat(self._node.get_clock().now().nanoseconds)
 
-    def begin_anew(self) -> None:
-        """Forget the path and what waits: the estimate is at another place, frame or time.
+    def reset(self) -> None:
+        """Forget the path and what waits: the estimate has another pose, frame or time.
 
         The map that is out, which is latched, and the markers are replaced.
         """
         self._path.clear()
         self._path_stamp_ns = None
         if self._broadcaster is not None:
-            self._broadcaster.forget()
-        self.renew_landmarks()
+            self._broadcaster.clear()
+        self.replace_landmarks()
 
     def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
         header = MESSAGES.header(stamp_ns, self._settings.map_frame)
