@@ -50,7 +50,8 @@ class ObserverCore:
         self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
-        self._estimator = Estimator(estimator_settings, on_jump=self._follow_jump)
+        self._estimator = Estimator(estimator_settings, on_jump=self._on_estimator_jump)
+        # What comes in and what goes out
         self._transforms = open_transforms(node, (settings.map_frame, settings.base_frame))
         self._feed = EstimatorFeed(
             node, settings, self._estimator, BaseFrame(settings, self._transforms)
@@ -61,10 +62,12 @@ class ObserverCore:
         self._diagnostics = DiagnosticsPublisher(
             node, self._estimator, self._feed, self._inputs, self._publisher
         )
+        # What others may do to the estimate
         self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
         InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
         ControlServices(node, self._estimator, self._feed, self._publisher)
         node.add_post_set_parameters_callback(self._apply_parameters)
+        # The times at which all that happens
         self._timers = self._create_timers(settings.publish_rate)
         self.stop()
         # The clock forgets a handle that nobody holds.
@@ -74,7 +77,7 @@ class ObserverCore:
                 min_backward=Duration(nanoseconds=-CLOCK_JITTER_NS),
                 on_clock_change=False,
             ),
-            post_callback=self._restart_time,
+            post_callback=self._on_clock_jump,
         )
         changed = len(changed_names(estimator_settings)) + len(changed_names(settings))
         node.get_logger().info(
@@ -128,10 +131,10 @@ class ObserverCore:
         if self._feed.is_paused:
             self._publisher.repeat_transform()
 
-    def _restart_time(self, _jump: object) -> None:
+    def _on_clock_jump(self, _jump: object) -> None:
         self._estimator.restart_time()
 
-    def _follow_jump(self) -> None:
+    def _on_estimator_jump(self) -> None:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""
         self._feed.clear()
         self._transforms.clear()

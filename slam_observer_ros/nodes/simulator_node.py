@@ -72,7 +72,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         if missing:
             topics = ' and '.join(missing)
             self._log.info(
-                topics,
+                'waiting',
                 f'waiting for {needed} subscriber(s) on {topics} (parameter wait_for_subscribers)',
             )
             return
