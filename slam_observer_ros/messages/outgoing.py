@@ -68,9 +68,9 @@ class OutgoingMessages:
         x, y, z = position.tolist()
         return self._make('geometry_msgs/msg/Point', x=x, y=y, z=z)
 
-    def vector(self, vector: FloatArray) -> Any:
-        """Make a geometry_msgs/Vector3 of a vector (3,)."""
-        x, y, z = vector.tolist()
+    def vector(self, components: FloatArray) -> Any:
+        """Make a geometry_msgs/Vector3 of its components (3,)."""
+        x, y, z = components.tolist()
         return self._make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
 
     def quaternion(self, rotation: FloatArray) -> Any:
