@@ -323,7 +323,7 @@ def test_a_calibration_that_nobody_can_mean_is_reported():
     wrong = CalibrationEstimate('angular_scale_z', -0.5, 0.01, '', nominal=1.0, stated=0.03)
     status = Publishing(calibration=[wrong]).publish(observation=1)
     assert status.level == DiagnosticStatus.WARN
-    assert status.message == wrong.problem
+    assert status.message == wrong.trouble
 
 
 def test_points_rejected_long_ago_are_reported_no_more():
