@@ -532,6 +532,17 @@ def outgoing_messages(make):
     ]
 
 
+@pytest.mark.parametrize('covariance', [ANGULAR_FIRST_COVARIANCE, None])
+def test_a_covariance_that_is_sent_is_read_again(covariance):
+    pose = ros.OUTGOING.pose_with_covariance(np.eye(4), covariance)
+    message = ros.make('geometry_msgs/msg/PoseWithCovarianceStamped', ros.header('map'), pose)
+    read = messages.decode_pose_with_covariance_stamped(ros.serialise(message)).covariance
+    if covariance is None:
+        assert read is None
+    else:
+        np.testing.assert_array_equal(read, covariance)
+
+
 def test_rclpy_serialises_the_same_bytes():
     """What rosbags' serialiser stands for here is what the middleware really sends."""
     serialization = pytest.importorskip('rclpy.serialization')
