@@ -25,7 +25,7 @@ def insert_transforms(
     """Put the transforms of a message on /tf or /tf_static into a buffer, without the bad ones."""
     good = []
     for transform in transforms:
-        if problem := transform.trouble:
+        if problem := transform.problem:
             buffer.refuse(transform.child_frame_id, problem)
         else:
             good.append(transform)

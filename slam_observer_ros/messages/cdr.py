@@ -24,26 +24,12 @@ _FLOAT64 = {'<': np.dtype('<f8'), '>': np.dtype('>f8')}
 
 
 class CdrReader:
-    """Cursor over one serialised message; every read checks that the bytes are there.
+    """Cursor over one message with its 4-byte encapsulation header, little or big endian.
 
-    Parameters
-    ----------
-    raw : Buffer
-        The message with its 4-byte encapsulation header, little or big endian.
-
-    Attributes
-    ----------
-    byte_order : str
-        ``'<'`` or ``'>'``, as numpy and struct write it.
-
-    Raises
-    ------
-    MessageError
-        If the bytes are not plain CDR.
-
+    Every read checks that the bytes are there; bytes that are not plain CDR raise a MessageError.
     """
 
-    __slots__ = ('_position', '_raw', 'byte_order')
+    __slots__ = ('_byte_order', '_position', '_raw')
 
     def __init__(self, raw: Buffer) -> None:
         if len(raw) < ENCAPSULATION_BYTES:
@@ -52,7 +38,7 @@ class CdrReader:
             raise MessageError(f'not plain CDR: encapsulation {bytes(raw[:2]).hex()}')
         self._raw = raw
         self._position = ENCAPSULATION_BYTES
-        self.byte_order = '<' if raw[1] else '>'
+        self._byte_order = '<' if raw[1] else '>'
 
     def _take(self, size: int, alignment: int) -> int:
         # CDR aligns to the first byte after the encapsulation header.
@@ -68,12 +54,12 @@ class CdrReader:
 
     def uint32(self) -> int:
         """Read a uint32; also the length of a sequence."""
-        value: int = _UINT32[self.byte_order].unpack_from(self._raw, self._take(4, 4))[0]
+        value: int = _UINT32[self._byte_order].unpack_from(self._raw, self._take(4, 4))[0]
         return value
 
     def stamp_ns(self) -> int:
         """Read a builtin_interfaces/Time as nanoseconds."""
-        seconds, nanoseconds = _STAMP[self.byte_order].unpack_from(self._raw, self._take(8, 4))
+        seconds, nanoseconds = _STAMP[self._byte_order].unpack_from(self._raw, self._take(8, 4))
         if nanoseconds >= NANOSECONDS_PER_SECOND:
             raise MessageError(f'stamp with {nanoseconds} ns in its nanosecond field')
         stamp_ns: int = seconds * NANOSECONDS_PER_SECOND + nanoseconds
@@ -94,11 +80,11 @@ class CdrReader:
 
     def float64(self, count: int) -> FloatArray:
         """Read ``count`` float64 values, shape (count,)."""
-        return self._array(_FLOAT64[self.byte_order], count, alignment=8)
+        return self._array(_FLOAT64[self._byte_order], count, alignment=8)
 
     def float32(self, count: int) -> FloatArray:
         """Read ``count`` float32 values as float64, shape (count,)."""
-        return self._array(_FLOAT32[self.byte_order], count, alignment=4)
+        return self._array(_FLOAT32[self._byte_order], count, alignment=4)
 
     def _array(
         self, dtype: np.dtype[np.float32] | np.dtype[np.float64], count: int, alignment: int
@@ -115,14 +101,7 @@ class CdrReader:
         return memoryview(self._raw)[start : start + size]
 
     def finish(self) -> None:
-        """Check that the message ends here, but for padding.
-
-        Raises
-        ------
-        MessageError
-            If bytes are left: the message is of another type.
-
-        """
+        """Check that the message ends here, but for padding: else it is of another type."""
         left = len(self._raw) - self._position
         if left > MAX_PADDING_BYTES:
             raise MessageError(f'{left} bytes too long: is it of another type?')

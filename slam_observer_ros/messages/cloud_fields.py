@@ -1,12 +1,44 @@
-"""What a sensor_msgs/PointCloud or PointCloud2 says of its points before these are decoded."""
+"""The fields of clouds: their names, and which ones a cloud has, without decoding it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
+from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
-from slam_observer_ros.messages.point_cloud_layout import CloudField, ID_NAME
+
+ID_NAME = 'id'
+POINT_NAMES = ('x', 'y', 'z')
+COVARIANCE_NAMES = ('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz')
+VELOCITY_NAMES = ('vx', 'vy', 'vz')
+
+UNKNOWN_UINT32_ID = MAX_ID + 1
+"""How an unknown id is written where ids are uint32: the same bits as -1."""
+
+FLOAT32_ID_LIMIT = 2**24
+"""From here on float32 can't distinguish neighbouring ids."""
+
+POINT_FIELD_UINT32, POINT_FIELD_FLOAT32 = 6, 7
+"""Constants of sensor_msgs/PointField."""
+
+
+@dataclass(frozen=True, slots=True)
+class CloudField:
+    """One sensor_msgs/PointField; ``offset`` in bytes from the start of the point."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int = 1
+
+
+class CloudFields(NamedTuple):
+    """The names of a PointCloud2's fields, or of a PointCloud's channels, and how many points."""
+
+    names: tuple[str, ...]
+    points: int
 
 
 def read_field(reader: CdrReader) -> CloudField:
@@ -14,39 +46,8 @@ def read_field(reader: CdrReader) -> CloudField:
     return CloudField(reader.string(), reader.uint32(), reader.uint8(), reader.uint32())
 
 
-class CloudFields(NamedTuple):
-    """What a cloud has.
-
-    Attributes
-    ----------
-    names : tuple of str
-        What a PointCloud2 tells of its points: the names of its fields. Of a PointCloud the
-        channels, which tell what there is beside where they are. With ``id`` the points have ids.
-    points : int
-        How many points there are.
-
-    """
-
-    names: tuple[str, ...]
-    points: int
-
-
 def read_fields(raw: Buffer, message_type: str) -> CloudFields:
-    """Return what a PointCloud or PointCloud2 has.
-
-    Parameters
-    ----------
-    raw : Buffer
-        The serialised message.
-    message_type : str
-        ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
-
-    Raises
-    ------
-    MessageError
-        If the message is malformed.
-
-    """
+    """Return what a sensor_msgs/msg/PointCloud or PointCloud2 has; MessageError if malformed."""
     reader = CdrReader(raw)
     reader.header()
     if message_type.endswith('PointCloud2'):
@@ -62,16 +63,7 @@ def read_fields(raw: Buffer, message_type: str) -> CloudFields:
 
 
 def missing_ids(names: Sequence[str], message_type: str) -> str:
-    """Tell what there is instead of ids; empty if there are ids.
-
-    Parameters
-    ----------
-    names : sequence of str
-        From :func:`read_fields`.
-    message_type : str
-        ``sensor_msgs/msg/PointCloud`` or ``sensor_msgs/msg/PointCloud2``.
-
-    """
+    """Describe what a cloud has instead of ids; empty if there are ids among its ``names``."""
     if ID_NAME in names:
         return ''
     kind = 'fields' if message_type.endswith('PointCloud2') else 'channels'

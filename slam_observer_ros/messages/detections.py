@@ -25,30 +25,17 @@ _COVARIANCE = 36
 _SIZE = 3
 _CORNERS = 10
 _HOMOGRAPHY = 9
-MAX_NAMES = 12
-"""Names of frames that a message lists."""
+MAX_NAMES = 12  # names of frames that a log line lists
 
 _TRAILING_NUMBER = re.compile(r'(?:.*\D)?(\d+)')
 _HASH = re.compile(r'(?<![^\W_])(?=.*\d[a-f])[\da-f-]{8,}\Z', re.IGNORECASE)
 """A UUID, too. Names with a number, as ``facade12`` or ``b-000123``, have no letter after it."""
-_HASH_LENGTH = 64
-"""No more of a name is searched: the time that takes grows with the square of the length."""
+_HASH_LENGTH = 64  # no more of a name is searched: that takes the square of the length
 
 
 @dataclass(frozen=True, slots=True)
 class TagDetections:
-    """Fiducials that a detector has seen; where they are is on /tf.
-
-    Attributes
-    ----------
-    stamp_ns : int
-    frame_id : str
-        Frame of the camera.
-    ids : tuple of int
-    families : tuple of str
-        Family of each fiducial, for example ``tag36h11``.
-
-    """
+    """Fiducials, of families such as ``tag36h11``, that a camera has seen; /tf has their poses."""
 
     stamp_ns: int
     frame_id: str
@@ -102,28 +89,16 @@ def observed_tags(
 ) -> list[Measurement[ObservationEvent]]:
     """Return what of /tf are sightings of fiducials: transforms from a camera to a tag.
 
-    Those that are no transforms, which have NaN in them for example, are left out, and so are
-    numbers beyond ``MAX_ID``.
-
-    Parameters
-    ----------
-    transforms : iterable of PoseMessage
-        Of one message.
-    tag_frame_prefix : str
-        A tag's frame is this and its id, or, as apriltag_ros has it, ``family:id``.
-
-    Returns
-    -------
-    list of Measurement[ObservationEvent]
-        One for each camera and stamp.
-
+    A tag's frame is the prefix and its id, or, as apriltag_ros has it, ``family:id``. Those that
+    are no transforms, which have NaN in them for example, are left out, and so are numbers beyond
+    ``MAX_ID``. One measurement is returned for each camera and stamp.
     """
     # Other things have names with a colon, too, and longer numbers than a family has tags.
     pattern = re.compile(rf'{re.escape(tag_frame_prefix)}(\d+)|\w+:(\d{{1,9}})')
     seen = [
         (message, _landmark_id(match[1] or match[2]))
         for message in transforms
-        if (match := pattern.fullmatch(message.child_frame_id)) and not message.trouble
+        if (match := pattern.fullmatch(message.child_frame_id)) and not message.problem
     ]
     seen = [sighting for sighting in seen if sighting[1] != UNKNOWN_ID]
     seen.sort(key=_camera_and_stamp)

@@ -12,16 +12,7 @@ EventT = TypeVar('EventT', VelocityEvent, AngularVelocityEvent, ObservationEvent
 
 @dataclass(frozen=True)
 class Measurement(Generic[EventT]):
-    """An event as the message holds it, not yet moved to the base frame.
-
-    Attributes
-    ----------
-    frame_id : str
-        Frame that it is expressed in, the sensor's as a rule; empty if the message doesn't say.
-    event : VelocityEvent, AngularVelocityEvent or ObservationEvent
-        What was measured there.
-
-    """
+    """An event in the frame ``frame_id``, the sensor's as a rule; empty if it has none."""
 
     frame_id: str
     event: EventT
@@ -39,4 +30,3 @@ class Measurement(Generic[EventT]):
 AnyMeasurement: TypeAlias = (
     Measurement[VelocityEvent] | Measurement[AngularVelocityEvent] | Measurement[ObservationEvent]
 )
-"""A measurement of whatever kind."""

@@ -25,23 +25,12 @@ from slam_observer_ros.messages.poses_and_velocities import (
     PoseMessage,
 )
 
-ODOMETRY = 'nav_msgs/msg/Odometry'
-"""Type that gives a velocity and a pose."""
-
-IMU = 'sensor_msgs/msg/Imu'
-"""Type that gives an angular velocity."""
-
-TRANSFORMS = 'tf2_msgs/msg/TFMessage'
-"""Type of /tf, which places sensors, and holds landmarks if they are fiducials."""
-
-APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'
-"""Type that gives the ids of fiducials, whose positions are on /tf."""
-
-POSE_ARRAY = 'geometry_msgs/msg/PoseArray'
-"""Type of landmarks without ids; it may hold other things."""
-
-DETECTIONS = 'vision_msgs/msg/Detection3DArray'
-"""Type of landmarks with ids or without."""
+ODOMETRY = 'nav_msgs/msg/Odometry'  # a velocity and a pose
+IMU = 'sensor_msgs/msg/Imu'  # an angular velocity
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'  # poses of sensors, and landmarks if they are fiducials
+APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'  # ids of fiducials that /tf has
+POSE_ARRAY = 'geometry_msgs/msg/PoseArray'  # landmarks without ids; it may hold other things
+DETECTIONS = 'vision_msgs/msg/Detection3DArray'  # landmarks with ids or without
 
 VelocityDecoder: TypeAlias = Callable[[Buffer, int], Measurement[VelocityEvent]]
 """From the serialised message and its receive time, which only unstamped messages use."""

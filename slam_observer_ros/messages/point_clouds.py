@@ -15,21 +15,21 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
-from slam_observer_ros.messages.cloud_fields import read_field
-from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.point_cloud_layout import (
+from slam_observer_ros.messages.cloud_fields import (
     CloudField,
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,
     ID_NAME,
     POINT_FIELD_FLOAT32,
     POINT_NAMES,
+    read_field,
     UNKNOWN_UINT32_ID,
     VELOCITY_NAMES,
 )
+from slam_observer_ros.messages.measurement import Measurement
 
 MAX_UNKNOWN_POINTS = 500
-"""Most points without id in a message: telling them apart costs their number cubed."""
+"""Most points without id in a message: associating them costs their number cubed."""
 
 _READ_NAMES = frozenset((ID_NAME, *POINT_NAMES, *COVARIANCE_NAMES, *VELOCITY_NAMES))
 _UPPER_TRIANGLE_TO_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]
@@ -43,21 +43,8 @@ Records: TypeAlias = NDArray[np.void]
 def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
     """Decode a sensor_msgs/PointCloud whose ids, if any, are in the channel ``id``.
 
-    Parameters
-    ----------
-    raw : Buffer
-        The serialised message.
-
-    Returns
-    -------
-    Measurement[ObservationEvent]
-        Ids are ``UNKNOWN_ID`` where the channel holds -1 or is missing.
-
-    Raises
-    ------
-    MessageError
-        If the message is malformed, or its ids aren't whole numbers that float32 holds exactly.
-
+    They are ``UNKNOWN_ID`` where the channel holds -1 or is missing; a MessageError is raised if
+    they aren't whole numbers that float32 holds exactly.
     """
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
@@ -78,26 +65,11 @@ def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[O
 def decode_point_cloud2(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
     """Decode a sensor_msgs/PointCloud2 with fields x, y, z and, if it has them, more.
 
-    ``id`` gives the landmark ids; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per
-    point in the axes of the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s.
-    Points that weren't measured, which are NaN or infinite, are left out, whatever id they have,
-    and whether or not the cloud claims to be dense.
-
-    Parameters
-    ----------
-    raw : Buffer
-        The serialised message.
-
-    Returns
-    -------
-    Measurement[ObservationEvent]
-        Ids are ``UNKNOWN_ID`` where the field holds -1 (2³² - 1 if unsigned) or is missing.
-
-    Raises
-    ------
-    MessageError
-        If the message is malformed or lacks a field.
-
+    ``id`` gives the landmark ids, ``UNKNOWN_ID`` where it holds -1 (2³² - 1 if unsigned) or is
+    missing; ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` a covariance per point in the axes of
+    the points, m²; ``vx vy vz`` the velocity of each landmark itself, m/s. Points that weren't
+    measured, which are NaN or infinite, are left out, whatever id they have, and whether or not
+    the cloud claims to be dense.
     """
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
@@ -129,15 +101,8 @@ def without_unmeasured(event: ObservationEvent) -> ObservationEvent:
     return event.select(is_measured(event.points))
 
 
-def scan_trouble(event: ObservationEvent) -> str:
-    """Return why an observation is a lidar's scan rather than landmarks; empty if it is not.
-
-    Parameters
-    ----------
-    event : ObservationEvent
-        What one message holds.
-
-    """
+def scan_problem(event: ObservationEvent) -> str:
+    """Return why a message's observation is a lidar's scan, not landmarks; empty if it isn't."""
     unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
     if unknown <= MAX_UNKNOWN_POINTS:
         return ''

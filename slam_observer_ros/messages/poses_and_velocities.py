@@ -25,19 +25,14 @@ _QUATERNION_NORM_TOLERANCE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class PoseMessage:
-    """A pose or transform, from ``child_frame_id`` to ``frame_id``.
+    """The pose of ``child_frame_id``, empty if the message doesn't name it, in ``frame_id``.
 
     Attributes
     ----------
-    stamp_ns : int
-    frame_id : str
-        Frame in which the pose is expressed.
-    child_frame_id : str
-        Frame whose pose it is; empty if the message doesn't say.
     position : FloatArray
         (3,) metres.
     quaternion : FloatArray
-        (4,) xyzw; of unit norm, but for transforms that say in ``trouble`` that it isn't.
+        (4,) xyzw; of unit norm, but for transforms that say in ``problem`` that it isn't.
     covariance : FloatArray or None
         (6, 6) of rotation vector and position in the axes of ``frame_id``; None if unknown.
 
@@ -60,10 +55,10 @@ class PoseMessage:
         return pose_matrices(self.position, self.quaternion)
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why it is no pose; empty if it is one."""
         if np.isfinite(self.position).all():
-            return _turn_trouble(self.quaternion)
+            return _quaternion_problem(self.quaternion)
         return 'a coordinate is NaN or infinite'
 
 
@@ -75,21 +70,7 @@ def pose_stack(messages: Sequence[PoseMessage]) -> FloatArray:
 
 
 def pose_matrices(positions: FloatArray, quaternions: FloatArray) -> FloatArray:
-    """Build homogeneous transforms.
-
-    Parameters
-    ----------
-    positions : FloatArray
-        (..., 3) metres.
-    quaternions : FloatArray
-        (..., 4) xyzw.
-
-    Returns
-    -------
-    FloatArray
-        (..., 4, 4).
-
-    """
+    """Return poses (..., 4, 4) of positions (..., 3), metres, and quaternions (..., 4) xyzw."""
     return se3.pose(so3.from_quaternion(quaternions), positions)
 
 
@@ -158,7 +139,7 @@ def decode_transform_stamped(raw: Buffer) -> PoseMessage:
 def decode_transforms(raw: Buffer) -> list[PoseMessage]:
     """Decode a tf2_msgs/TFMessage, as on /tf and /tf_static.
 
-    A bad transform says so in ``trouble``: those beside it are of other frames, and good.
+    A bad transform says so in ``problem``: those beside it are of other frames, and good.
     """
     reader = CdrReader(raw)
     messages = [_read_transform(reader) for _ in range(reader.uint32())]
@@ -167,14 +148,7 @@ def decode_transforms(raw: Buffer) -> list[PoseMessage]:
 
 
 def decode_imu(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[AngularVelocityEvent]:
-    """Decode the angular velocity of a sensor_msgs/Imu.
-
-    Raises
-    ------
-    MessageError
-        If the message is malformed, or says (-1 in its covariance) that it measures none.
-
-    """
+    """Decode the angular velocity of a sensor_msgs/Imu; MessageError if it has none (-1)."""
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     reader.float64(13)  # Orientation and its covariance.
@@ -200,7 +174,7 @@ def _read_covariance(reader: CdrReader) -> FloatArray | None:
 
 
 def _known(covariance: FloatArray) -> FloatArray | None:
-    """Tell a real covariance from the two ways in which ROS messages say 'unknown'."""
+    """Return None for the two ways in which ROS messages say 'unknown'."""
     if covariance[0, 0] == -1.0 or not covariance.any():
         return None
     return covariance
@@ -228,13 +202,13 @@ def _read_transform(reader: CdrReader) -> PoseMessage:
 
 
 def _checked(message: PoseMessage) -> PoseMessage:
-    trouble = _turn_trouble(message.quaternion)
-    if trouble:
-        raise MessageError(trouble)
+    problem = _quaternion_problem(message.quaternion)
+    if problem:
+        raise MessageError(problem)
     return message
 
 
-def _turn_trouble(quaternion: FloatArray) -> str:
+def _quaternion_problem(quaternion: FloatArray) -> str:
     """Return why a quaternion is no rotation; empty if it is one."""
     norm = math.hypot(*quaternion)  # which does not overflow
     # Written so that NaN is refused too.

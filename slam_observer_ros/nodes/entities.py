@@ -1,4 +1,4 @@
-"""What a node communicates with, so that parts of it can be taken away again."""
+"""What a node communicates with, so that parts of it can be destroyed again."""
 
 from __future__ import annotations
 
@@ -9,16 +9,10 @@ from rosgraph_msgs.msg import Clock
 
 
 class Entities:
-    """Remembers the publishers, subscriptions, services and timers of a node.
+    """Remembers the publishers, subscriptions, services and timers that a node has now.
 
     A subscription to the clock is none of them: rclpy itself makes it whenever ``use_sim_time`` is
     set, and needs it for as long.
-
-    Parameters
-    ----------
-    node : Node
-        Node as it is now.
-
     """
 
     def __init__(self, node: Node) -> None:

@@ -57,12 +57,12 @@ class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Save the map if that was asked for, and forget all."""
-        self._close_and_tell()
+        self._close_and_log()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Save the map if that was asked for, and end for good."""
-        self._close_and_tell()
+        self._close_and_log()
         return TransitionCallbackReturn.SUCCESS
 
     def destroy_node(self) -> None:
@@ -87,7 +87,7 @@ class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes
 
         service.callback = change_if_possible
 
-    def _close_and_tell(self) -> None:
+    def _close_and_log(self) -> None:
         """Close the core; a map that can't be saved keeps no transition from being made."""
         try:
             self._close()

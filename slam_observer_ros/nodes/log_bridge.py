@@ -10,14 +10,7 @@ PACKAGE_LOGGER = 'slam_observer_ros'
 
 
 class RosLogHandler(logging.Handler):
-    """Hands log records to a ROS logger.
-
-    Parameters
-    ----------
-    ros_logger : RcutilsLogger
-        Logger of a node.
-
-    """
+    """Gives log records to a node's ROS logger."""
 
     def __init__(self, ros_logger: RcutilsLogger) -> None:
         super().__init__()

@@ -15,23 +15,23 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.nodes.entities import Entities
-from slam_observer_ros.nodes.intake.input_topics import open_inputs
-from slam_observer_ros.nodes.intake.intake import Intake
-from slam_observer_ros.nodes.intake.subscriptions import Input
+from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
+from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
+from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.intake.transform_listener import open_transforms
-from slam_observer_ros.nodes.publishing.diagnostics import Diagnostics
-from slam_observer_ros.nodes.publishing.publishers import Outputs, TOPICS
+from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
+from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
 from slam_observer_ros.nodes.ros_parameters import read_settings
-from slam_observer_ros.nodes.services.controls import Controls
-from slam_observer_ros.nodes.services.initial_pose import InitialPose
-from slam_observer_ros.nodes.services.map_services import Maps
+from slam_observer_ros.nodes.services.control_services import ControlServices
+from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
+from slam_observer_ros.nodes.services.map_services import MapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
 
 OVERVIEW_PERIOD_S = 0.5
 DIAGNOSTICS_PERIOD_S = 1.0
-LOOK_PERIOD_S = 0.25
+CHECK_PERIOD_S = 0.25
 RETRY_PERIOD_S = 0.02
 
 CLOCK_JITTER_NS = 100_000_000
@@ -39,18 +39,10 @@ CLOCK_JITTER_NS = 100_000_000
 
 
 class ObserverCore:
-    """Feeds what a node receives to an :class:`Estimator` and publishes the estimate.
+    """Gives what a node receives to an :class:`Estimator` and publishes the estimate.
 
-    Parameters
-    ----------
-    node : Node
-        Node that communicates; the parameters are declared.
-
-    Raises
-    ------
-    SlamObserverError
-        If a parameter, or a file that it names, can't be used.
-
+    The node's parameters are declared. Raises a SlamObserverError if one, or a file that it names,
+    can't be used.
     """
 
     def __init__(self, node: Node) -> None:
@@ -58,21 +50,24 @@ class ObserverCore:
         self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
-        self._estimator = Estimator(estimator_settings, on_jump=self._follow_jump)
+        self._estimator = Estimator(estimator_settings, on_jump=self._on_estimator_jump)
+        # What comes in and what goes out
         self._transforms = open_transforms(node, (settings.map_frame, settings.base_frame))
-        self._intake = Intake(
+        self._feed = EstimatorFeed(
             node, settings, self._estimator, BaseFrame(settings, self._transforms)
         )
-        self._outputs = Outputs(node, settings, self._estimator, self._transforms)
-        self._inputs = open_inputs(node, settings, self._intake)
+        self._publisher = EstimatePublisher(node, settings, self._estimator, self._transforms)
+        self._inputs = open_inputs(node, settings, self._feed)
         _refuse_own_outputs(node, self._inputs)
-        self._diagnostics = Diagnostics(
-            node, self._estimator, self._intake, self._inputs, self._outputs
+        self._diagnostics = DiagnosticsPublisher(
+            node, self._estimator, self._feed, self._inputs, self._publisher
         )
-        self._maps = Maps(node, settings, self._estimator, self._outputs.begin_anew)
-        InitialPose(node, settings.map_frame, self._estimator, self._outputs.begin_anew)
-        Controls(node, self._estimator, self._intake, self._outputs)
+        # What others may do to the estimate
+        self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
+        InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
+        ControlServices(node, self._estimator, self._feed, self._publisher)
         node.add_post_set_parameters_callback(self._apply_parameters)
+        # The times at which all that happens
         self._timers = self._create_timers(settings.publish_rate)
         self.stop()
         # The clock forgets a handle that nobody holds.
@@ -82,7 +77,7 @@ class ObserverCore:
                 min_backward=Duration(nanoseconds=-CLOCK_JITTER_NS),
                 on_clock_change=False,
             ),
-            post_callback=self._restart_time,
+            post_callback=self._on_clock_jump,
         )
         changed = len(changed_names(estimator_settings)) + len(changed_names(settings))
         node.get_logger().info(
@@ -94,25 +89,21 @@ class ObserverCore:
 
     def start(self) -> None:
         """Begin to use what comes in and to publish; a new core waits for this."""
-        self._intake.is_active = True
+        self._feed.is_active = True
         for timer in self._timers:
             timer.reset()
 
     def stop(self) -> None:
         """Drop what comes in and publish nothing, until the next start."""
-        self._intake.is_active = False
-        self._intake.forget()
+        self._feed.is_active = False
+        self._feed.clear()
         for timer in self._timers:
             timer.cancel()
 
     def close(self) -> None:
-        """Save the map if that was asked for, and take all away from the node again.
+        """Save the map if that was asked for, and remove all from the node again.
 
-        Raises
-        ------
-        MapError
-            If the map can't be saved; all is taken away nevertheless.
-
+        Raises a MapError if the map can't be saved; all is removed nevertheless.
         """
         try:
             self._maps.save_at_end()
@@ -128,33 +119,33 @@ class ObserverCore:
             self._node.create_timer(period_s, callback, clock=clock)
             for period_s, callback in (
                 (1.0 / publish_rate_hz, self._publish_state),
-                (OVERVIEW_PERIOD_S, self._outputs.publish_overview),
+                (OVERVIEW_PERIOD_S, self._publisher.publish_overview),
                 (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
-                (RETRY_PERIOD_S, self._intake.retry),
-                *((LOOK_PERIOD_S, source.look) for source in self._inputs),
+                (RETRY_PERIOD_S, self._feed.retry),
+                *((CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
             )
         ]
 
     def _publish_state(self) -> None:
-        self._outputs.publish_state()
-        if self._intake.is_paused:
-            self._outputs.repeat_transform()
+        self._publisher.publish_state()
+        if self._feed.is_paused:
+            self._publisher.repeat_transform()
 
-    def _restart_time(self, _jump: object) -> None:
+    def _on_clock_jump(self, _jump: object) -> None:
         self._estimator.handle_clock_jump()
 
-    def _follow_jump(self) -> None:
+    def _on_estimator_jump(self) -> None:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""
-        self._intake.forget()
+        self._feed.clear()
         self._transforms.clear()
-        self._outputs.begin_anew()
+        self._publisher.reset()
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
         self._estimator.change_settings(read_settings(self._node, Settings))
 
 
-def _refuse_own_outputs(node: Node, inputs: Iterable[Input[Any]]) -> None:
-    """Refuse to take in the node's own estimate, which it would follow for ever."""
+def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic[Any]]) -> None:
+    """Refuse the node's own estimate as an input: it would follow that for ever."""
     outputs = {node.resolve_topic_name(name): name for name in TOPICS}
     for source in inputs:
         if name := outputs.get(source.topic):

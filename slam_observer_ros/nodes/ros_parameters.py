@@ -31,19 +31,12 @@ def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
 
     Names that are set but in no table are ignored with a warning: they may be other nodes'.
 
-    Parameters
-    ----------
-    node : Node
-        The node that owns the parameters.
-    *settings_classes : type
-        Settings dataclasses; their names must not overlap.
-
     Raises
     ------
     ParameterError
-        If the command line or a parameter file sets a name that is one of ours misspelt.
+        If a name that is set is one of ours misspelt.
     InvalidParameterValueException
-        If a value from the command line or a parameter file does not fit its row.
+        If a value that is set does not fit its row.
 
     """
     rows = [row for settings_class in settings_classes for row in table(settings_class)]

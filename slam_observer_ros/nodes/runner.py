@@ -50,21 +50,11 @@ class StopSignal:
 
 
 def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int:
-    """Spin a node until it shuts its context down or a signal asks it to stop.
+    """Make a node and spin it until it shuts its context down or a signal asks it to stop.
 
-    Parameters
-    ----------
-    make_node : callable
-        Returns the node; called once ROS is initialised.
-    args : sequence of str or None
-        Command line with ROS arguments; None for the process's own.
-
-    Returns
-    -------
-    int
-        Exit code: 0 after a clean stop, 1 if something could not be saved at the end, 2 where ROS
-        or the node refused to start.
-
+    ``args`` is a command line with ROS arguments, None for the process's own. The exit code that
+    is returned is 0 after a clean stop, 1 if something could not be saved at the end, 2 where ROS
+    or the node refused to start.
     """
     use_one_thread()
     stop = StopSignal()

@@ -17,37 +17,21 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_cloud2_message,
-    pose_message,
-    time_message,
-    twist_message,
-)
+from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.nodes.ros_parameters import declare_settings, read_settings
 from slam_observer_ros.nodes.runner import run
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
 
-QUEUE_DEPTH = 1000
-"""Deep enough that nothing is lost while a reliable reader falls behind for a moment."""
-
-TICK_S = 0.005
-"""Wall time between two looks at what is due."""
-
-MATCH_DELAY_S = 1.0
-"""A publisher knows of its reader before the reader can receive; wait so much longer."""
-
-ACKNOWLEDGED_S = 10.0
-"""How long the last messages may be on their way, as on a busy machine."""
-
-SIMULATED_EPOCH_NS = 1_000_000_000
-"""First stamp where /clock is simulated; zero would mean 'no time yet'."""
-
-WAIT_REPORT_PERIOD_S = 10.0
+QUEUE_DEPTH = 1000  # nothing is lost while a reliable reader falls behind for a moment
+TICK_S = 0.005  # wall time between two checks of what is due
+MATCH_DELAY_S = 1.0  # a publisher knows of its reader before the reader can receive
+ACKNOWLEDGED_S = 10.0  # how long the last messages may be on their way, as on a busy machine
+SIMULATED_EPOCH_NS = 1_000_000_000  # first stamp of a simulated /clock; zero means 'no time yet'
 
 
 class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
@@ -59,6 +43,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         self._settings = read_settings(self, SimulatorNodeSettings)
         self._scenario = read_settings(self, Scenario)
         self._create_publishers()
+        self._log = ThrottledLog(self)
         self._steady_clock = RosClock(clock_type=ClockType.STEADY_TIME)
         self._wait_timer = self.create_timer(TICK_S, self._wait, clock=self._steady_clock)
 
@@ -79,16 +64,16 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
     def _wait(self) -> None:
         """Start once the subscribers are there: the biased first sighting must not be missed."""
         needed = self._settings.wait_for_subscribers
-        lacking = [
+        missing = [
             publisher.topic_name
             for publisher in (self._twist, self._landmarks)
             if publisher.get_subscription_count() < needed
         ]
-        if lacking:
-            self.get_logger().info(
-                f'waiting for {needed} subscriber(s) on {" and ".join(lacking)}'
-                ' (parameter wait_for_subscribers)',
-                throttle_duration_sec=WAIT_REPORT_PERIOD_S,
+        if missing:
+            topics = ' and '.join(missing)
+            self._log.info(
+                'waiting',
+                f'waiting for {needed} subscriber(s) on {topics} (parameter wait_for_subscribers)',
             )
             return
         self.destroy_timer(self._wait_timer)
@@ -113,7 +98,7 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         elapsed_s = (time.monotonic() - self._start_wall_s) * self._settings.real_time_factor
         now_ns = self._start_ns + to_ns(elapsed_s)
         if self._publishes_clock:
-            self._clock_publisher.publish(Clock(clock=time_message(now_ns)))
+            self._clock_publisher.publish(Clock(clock=MESSAGES.time(now_ns)))
         while self._next is not None and self._next.arrival_ns <= now_ns:
             self._publish(self._next.event)
             self._next = next(self._deliveries, None)
@@ -136,22 +121,22 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
                 self._publish_true_pose(event)
 
     def _publish_velocity(self, event: VelocityEvent) -> None:
-        twist = twist_message(event.body_velocity)
-        if not self._settings.stamped:
-            self._twist.publish(twist)
-            return
-        header = header_message(event.stamp_ns, self._settings.base_frame)
-        self._twist.publish(TwistStamped(header=header, twist=twist))
+        stamp_ns, velocity = event.stamp_ns, event.body_velocity
+        if self._settings.stamped:
+            frame = self._settings.base_frame
+            self._twist.publish(MESSAGES.twist_stamped(stamp_ns, frame, velocity))
+        else:
+            self._twist.publish(MESSAGES.twist(velocity))
 
     def _publish_observation(self, event: ObservationEvent) -> None:
         contents = (event.stamp_ns, self._settings.base_frame, event.ids, event.points)
         if self._settings.landmarks_type == 'PointCloud2':
-            self._landmarks.publish(point_cloud2_message(*contents, velocities=event.velocities))
+            self._landmarks.publish(MESSAGES.point_cloud2(*contents, velocities=event.velocities))
         else:
             self._landmarks.publish(encode_point_cloud(*contents))
 
     def _publish_start(self) -> None:
-        """Tell where an estimate that starts at the identity lies in the true world."""
+        """Publish the pose, in the true world, of an estimate that starts at the identity."""
         self._start_transform = TransformPublisher(self, '/tf_static', LATCHED_QOS)
         self._start_transform.publish(
             self._start_ns,
@@ -161,15 +146,15 @@ class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
         )
 
     def _publish_true_pose(self, truth: PoseTruth) -> None:
-        header = header_message(truth.stamp_ns, self._settings.truth_frame)
-        self._true_pose.publish(PoseStamped(header=header, pose=pose_message(truth.pose)))
+        frame = self._settings.truth_frame
+        self._true_pose.publish(MESSAGES.pose_stamped(truth.stamp_ns, frame, truth.pose))
         if self._scenario.landmark_speed > 0.0:
             self._publish_true_landmarks(truth.stamp_ns)
 
     def _publish_true_landmarks(self, stamp_ns: int) -> None:
         truth = self._simulation.landmark_truth(stamp_ns)
         self._true_landmarks.publish(
-            point_cloud2_message(
+            MESSAGES.point_cloud2(
                 stamp_ns, self._settings.truth_frame, truth.ids, truth.world_points
             )
         )

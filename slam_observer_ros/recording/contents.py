@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from slam_observer_ros.common.errors import MessageError
-from slam_observer_ros.messages.cloud_fields import missing_ids, read_fields
+from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
@@ -20,7 +20,6 @@ from slam_observer_ros.messages.message_types import (
     POSE_ARRAY,
     TRANSFORMS,
 )
-from slam_observer_ros.messages.point_cloud_layout import ID_NAME
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_pose,

@@ -21,7 +21,7 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.messages.point_clouds import scan_trouble
+from slam_observer_ros.messages.point_clouds import scan_problem
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
@@ -81,7 +81,7 @@ def _one(decode: Callable[[Buffer, int], Measured]) -> Decode:
 
 def _landmarks(raw: RawMessage) -> list[Measurement[ObservationEvent]]:
     message = decode_landmarks(raw)
-    trouble = scan_trouble(message.event)
+    trouble = scan_problem(message.event)
     if trouble:
         raise RecordingError(f'{raw.topic}: {trouble}')
     return [message]

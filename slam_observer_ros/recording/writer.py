@@ -7,6 +7,7 @@ from pathlib import Path
 import tempfile
 from types import TracebackType
 
+import numpy as np
 from rosbags.interfaces import (
     Connection,
     Qos,
@@ -23,14 +24,14 @@ from rosbags.rosbag2 import (
     Writer,
     WriterError,
 )
+from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.output_files import destination
 from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.messages.point_cloud_layout import point_cloud2_layout
-from slam_observer_ros.recording.message_factory import MessageFactory
+from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 VELOCITY_TOPIC = '/twist'
 LANDMARKS_TOPIC = '/landmarks'
@@ -74,7 +75,10 @@ class RecordingWriter:
         self.path = Path(path)
         self._overwrite = overwrite
         self._connections: dict[tuple[str, str], Connection] = {}
-        self._messages = MessageFactory()
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._messages = OutgoingMessages(
+            self._typestore.types.__getitem__, lambda data: np.frombuffer(data, np.uint8)
+        )
         if self.path.suffix != '.mcap':
             raise RecordingError(f'{self.path}: recordings are written as .mcap files')
         self._refuse_to_overwrite()
@@ -158,7 +162,7 @@ class RecordingWriter:
             self._connections[key] = self._bag.add_connection(
                 topic,
                 message_type,
-                typestore=self._messages.typestore,
+                typestore=self._typestore,
                 offered_qos_profiles=[_LATCHED] if latched else [],
             )
         try:
@@ -192,11 +196,7 @@ class RecordingWriter:
             Time of reception if it isn't the event's stamp.
 
         """
-        message = self._messages.make(
-            'geometry_msgs/msg/TwistStamped',
-            self._messages.header(event.stamp_ns, frame_id),
-            self._messages.twist(event.body_velocity),
-        )
+        message = self._messages.twist_stamped(event.stamp_ns, frame_id, event.body_velocity)
         self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
     def write_observation(
@@ -216,23 +216,24 @@ class RecordingWriter:
             Time of reception if it isn't the event's stamp.
 
         """
-        layout = point_cloud2_layout(event.ids, event.points, event.covariances, event.velocities)
-        message = self._messages.point_cloud2(event.stamp_ns, frame_id, layout)
+        message = self._messages.point_cloud2(
+            event.stamp_ns,
+            frame_id,
+            event.ids,
+            event.points,
+            event.covariances,
+            event.velocities,
+        )
         self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
     def write_pose(self, truth: PoseTruth) -> None:
         """Write a true pose as PoseStamped."""
-        message = self._messages.make(
-            'geometry_msgs/msg/PoseStamped',
-            self._messages.header(truth.stamp_ns, MAP_FRAME),
-            self._messages.pose(truth.pose),
-        )
+        message = self._messages.pose_stamped(truth.stamp_ns, MAP_FRAME, truth.pose)
         self._write_message(POSE_TRUTH_TOPIC, message, truth.stamp_ns)
 
     def write_landmarks(self, stamp_ns: int, truth: LandmarkTruth) -> None:
         """Write true landmark positions as a latched PointCloud2 with ids."""
-        layout = point_cloud2_layout(truth.ids, truth.world_points)
-        message = self._messages.point_cloud2(stamp_ns, MAP_FRAME, layout)
+        message = self._messages.point_cloud2(stamp_ns, MAP_FRAME, truth.ids, truth.world_points)
         self._write_message(LANDMARK_TRUTH_TOPIC, message, stamp_ns, latched=True)
 
     def _write_message(
@@ -244,7 +245,7 @@ class RecordingWriter:
         latched: bool = False,
     ) -> None:
         message_type: str = message.__msgtype__  # type: ignore[attr-defined]
-        data = self._messages.typestore.serialize_cdr(message, message_type)
+        data = self._typestore.serialize_cdr(message, message_type)
         received = stamp_ns if receive_stamp_ns is None else receive_stamp_ns
         self.write(topic, message_type, data, received, latched)
 

@@ -233,8 +233,8 @@ def test_another_clock_is_found_and_corrected_once():
         assert not clock.is_off
         clock.add(1000 * SECOND + index, 10 * SECOND + index)
     assert clock.is_off
-    assert 'or set use_sim_time' in clock.trouble('twist', is_simulated=False)
-    assert 'use_sim_time' not in clock.trouble('twist', is_simulated=True)
+    assert 'or set use_sim_time' in clock.problem('twist', is_simulated=False)
+    assert 'use_sim_time' not in clock.problem('twist', is_simulated=True)
     assert clock.correction_ns == -990 * SECOND
     for index in range(SAMPLES):  # a delay that varies moves nothing
         clock.add(1000 * SECOND + index, 10 * SECOND + 2 * index)

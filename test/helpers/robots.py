@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import time
 
-from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
+from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud
+from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_cloud2_message,
-    transform_message,
-    twist_message,
-)
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.simulation import Simulation
@@ -82,21 +77,20 @@ class Robot:
         ]
 
     def _velocity(self, event):
-        twist = twist_message(event.body_velocity)
-        header = header_message(event.stamp_ns, self.frame_id)
         if self.twist_class is Twist:
-            return twist
+            return MESSAGES.twist(event.body_velocity)
         if self.twist_class is TwistStamped:
-            return TwistStamped(header=header, twist=twist)
+            return MESSAGES.twist_stamped(event.stamp_ns, self.frame_id, event.body_velocity)
+        header = MESSAGES.header(event.stamp_ns, self.frame_id)
         message = Odometry(header=header, child_frame_id=self.frame_id)
-        message.twist.twist = twist
+        message.twist.twist = MESSAGES.twist(event.body_velocity)
         return message
 
     def _observation(self, event):
         contents = (event.stamp_ns, self.sensor_frame_id, event.ids, event.points)
         if self.cloud_class is PointCloud:
             return encode_point_cloud(*contents)
-        return point_cloud2_message(*contents, velocities=event.velocities)
+        return MESSAGES.point_cloud2(*contents, velocities=event.velocities)
 
 
 class TransformSender:
@@ -113,11 +107,7 @@ class TransformSender:
         publisher.publish(
             TFMessage(
                 transforms=[
-                    TransformStamped(
-                        header=header_message(stamp_ns, parent),
-                        child_frame_id=child,
-                        transform=transform_message(pose),
-                    )
+                    MESSAGES.transform_stamped(stamp_ns, parent, child, pose)
                     for parent, child, pose in poses
                 ]
             )

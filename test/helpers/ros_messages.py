@@ -1,4 +1,7 @@
-"""Builds ROS messages and serialises them with rosbags, apart from the package's decoders."""
+"""Builds ROS messages and serialises them with rosbags, apart from the package's decoders.
+
+``OUTGOING`` are the package's own messages, of rosbags' classes.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
+from slam_observer_ros.messages.outgoing import OutgoingMessages
+
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 1_700_000_000_123_456_789
+OUTGOING = OutgoingMessages(
+    TYPESTORE.types.__getitem__, lambda data: np.frombuffer(data, np.uint8)
+)
 
 
 def make(message_type: str, *values: object) -> object:

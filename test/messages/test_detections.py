@@ -18,7 +18,6 @@ from slam_observer_ros.messages.detections import (
     no_tags,
     observed_tags,
 )
-from slam_observer_ros.messages.point_cloud_layout import point_cloud2_layout
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 
 
@@ -142,11 +141,11 @@ def test_a_frame_with_a_serial_number_is_no_fiducial():
 def test_the_largest_id_is_taken():
     assert_array_equal(detections(detector.detection(f'000{MAX_ID}')).ids, [MAX_ID])
     (seen,) = observed_tags([transform('camera', f'tag_{MAX_ID}', 1.0)], 'tag_')
-    layout = point_cloud2_layout(seen.event.ids, seen.event.points)
-    assert layout.width == 1
+    cloud = ros.OUTGOING.point_cloud2(ros.STAMP_NS, 'camera', seen.event.ids, seen.event.points)
+    assert cloud.width == 1
 
 
-def test_fiducials_on_tf_are_told_by_their_names():
+def test_fiducials_on_tf_are_known_by_their_names():
     seen = observed_tags(
         [
             transform('left', 'tag36h11:7', 1.0),

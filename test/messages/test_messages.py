@@ -25,10 +25,7 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.messages.point_cloud_layout import (
-    encode_point_cloud,
-    point_cloud2_layout,
-)
+from slam_observer_ros.messages.outgoing import encode_point_cloud
 
 FINITE = st.floats(-1e6, 1e6)
 TWISTS = st.tuples(*[FINITE] * 6)
@@ -204,7 +201,7 @@ class TestPointCloud:
         assert 'id' not in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
 
     @pytest.mark.parametrize('bad_id', [0.5, -2.0, np.nan, np.inf, 2.0**24])
-    def test_id_that_float32_cannot_tell_is_refused(self, bad_id):
+    def test_id_that_float32_cannot_hold_is_refused(self, bad_id):
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.array([1, bad_id])}))
         with pytest.raises(MessageError, match='not a whole number'):
             point_clouds.decode_point_cloud(raw)
@@ -267,30 +264,15 @@ class TestPointCloud2:
         covariances = (roots + roots.swapaxes(1, 2)).astype(np.float32).astype(float)
         points, velocities = random.normal(size=(2, count, 3)).astype(np.float32).astype(float)
         ids = np.arange(-1, count - 1)
-        layout = point_cloud2_layout(
+        cloud = ros.OUTGOING.point_cloud2(
+            ros.STAMP_NS,
+            'map',
             ids,
             points,
             covariances if with_covariances else None,
             velocities if with_velocities else None,
         )
-        fields = [
-            ros.make('sensor_msgs/msg/PointField', f.name, f.offset, f.datatype, f.count)
-            for f in layout.fields
-        ]
-        raw = ros.serialise(
-            ros.make(
-                'sensor_msgs/msg/PointCloud2',
-                ros.header('map'),
-                1,
-                layout.width,
-                fields,
-                False,
-                layout.point_step,
-                layout.point_step * layout.width,
-                np.frombuffer(layout.data, np.uint8),
-                True,
-            )
-        )
+        raw = ros.serialise(cloud)
         event = point_clouds.decode_point_cloud2(raw).event
         np.testing.assert_array_equal(event.ids, ids)
         np.testing.assert_array_equal(event.points, points)
@@ -304,19 +286,19 @@ class TestPointCloud2:
             assert event.velocities is None
 
     def test_layout_starts_with_what_viewers_display(self):
-        layout = point_cloud2_layout(np.array([3]), np.ones((1, 3)))
-        assert [(f.name, f.offset, f.datatype) for f in layout.fields] == [
+        cloud = ros.OUTGOING.point_cloud2(0, 'map', np.array([3]), np.ones((1, 3)))
+        assert [(f.name, f.offset, f.datatype) for f in cloud.fields] == [
             ('x', 0, 7),
             ('y', 4, 7),
             ('z', 8, 7),
             ('id', 12, 6),
         ]
-        assert layout.point_step == 16
+        assert cloud.point_step == 16
 
     @pytest.mark.parametrize('bad_id', [-2, 2**32 - 1])
     def test_layout_refuses_ids_beyond_uint32(self, bad_id):
         with pytest.raises(MessageError, match='landmark ids'):
-            point_cloud2_layout(np.array([bad_id]), np.zeros((1, 3)))
+            ros.OUTGOING.point_cloud2(0, 'map', np.array([bad_id]), np.zeros((1, 3)))
 
     def test_empty_cloud_needs_no_fields(self):
         raw = ros.serialise(ros.point_cloud2(np.zeros((0, 0), np.dtype([('q', 'f4')]))))
@@ -525,28 +507,55 @@ class TestMalformed:
             point_clouds.decode_point_cloud(bytes(raw))
 
 
+def outgoing_messages(make):
+    """Return one message of each kind that is published or recorded."""
+    stamp, pose, velocity = ros.STAMP_NS, np.eye(4), np.array([0.0, 0.0, -0.5, 1.5, 0.0, 0.0])
+    pose[:3, 3] = [1.0, 2.0, 3.0]
+    cloud = np.array([4, -1]), np.arange(6.0).reshape(2, 3)
+    covariances, velocities = np.tile(np.diag([1.0, 2.0, 3.0]), (2, 1, 1)), np.ones((2, 3))
+    return [
+        make.time(stamp),
+        make.header(stamp, 'base_link'),
+        make.point(pose[:3, 3]),
+        make.vector(pose[:3, 3]),
+        make.quaternion(pose[:3, :3]),
+        make.pose(pose),
+        make.pose_stamped(stamp, 'map', pose),
+        make.pose_with_covariance(pose, COVARIANCE),
+        make.pose_with_covariance(pose, None),
+        make.transform_stamped(stamp, 'map', 'base_link', pose),
+        make.twist(velocity),
+        make.twist_with_covariance(velocity, None),
+        make.twist_stamped(stamp, 'base_link', velocity),
+        make.point_cloud2(stamp, 'map', *cloud),
+        make.point_cloud2(stamp, 'map', *cloud, covariances, velocities),
+    ]
+
+
+@pytest.mark.parametrize('covariance', [ANGULAR_FIRST_COVARIANCE, None])
+def test_a_covariance_that_is_sent_is_read_again(covariance):
+    pose = ros.OUTGOING.pose_with_covariance(np.eye(4), covariance)
+    message = ros.make('geometry_msgs/msg/PoseWithCovarianceStamped', ros.header('map'), pose)
+    read = messages.decode_pose_with_covariance_stamped(ros.serialise(message)).covariance
+    if covariance is None:
+        assert read is None
+    else:
+        np.testing.assert_array_equal(read, covariance)
+
+
 def test_rclpy_serialises_the_same_bytes():
     """What rosbags' serialiser stands for here is what the middleware really sends."""
     serialization = pytest.importorskip('rclpy.serialization')
-    from geometry_msgs.msg import TwistStamped
-    from sensor_msgs.msg import PointCloud2, PointField
+    from slam_observer_ros.nodes.message_classes import MESSAGES
 
-    twist = TwistStamped()
-    twist.header.frame_id = 'base_link'
-    twist.header.stamp.sec = 5
-    twist.twist.linear.x, twist.twist.angular.z = 1.5, -0.5
-    decoded = messages.decode_twist_stamped(serialization.serialize_message(twist))
-    assert (decoded.frame_id, decoded.event.stamp_ns) == ('base_link', 5_000_000_000)
+    messages_of_rclpy = outgoing_messages(MESSAGES)
+    for message, recorded in zip(messages_of_rclpy, outgoing_messages(ros.OUTGOING), strict=True):
+        raw = ros.serialise(recorded)
+        assert serialization.deserialize_message(raw, type(message)) == message
+    published = [serialization.serialize_message(message) for message in messages_of_rclpy]
+    decoded = messages.decode_twist_stamped(published[-3])
+    assert (decoded.frame_id, decoded.event.stamp_ns) == ('base_link', ros.STAMP_NS)
     assert decoded.event.body_velocity.tolist() == [0.0, 0.0, -0.5, 1.5, 0.0, 0.0]
-
-    layout = point_cloud2_layout(np.array([4, -1]), np.arange(6.0).reshape(2, 3))
-    cloud = PointCloud2(height=1, width=layout.width, point_step=layout.point_step)
-    cloud.row_step = layout.point_step * layout.width
-    cloud.fields = [
-        PointField(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count)
-        for f in layout.fields
-    ]
-    cloud.data = layout.data
-    event = point_clouds.decode_point_cloud2(serialization.serialize_message(cloud)).event
+    event = point_clouds.decode_point_cloud2(published[-2]).event
     assert event.ids.tolist() == [4, -1]
     assert event.points.tolist() == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]

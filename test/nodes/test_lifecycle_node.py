@@ -72,7 +72,7 @@ def test_managed_node_estimates_only_while_it_is_active(ros, tmp_path):
                 lambda: stamp_ns(odometry[-1]) > deactivated_ns or robot.send_zeros(),
                 'the estimate',
             )
-            # It went on from where it was held, and did not begin anew.
+            # It went on from where it was held, and did not start again.
             again = next(message for message in odometry if stamp_ns(message) > deactivated_ns)
             assert x_of(again) > 0.4
 

@@ -26,8 +26,8 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
-from slam_observer_ros.nodes.intake.intake import transform_listener
-from slam_observer_ros.nodes.publishing.conversions import header_message
+from slam_observer_ros.nodes.intake import transform_listener
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.simulation import Scenario, Simulation
 
@@ -258,7 +258,7 @@ def test_the_nodes_own_transform_takes_no_other_ones_place():
     transforms = transform_listener.TopicTransforms(node, ('map', 'base_link'))
     receive = node.create_subscription.call_args_list[0].args[2]
     for parent in ('odom', 'map'):
-        header = header_message(SECOND, parent)
+        header = MESSAGES.header(SECOND, parent)
         transform = TransformStamped(header=header, child_frame_id='base_link')
         receive(serialize_message(TFMessage(transforms=[transform])))
     assert transforms.newest_ns('odom', 'base_link') == SECOND

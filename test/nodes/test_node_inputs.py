@@ -1,4 +1,4 @@
-"""Every kind of input over real DDS; missing packages and deaf subscriptions are told."""
+"""Every kind of input over real DDS; missing packages and deaf subscriptions are reported."""
 
 from __future__ import annotations
 
@@ -29,17 +29,10 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.message_types import IMU
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
-from slam_observer_ros.nodes.intake.input_topics import open_inputs
-from slam_observer_ros.nodes.intake.intake import decoders
-from slam_observer_ros.nodes.intake.intake import subscriptions as inputs
-from slam_observer_ros.nodes.intake.subscriptions import Input
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_message,
-    pose_message,
-    twist_message,
-    vector_message,
-)
+from slam_observer_ros.nodes.intake import warning_decoders
+from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
+from slam_observer_ros.nodes.intake.input_topic import InputTopic
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -58,22 +51,22 @@ def true_pose(stamp_ns, start_ns):
 
 
 def odometry(stamp, start_ns, velocity=V):
-    message = Odometry(header=header_message(stamp, 'odom'), child_frame_id='base_link')
-    message.pose.pose = pose_message(true_pose(stamp, start_ns))
-    message.twist.twist = twist_message(velocity)
+    message = Odometry(header=MESSAGES.header(stamp, 'odom'), child_frame_id='base_link')
+    message.pose.pose = MESSAGES.pose(true_pose(stamp, start_ns))
+    message.twist.twist = MESSAGES.twist(velocity)
     return message
 
 
 def twist_with_covariance(stamp, _start_ns):
-    message = TwistWithCovarianceStamped(header=header_message(stamp, 'base_link'))
-    message.twist.twist = twist_message(V)
+    message = TwistWithCovarianceStamped(header=MESSAGES.header(stamp, 'base_link'))
+    message.twist.twist = MESSAGES.twist(V)
     message.twist.covariance = (np.eye(6) * 1e-4).ravel()
     return message
 
 
 def imu(stamp, _start_ns):
-    message = Imu(header=header_message(stamp, 'base_link'))
-    message.angular_velocity = vector_message(V[:3])
+    message = Imu(header=MESSAGES.header(stamp, 'base_link'))
+    message.angular_velocity = MESSAGES.vector(V[:3])
     return message
 
 
@@ -110,7 +103,7 @@ def unstamped_input(node, received, is_simulated=False):
     node.get_clock.return_value = FakeClock(is_simulated)
     node.resolve_topic_name.side_effect = lambda name: f'/{name}'
     decoders = {'geometry_msgs/msg/Twist': decode_twist}
-    source = Input(node, 'twist', decoders, lambda *taken: received.append(taken), QOS)
+    source = InputTopic(node, 'twist', decoders, lambda *taken: received.append(taken), QOS)
     return source, node.create_subscription.call_args.args[2]
 
 
@@ -128,7 +121,7 @@ def test_a_message_that_had_to_wait_was_received_when_the_middleware_had_it(
     _, receive = unstamped_input(Mock(), received, is_simulated)
     waited_since_ns = NOW_NS - 3 * SECOND
     receive(TWIST, {'received_timestamp': waited_since_ns})
-    receive(TWIST, {'received_timestamp': 0})  # as where the middleware does not tell
+    receive(TWIST, {'received_timestamp': 0})  # as where the middleware does not say
     (first, first_ns), (last, last_ns) = received
     assert (first.event.stamp_ns, last.event.stamp_ns) == (first_ns, last_ns)
     assert last_ns == NOW_NS + 10 * SECOND
@@ -140,10 +133,10 @@ def test_a_first_message_ends_the_report_that_there_is_none():
     source, receive = unstamped_input(node, [])
     publisher = Mock(topic_type='geometry_msgs/msg/Twist', qos_profile=QOS)
     node.get_publishers_info_by_topic.return_value = [publisher]
-    source.look()
-    assert source.trouble == "no message yet on '/twist' (geometry_msgs/msg/Twist)"
+    source.check_publishers()
+    assert source.problem == "no message yet on '/twist' (geometry_msgs/msg/Twist)"
     receive(TWIST, {'received_timestamp': time.time_ns()})
-    assert not source.trouble
+    assert not source.problem
 
 
 def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
@@ -153,21 +146,21 @@ def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
     monkeypatch.setattr(time, 'time_ns', lambda: NOW_NS)
     publisher = Mock(topic_type='geometry_msgs/msg/Twist', qos_profile=QOS)
     node.get_publishers_info_by_topic.return_value = [publisher]
-    troubles = []
+    problems = []
 
     def at(step):
         monkeypatch.setattr(time, 'monotonic', lambda: steady_s + 0.1 * step)
-        source.look()
-        return source.trouble
+        source.check_publishers()
+        return source.problem
 
     for step, wait_s in enumerate([0.0, *[1.5] * 30, 0.0, *[1.5] * 30]):
         at(step)
         receive(TWIST, {'received_timestamp': NOW_NS - round(wait_s * SECOND)})
-        troubles.append(at(step))
-    assert troubles[:20] == [''] * 20, 'it may only have been busy for a moment'
-    assert troubles[30].startswith("the node does not keep up: messages on '/twist' wait 1.5 s")
-    assert troubles[31] == ''
-    assert troubles[-1]
+        problems.append(at(step))
+    assert problems[:20] == [''] * 20, 'it may only have been busy for a moment'
+    assert problems[30].startswith("the node does not keep up: messages on '/twist' wait 1.5 s")
+    assert problems[31] == ''
+    assert problems[-1]
     assert at(step + 30) == '', 'no message comes any more'
     for step in (2000, 4000):
         at(step)
@@ -184,7 +177,7 @@ def test_a_node_that_does_not_keep_up_says_so(monkeypatch):
         ('sensor_msgs/msg/PointCloud', 'id', None),
     ],
 )
-def test_points_whose_ids_are_named_otherwise_are_told_once(message_type, name, found):
+def test_points_whose_ids_are_named_otherwise_are_reported_once(message_type, name, found):
     node = Mock()
     node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
     if message_type.endswith('2'):
@@ -195,37 +188,37 @@ def test_points_whose_ids_are_named_otherwise_are_told_once(message_type, name, 
             ros_messages.point_cloud(np.ones((count, 3)), {name: np.ones(count)})
             for count in (0, 2, 2)
         ]
-    decode = decoders.CloudDecoder(node, message_type)
+    decode = warning_decoders.CloudDecoder(node, message_type)
     decoded = [decode(ros_messages.serialise(cloud), 0) for cloud in clouds]
     assert [len(message.event.ids) for message in decoded] == [0, 2, 2]
-    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
-    start = f"points on '/robot/landmarks' come without ids; {found}: they are told apart"
-    assert [text.startswith(start) for text in told] == ([] if found is None else [True])
-    assert all(text.endswith("name these 'id'") for text in told)
+    logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    start = f"points on '/robot/landmarks' come without ids; {found}: they are distinguished"
+    assert [text.startswith(start) for text in logged] == ([] if found is None else [True])
+    assert all(text.endswith("name these 'id'") for text in logged)
 
 
 @pytest.mark.parametrize(
-    ('velocity', 'speed', 'is_told'),
+    ('velocity', 'speed', 'is_logged'),
     [(np.zeros(6), 0.5, True), (V, 0.5, False), (np.zeros(6), 0.001, False)],
     ids=['poses alone', 'both', 'at rest'],
 )
-def test_an_odometry_with_poses_alone_is_told_once(velocity, speed, is_told):
+def test_an_odometry_with_poses_alone_is_reported_once(velocity, speed, is_logged):
     node = Mock()
     node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
-    decode = decoders.OdometryDecoder(node)
+    decode = warning_decoders.OdometryDecoder(node)
     for step in range(20):
         message = odometry(round(speed * step * SECOND), 0, velocity)
         assert_allclose(decode(serialize_message(message), 0).event.body_velocity, velocity)
-    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
-    assert len(told) == is_told
-    assert all("all velocities on '/robot/twist' are zero" in text for text in told)
-    assert all("velocity_source to 'pose_differences'" in text for text in told)
+    logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    assert len(logged) == is_logged
+    assert all("all velocities on '/robot/twist' are zero" in text for text in logged)
+    assert all("velocity_source to 'pose_differences'" in text for text in logged)
 
 
 def test_an_odometry_without_an_attitude_has_a_velocity():
     message = odometry(0, 0, np.zeros(6))
     message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
-    decode = decoders.OdometryDecoder(Mock())
+    decode = warning_decoders.OdometryDecoder(Mock())
     assert_allclose(decode(serialize_message(message), 0).event.body_velocity, 0.0)
 
 
@@ -236,19 +229,19 @@ def test_a_velocity_without_poses_has_no_pose_differences():
 
 
 @pytest.mark.parametrize('is_seen', [False, True])
-def test_fiducials_on_tf_by_another_name_are_told_once(monkeypatch, is_seen):
+def test_fiducials_on_tf_by_another_name_are_reported_once(monkeypatch, is_seen):
     node, now = Mock(), [0.0]
-    monkeypatch.setattr(decoders, 'time', Mock(monotonic=lambda: now[0]))
-    decode = decoders.TagDecoder(node, 'dock')
+    monkeypatch.setattr(warning_decoders, 'time', Mock(monotonic=lambda: now[0]))
+    decode = warning_decoders.TagDecoder(node, 'dock')
     for name in ('dock7' if is_seen else 'fiducial_7', 'wheel', 'wheel'):
         names, position, quaternion = ('camera', name), (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)
         sent = [ros_messages.transform_stamped(names, position, quaternion)]
         decode(ros_messages.serialise(ros_messages.make('tf2_msgs/msg/TFMessage', sent)), 0)
-        now[0] += decoders.WITHOUT_TAG_S
-    told = [call.args[0] for call in node.get_logger().warning.call_args_list]
-    assert len(told) == (not is_seen)
-    assert all("named 'dock<id>'" in text for text in told)
-    assert all('(there are fiducial_7, wheel)' in text for text in told)
+        now[0] += warning_decoders.WITHOUT_TAG_S
+    logged = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    assert len(logged) == (not is_seen)
+    assert all("named 'dock<id>'" in text for text in logged)
+    assert all('(there are fiducial_7, wheel)' in text for text in logged)
 
 
 def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):
@@ -306,8 +299,8 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
                 ('odom', 'base_link', np.eye(4)),
                 stamp_ns=stamp,
             )
-            point = Pose(position=point_message(np.ones(3)))
-            header = header_message(stamp, 'base_link')
+            point = Pose(position=MESSAGES.point(np.ones(3)))
+            header = MESSAGES.header(stamp, 'base_link')
             poses.publish(PoseArray(header=header, poses=[point]))
             ros.spin_for(0.03)
         ros.spin_until(lambda: len(seen(maps)) == 2, 'two fiducials')
@@ -318,7 +311,7 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
     assert_allclose(seen(nameless_maps)[FIRST_AUTOMATIC_ID], [1.0, 1.0, 1.0], atol=1e-6)
 
 
-def test_the_map_tells_the_velocities_that_landmarks_came_with(ros, tmp_path):
+def test_the_map_has_the_velocities_that_landmarks_came_with(ros, tmp_path):
     maps = ros.collect(PointCloud2, '/moving/map', LATCHED_QOS)
     points, speed = np.array([[2.0, 0, 0], [0, 3.0, 1.0]]), np.array([[0, 0.5, 0], [0, 0, 0]])
     with (
@@ -364,31 +357,31 @@ def test_optional_packages_are_named_when_they_are_missing(tmp_path):
 
 def test_a_driver_that_falls_silent_is_logged_until_it_is_heard_again(monkeypatch):
     clock = SimpleNamespace(now_s=1000.0)
-    monkeypatch.setattr(inputs, 'time', SimpleNamespace(monotonic=lambda: clock.now_s))
+    monkeypatch.setattr(time, 'monotonic', lambda: clock.now_s)
     node, qos = Mock(), QoSProfile(depth=1)
     node.resolve_topic_name.return_value = '/twist'
     node.get_clock.return_value.now.return_value.nanoseconds = 0
     publisher = SimpleNamespace(topic_type=IMU, qos_profile=qos, node_name='driver')
     node.get_publishers_info_by_topic.return_value = [publisher]
-    source = inputs.Input(node, 'twist', {IMU: lambda raw, receive_ns: raw}, Mock(), qos)
+    source = InputTopic(node, 'twist', {IMU: lambda raw, receive_ns: raw}, Mock(), qos)
     receive = node.create_subscription.call_args.args[2]
     warning = node.get_logger.return_value.warning
 
-    def look_for(duration_s):
+    def check_for(duration_s):
         for _ in range(duration_s):
             clock.now_s += 1.0
-            source.look()
+            source.check_publishers()
         return [call.args[0] for call in warning.call_args_list]
 
     for _ in range(20):
         receive(b'', {'received_timestamp': 0})
-        assert not look_for(1)
-    told = look_for(20)
-    assert told[0] == "no message on '/twist' for 6 s, though it has a publisher"
-    assert len(told) == 2, 'not throttled'
+        assert not check_for(1)
+    logged = check_for(20)
+    assert logged[0] == "no message on '/twist' for 6 s, though it has a publisher"
+    assert len(logged) == 2, 'not throttled'
     receive(b'', {'received_timestamp': 0})
-    assert len(look_for(4)) == 2
-    assert not source.trouble
+    assert len(check_for(4)) == 2
+    assert not source.problem
 
 
 def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
@@ -400,9 +393,9 @@ def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
         order.append(kind)
 
     decoders = {'geometry_msgs/msg/Twist': lambda *_: 'velocity'}
-    velocities = Input(node, 'busy/twist', decoders, take, qos)
+    velocities = InputTopic(node, 'busy/twist', decoders, take, qos)
     decoders = {'geometry_msgs/msg/PoseArray': lambda *_: 'landmarks'}
-    Input(node, 'busy/landmarks', decoders, take, qos).read_first = [velocities]
+    InputTopic(node, 'busy/landmarks', decoders, take, qos).read_first = [velocities]
     twists = ros.node.create_publisher(Twist, 'busy/twist', qos)
     landmarks = ros.node.create_publisher(PoseArray, 'busy/landmarks', qos)
     executor = SingleThreadedExecutor(context=ros.node.context)
@@ -422,7 +415,7 @@ def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
         assert len(order) == 72
         velocities_before = np.flatnonzero(np.array(order) == 'landmarks') - np.arange(12)
         published_before = 5 * np.arange(1, 13)
-        # One more tells that there is none before, and one comes in turn.
+        # One more shows that there is none before, and one comes in turn.
         assert set(velocities_before - published_before) <= {0, 1, 2}
     finally:
         executor.shutdown()

@@ -26,14 +26,8 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_cloud2_message,
-    pose_covariance_field,
-    pose_message,
-    twist_message,
-)
-from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPose
+from slam_observer_ros.nodes.message_classes import MESSAGES
+from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.nodes.services.map_services import free_name
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -61,7 +55,7 @@ def ros(ros_domain_id):
 
 
 class Robot:
-    """Stands somewhere among 50 landmarks and tells what it sees."""
+    """Stands somewhere among 50 landmarks and reports what it sees."""
 
     def __init__(self, ros):
         self.ros = ros
@@ -81,11 +75,11 @@ class Robot:
         ids = np.array(list(ids), dtype=np.int64)
         points = se3.transform(se3.inverse(pose), self.points[ids])
         points += self.random.normal(scale=NOISE_M, size=points.shape)
-        twist = TwistStamped(header=header_message(time.time_ns(), 'base_link'))
-        twist.twist = twist_message(np.zeros(6))
+        twist = TwistStamped(header=MESSAGES.header(time.time_ns(), 'base_link'))
+        twist.twist = MESSAGES.twist(np.zeros(6))
         self.twist.publish(twist)
         self.ros.spin_for(0.1)
-        message = point_cloud2_message(time.time_ns(), 'base_link', ids, points)
+        message = MESSAGES.point_cloud2(time.time_ns(), 'base_link', ids, points)
         self.landmarks.publish(message)
         return message.header.stamp
 
@@ -134,9 +128,8 @@ def name_file(ros, path, must_succeed=True):
 
 
 def initial_pose(pose, frame_id='map', variances=(0.01,) * 6):
-    message = PoseWithCovarianceStamped(header=header_message(time.time_ns(), frame_id))
-    message.pose.pose = pose_message(pose)
-    message.pose.covariance = pose_covariance_field(np.diag(variances))
+    message = PoseWithCovarianceStamped(header=MESSAGES.header(time.time_ns(), frame_id))
+    message.pose = MESSAGES.pose_with_covariance(pose, np.diag(variances))
     return message
 
 
@@ -163,7 +156,7 @@ def test_saved_killed_loaded_and_localised(ros, robot, tmp_path):
         robot = Robot(ros).connect()
         robot.see(elsewhere, [7, 31])
         ros.spin_for(0.5)
-        assert not robot.odometry  # two landmarks don't tell where it is
+        assert not robot.odometry  # two landmarks don't determine where it is
         pose, covariance = robot.see_until_published(elsewhere, [7, 31, 44])
         assert nees(pose, covariance, elsewhere) < chi2.ppf(0.9973, 6)
         node.wait_for_output('Found the place in the map')
@@ -210,7 +203,7 @@ def test_a_map_that_is_not_the_nodes_own_is_kept_when_another_one_takes_its_plac
     assert (tmp_path / 'hall.yaml~').read_text() == before
 
 
-def test_a_place_that_there_can_not_be_is_told_and_ends_nothing(ros, robot, tmp_path):
+def test_a_file_that_there_can_not_be_is_reported_and_ends_nothing(ros, robot, tmp_path):
     with running('observer_node', tmp_path / 'log', **PARAMETERS):
         robot.connect()
         for _ in range(3):
@@ -231,7 +224,7 @@ def test_what_a_file_held_is_never_lost_however_often_it_is_replaced(tmp_path):
     assert kept == ['first', 'second', 'third']
 
 
-def test_a_map_that_can_not_be_saved_at_the_end_is_told_by_the_exit_code(ros, robot, tmp_path):
+def test_a_map_that_can_not_be_saved_at_the_end_shows_in_the_exit_code(ros, robot, tmp_path):
     folder = tmp_path / 'folder'
     folder.mkdir()
     maps = {'map_path': folder / 'map.yaml', 'autosave_map': True}
@@ -260,7 +253,7 @@ def test_a_map_loaded_while_running_moves_the_estimate_into_its_frame(ros, robot
         name_file(ros, surveyed)
         answer = call(ros, 'load_map')
         assert answer.success
-        assert answer.message.endswith('the robot has found its place in it')
+        assert answer.message.endswith('the robot has found its pose in it')
         after, covariance = robot.see_until_published(pose, range(20))
         assert nees(after, covariance, pose) < chi2.ppf(0.9973, 6)
 
@@ -287,7 +280,7 @@ class GivenPose:
         self.estimator = Estimator(Settings(reorder_window=reorder_window))
         self.stamp_ns = 0
         self.node, self.on_move = Mock(), Mock()
-        InitialPose(self.node, 'map', self.estimator, self.on_move)
+        InitialPoseListener(self.node, 'map', self.estimator, self.on_move)
         self.receive = self.node.create_subscription.call_args.args[2]
         self.see()
 
@@ -329,12 +322,12 @@ def test_an_initial_pose_is_that_of_the_newest_message_even_if_that_waits_for_ot
     assert given.estimator.stamp_ns == given.stamp_ns
 
 
-def test_of_an_initial_pose_what_is_told_counts_and_what_is_not_is_assumed():
+def test_of_an_initial_pose_what_is_given_counts_and_what_is_not_is_assumed():
     """What only rounding has made negative is not refused."""
-    told = np.diag([0.0, 0.0, 0.07, 0.25, 0.25, 0.0])
-    told[3, 4] = told[4, 3] = 0.25 + 1e-14
-    expected = told + np.diag([0.26, 0.26, 0.0, 0.0, 0.0, 0.5]) ** 2
-    assert_allclose(filled_in(told), expected)
+    given = np.diag([0.0, 0.0, 0.07, 0.25, 0.25, 0.0])
+    given[3, 4] = given[4, 3] = 0.25 + 1e-14
+    expected = given + np.diag([0.26, 0.26, 0.0, 0.0, 0.0, 0.5]) ** 2
+    assert_allclose(filled_in(given), expected)
     assert_allclose(filled_in(None), np.diag([0.26, 0.26, 0.26, 0.5, 0.5, 0.5]) ** 2)
 
 
@@ -400,8 +393,8 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
         assert not answer.success
         assert 'not known yet: nothing is saved' in answer.message
         ros.spin_until(
-            lambda: any('place in the loaded map' in m.status[0].message for m in diagnostics),
-            'a diagnostic that tells it',
+            lambda: any('pose in the loaded map' in m.status[0].message for m in diagnostics),
+            'a diagnostic that says so',
         )
 
 
@@ -462,12 +455,12 @@ def test_without_ids_the_pose_in_a_map_is_asked_for(ros, robot, tmp_path):
     surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(5))
     message = 'points have no ids: give the pose on initialpose'
 
-    def is_told():
+    def is_reported():
         return diagnostics and message in diagnostics[-1].status[0].message
 
     def see_without_ids():
         ids, points = np.full(3, UNKNOWN_ID), robot.points[2:5]
-        robot.landmarks.publish(point_cloud2_message(time.time_ns(), 'base_link', ids, points))
+        robot.landmarks.publish(MESSAGES.point_cloud2(time.time_ns(), 'base_link', ids, points))
         ros.spin_for(0.1)
 
     with running('observer_node', tmp_path / 'log', map_file=surveyed, **PARAMETERS) as node:
@@ -476,6 +469,6 @@ def test_without_ids_the_pose_in_a_map_is_asked_for(ros, robot, tmp_path):
         robot.see(np.eye(4), [0, 1])
         diagnostics.clear()
         ros.spin_until(lambda: len(diagnostics) > 1, 'diagnostics')
-        assert 'place in the loaded map' in diagnostics[-1].status[0].message
-        assert not is_told()
-        ros.spin_until(lambda: see_without_ids() or is_told(), 'the request')
+        assert 'pose in the loaded map' in diagnostics[-1].status[0].message
+        assert not is_reported()
+        ros.spin_until(lambda: see_without_ids() or is_reported(), 'the request')

@@ -27,10 +27,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
-from slam_observer_ros.nodes.publishing.conversions import header_message
-from slam_observer_ros.nodes.publishing.diagnostics import Diagnostics as NodeDiagnostics
-from slam_observer_ros.nodes.publishing.diagnostics import MANY_UNUSED
+from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher, MANY_UNUSED
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.simulation import Scenario
@@ -152,7 +151,7 @@ def test_correction_of_the_odometry_holds_while_paused(ros, tmp_path):
     assert len(set(stamps)) == len(stamps)
 
 
-def test_odometry_that_ends_on_tf_is_told_by_log_and_diagnostics(ros, tmp_path):
+def test_odometry_that_ends_on_tf_is_reported_by_log_and_diagnostics(ros, tmp_path):
     if TFMessage is None:
         pytest.skip('tf2_msgs is not installed')
     diagnostics = Diagnostics(ros, '/stranded')
@@ -163,12 +162,12 @@ def test_odometry_that_ends_on_tf_is_told_by_log_and_diagnostics(ros, tmp_path):
     ):
         ros.wait_for_subscriber(sender.dynamic)
         sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=time.time_ns())
-        told = "'odom' to 'base_link' on /tf is .* s behind the estimate"
+        warning = "'odom' to 'base_link' on /tf is .* s behind the estimate"
         diagnostics.wait(
-            lambda d: robot.send_zeros() or re.search(told, d.status.message), 'the warning'
+            lambda d: robot.send_zeros() or re.search(warning, d.status.message), 'the warning'
         )
         assert diagnostics.status.level == DiagnosticStatus.WARN
-        node.wait_for_output(told)
+        node.wait_for_output(warning)
 
 
 def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
@@ -224,13 +223,13 @@ def test_forgotten_landmarks_stay_neither_in_the_latched_map_nor_drawn(ros, tmp_
             robot.send_zeros()
             if service == 'reset':
                 ros.spin_until(lambda: ids(maps) == [7], 'a new landmark')
-        assert not ids(maps), 'published before the place in the loaded map is known'
+        assert not ids(maps), 'published before the pose in the loaded map is known'
 
 
 DELAYED = ('-p', 'velocity_delay_error:=0.1')
 
 
-def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
+def test_diagnostics_report_rates_ages_drops_and_times(ros, tmp_path):
     diagnostics = Diagnostics(ros, '/watched')
     with (
         running('observer_node', tmp_path / 'log', '-r', '__ns:=/watched', *DELAYED),
@@ -239,9 +238,9 @@ def test_diagnostics_tell_rates_ages_drops_and_times(ros, tmp_path):
         robot.run(Scenario(velocity_rate=40.0, observation_rate=20.0, duration=3.0))
 
         def of_a_robot_under_way():
-            """Not the latest status: a busy machine may tell of the run when it is over."""
-            told = [values_of(status) for status in diagnostics.all]
-            return [v for v in told if v['landmarks known'] == '4' and is_moving(v)]
+            """Not the latest status: a busy machine may report the run when it is over."""
+            reported = [values_of(status) for status in diagnostics.all]
+            return [v for v in reported if v['landmarks known'] == '4' and is_moving(v)]
 
         diagnostics.wait(lambda _: of_a_robot_under_way() or robot.send_zeros(), 'the rates')
         values = of_a_robot_under_way()[-1]
@@ -274,7 +273,7 @@ def is_moving(values):
     )
 
 
-class Told:
+class Publishing:
     """The status that diagnostics publish of an estimator's counts."""
 
     def __init__(self, *inputs, **estimate):
@@ -289,13 +288,13 @@ class Told:
             is_localised=True,
         )  # fmt: skip
         vars(self.estimator).update(estimate)
-        self.intake = SimpleNamespace(
-            dropped=Counter(), is_paused=False, clock_troubles=list,
+        self.feed = SimpleNamespace(
+            dropped=Counter(), is_paused=False, clock_problems=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
-        self.outputs = SimpleNamespace(trouble='')
-        parts = self.estimator, self.intake, inputs, self.outputs
-        self.diagnostics = NodeDiagnostics(self.node, *parts)
+        self.estimate_publisher = SimpleNamespace(problem='')
+        parts = self.estimator, self.feed, inputs, self.estimate_publisher
+        self.diagnostics = DiagnosticsPublisher(self.node, *parts)
 
     def publish(self, **new):
         # A new one, as the real one gives.
@@ -307,44 +306,46 @@ class Told:
 @pytest.mark.parametrize(
     ('points', 'rejected', 'warns'), [(20, 3, True), (20, 2, False), (8, 4, False)]
 )
-def test_more_rejected_points_than_outliers_are_told_once_there_are_enough(
+def test_more_rejected_points_than_outliers_are_reported_once_there_are_enough(
     points, rejected, warns
 ):
-    told = Told()
+    publishing = Publishing()
     for _ in range(5):  # MIN_POINTS are 50
-        status = told.publish(observation=1, observed_point=points, rejected_landmark=rejected)
+        status = publishing.publish(
+            observation=1, observed_point=points, rejected_landmark=rejected
+        )
     text = f'{100 * rejected / points:.0f} % of the points seen lately were rejected'
     assert (text in status.message) == warns
     assert status.level == (DiagnosticStatus.WARN if warns else DiagnosticStatus.OK)
 
 
-def test_a_calibration_that_nobody_can_mean_is_told():
+def test_a_calibration_that_nobody_can_mean_is_reported():
     wrong = CalibrationEstimate('angular_scale_z', -0.5, 0.01, '', nominal=1.0, stated=0.03)
-    status = Told(calibration=[wrong]).publish(observation=1)
+    status = Publishing(calibration=[wrong]).publish(observation=1)
     assert status.level == DiagnosticStatus.WARN
     assert status.message == wrong.problem
 
 
-def test_points_rejected_long_ago_are_told_of_no_more():
-    told = Told()
+def test_points_rejected_long_ago_are_reported_no_more():
+    publishing = Publishing()
     for _ in range(5):
-        assert told.publish(observation=1, observed_point=20, rejected_landmark=20)
+        assert publishing.publish(observation=1, observed_point=20, rejected_landmark=20)
     for _ in range(20):
-        status = told.publish(observation=1, observed_point=20)
+        status = publishing.publish(observation=1, observed_point=20)
     assert status.message == '20 % of the points seen lately were rejected'
     for _ in range(10):
-        status = told.publish(observation=1, observed_point=20)
+        status = publishing.publish(observation=1, observed_point=20)
     assert status.message == 'running'
 
 
 @pytest.mark.parametrize('reason', ['repeated_id', 'reserved_id'])
-def test_of_points_left_out_for_their_ids_a_single_one_is_told(reason):
-    status = Told().publish(observation=1, observed_point=100, **{reason: 1})
+def test_of_points_left_out_for_their_ids_a_single_one_is_reported(reason):
+    status = Publishing().publish(observation=1, observed_point=100, **{reason: 1})
     assert status.message.startswith('of 100 points seen 1 ')
     assert status.level == DiagnosticStatus.WARN
 
 
-NO_PLACE = 'the place in the loaded map is not known yet: no pose is published'
+NO_POSE = 'the pose in the loaded map is not known yet: no pose is published'
 NO_IDS = 'points have no ids: give the pose on initialpose'
 
 
@@ -353,43 +354,43 @@ NO_IDS = 'points have no ids: give the pose on initialpose'
     [
         ({'velocity_is_stale': True}, 'running'),  # there was no event yet
         ({'velocity_is_stale': True, 'stamp_ns': 1}, 'no velocity in force: the pose is held'),
-        ({'is_localised': False}, NO_PLACE),
-        ({'is_localised': False, 'landmark_ids': [7, FIRST_AUTOMATIC_ID]}, NO_PLACE),
-        ({'is_localised': False, 'landmark_ids': [FIRST_AUTOMATIC_ID]}, f'{NO_PLACE}; {NO_IDS}'),
+        ({'is_localised': False}, NO_POSE),
+        ({'is_localised': False, 'landmark_ids': [7, FIRST_AUTOMATIC_ID]}, NO_POSE),
+        ({'is_localised': False, 'landmark_ids': [FIRST_AUTOMATIC_ID]}, f'{NO_POSE}; {NO_IDS}'),
     ],
 )
-def test_what_is_amiss_with_the_estimate_is_told_and_nothing_else(estimate, message):
+def test_what_is_amiss_with_the_estimate_is_reported_and_nothing_else(estimate, message):
     landmark_ids = np.array(estimate.get('landmark_ids', []), dtype=np.int64)
-    told = Told(**{**estimate, 'landmark_ids': landmark_ids})
-    assert told.publish().message == message
+    publishing = Publishing(**{**estimate, 'landmark_ids': landmark_ids})
+    assert publishing.publish().message == message
 
 
 def test_what_is_dropped_in_a_pause_is_no_error():
-    told = Told()
-    told.intake.is_paused = True
-    told.intake.dropped['paused'] += 3
-    status = told.publish()
+    publishing = Publishing()
+    publishing.feed.is_paused = True
+    publishing.feed.dropped['paused'] += 3
+    status = publishing.publish()
     assert (status.level, status.message) == (DiagnosticStatus.WARN, 'paused')
 
 
-def test_what_cannot_be_published_is_told():
-    told = Told()
-    told.outputs.trouble = 'no odometry'
-    assert told.publish().message == 'no odometry'
+def test_what_cannot_be_published_is_reported():
+    publishing = Publishing()
+    publishing.estimate_publisher.problem = 'no odometry'
+    assert publishing.publish().message == 'no odometry'
 
 
-def test_an_input_is_told_by_what_came_since_the_last_time(monkeypatch):
+def test_an_input_is_judged_by_what_came_since_the_last_time(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr(node_diagnostics.time, 'monotonic', lambda: now_s[0])
     source = SimpleNamespace(
-        name='twist', topic='/twist', received=0, age_s=None, malformed=0, trouble='',
+        name='twist', topic='/twist', received=0, age_s=None, malformed=0, problem='',
         backlog=SimpleNamespace(wait_s=0.0),
     )  # fmt: skip
-    told, messages, rates = Told(source), [], []
+    publishing, messages, rates = Publishing(source), [], []
     for received, malformed, age_s in [(0, 0, None), (40, 2, 0.1), (60, 2, 0.1), (60, 2, 3.0)]:
         source.received, source.malformed, source.age_s = received, malformed, age_s
         now_s[0] += 2.0
-        status = told.publish(velocity=1)
+        status = publishing.publish(velocity=1)
         assert status.level != DiagnosticStatus.ERROR
         messages.append(status.message)
         rates.append(values_of(status)['/twist rate [Hz]'])
@@ -397,42 +398,42 @@ def test_an_input_is_told_by_what_came_since_the_last_time(monkeypatch):
     assert messages == ['running', dropped, 'running', "no message on '/twist'"]
     assert rates == ['0.0', '20.0', '10.0', '0.0']
     now_s[0] += 2.0
-    source.trouble = 'another type'
-    assert told.publish(velocity=1).message == 'another type'
+    source.problem = 'another type'
+    assert publishing.publish(velocity=1).message == 'another type'
 
 
 def test_an_input_of_which_nothing_was_ever_used_is_an_error():
     """As landmarks in a frame that /tf does not have, beside good odometry."""
     source = SimpleNamespace(
-        name='landmarks', topic='/tags', received=MANY_UNUSED, age_s=0.1, malformed=0, trouble='',
+        name='landmarks', topic='/tags', received=MANY_UNUSED, age_s=0.1, malformed=0, problem='',
         backlog=SimpleNamespace(wait_s=0.0),
     )  # fmt: skip
-    told = Told(source)
-    assert told.publish(velocity=5).message == 'running', 'they may have come during a pause'
-    told.dropped['no_transform'] += 1
-    status = told.publish(velocity=5)
+    publishing = Publishing(source)
+    assert publishing.publish(velocity=5).message == 'running', 'they may have come during a pause'
+    publishing.dropped['no_transform'] += 1
+    status = publishing.publish(velocity=5)
     assert status.level == DiagnosticStatus.ERROR
     assert status.message == (
         f"none of {MANY_UNUSED} messages on '/tags' was used; 1 message dropped (no_transform)"
     )
-    status = told.publish(velocity=5, observation=1)
+    status = publishing.publish(velocity=5, observation=1)
     assert (status.level, status.message) == (DiagnosticStatus.OK, 'running')
 
 
 def test_messages_that_are_all_dropped_are_an_error_and_some_a_warning():
-    told = Told()
-    told.publish()
-    told.dropped['not_finite'] += 3
-    assert told.publish().level == DiagnosticStatus.ERROR
-    told.dropped['not_finite'] += 1
-    status = told.publish(velocity=5)
+    publishing = Publishing()
+    publishing.publish()
+    publishing.dropped['not_finite'] += 3
+    assert publishing.publish().level == DiagnosticStatus.ERROR
+    publishing.dropped['not_finite'] += 1
+    status = publishing.publish(velocity=5)
     assert (status.level, status.message) == (
         DiagnosticStatus.WARN,
         '1 message dropped (not_finite)',
     )
-    told.dropped.update({'not_finite': 2, 'too_late': 1})
-    assert told.publish(velocity=5).message == '3 messages dropped (mostly not_finite)'
-    assert told.publish(velocity=5).level == DiagnosticStatus.OK
+    publishing.dropped.update({'not_finite': 2, 'too_late': 1})
+    assert publishing.publish(velocity=5).message == '3 messages dropped (mostly not_finite)'
+    assert publishing.publish(velocity=5).level == DiagnosticStatus.OK
 
 
 SENT = {
@@ -452,10 +453,10 @@ def test_what_is_missing_is_said_once_with_topic_and_type(ros, tmp_path):
             robots[namespace] = OneSidedRobot(ros, namespace, SENT[namespace])
         ros.spin_until(
             lambda: all(
-                robots[namespace].send() or is_told(node, namespace)
+                robots[namespace].send() or is_reported(node, namespace)
                 for namespace, node in nodes.items()
             ),
-            'all to be told',
+            'all to be reported',
         )
         start_s = time.monotonic()
         busy_s = {namespace: cpu_seconds(node) for namespace, node in nodes.items()}
@@ -470,7 +471,7 @@ def test_what_is_missing_is_said_once_with_topic_and_type(ros, tmp_path):
 WANTED = {'twist': r'geometry_msgs/msg/TwistStamped', 'landmarks': r'sensor_msgs/msg/PointCloud2'}
 
 
-def is_told(node, namespace):
+def is_reported(node, namespace):
     return all(
         re.search(
             rf"nothing publishes on '{namespace}/{topic}' \({wanted} .*is needed\)", node.output
@@ -493,7 +494,7 @@ class OneSidedRobot:
         ]
 
     def send(self):
-        header = header_message(time.time_ns(), 'base_link')
+        header = MESSAGES.header(time.time_ns(), 'base_link')
         for publisher in self.publishers:
             publisher.publish(publisher.msg_type(header=header))
         self.ros.spin_for(0.02)
@@ -505,7 +506,7 @@ def cpu_seconds(node):
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
-def test_diagnostics_tell_why_messages_were_dropped(ros, tmp_path):
+def test_diagnostics_report_why_messages_were_dropped(ros, tmp_path):
     diagnostics = Diagnostics(ros, '/unclocked')
     with (
         running('observer_node', tmp_path / 'log', '-r', '__ns:=/unclocked', use_sim_time=True),

@@ -28,8 +28,8 @@ from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
-from slam_observer_ros.nodes.intake.intake import Intake
-from slam_observer_ros.nodes.publishing.conversions import time_message
+from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -45,7 +45,7 @@ RUN = Scenario(velocity_rate=40.0, observation_rate=20.0, duration=1.5, initial_
 @pytest.fixture(scope='module')
 def clock(ros):
     publisher = ros.node.create_publisher(Clock, '/clock', 100)
-    yield lambda now_ns: publisher.publish(Clock(clock=time_message(now_ns)))
+    yield lambda now_ns: publisher.publish(Clock(clock=MESSAGES.time(now_ns)))
     ros.node.destroy_publisher(publisher)
 
 
@@ -102,7 +102,7 @@ def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
     for choice in choices:
         first = min(poses[choice], key=stamp_ns)
         output = nodes[choice].output
-        assert output.count('The clock has jumped') == 1, 'told by the clock and by the stamps'
+        assert output.count('The clock has jumped') == 1, 'seen in the clock and in the stamps'
         assert 'Dropped' not in output
         if choice == 'reset':
             assert first.pose.pose.position.x < 0.3
@@ -125,7 +125,7 @@ def test_unstamped_velocity_waits_for_the_clock_to_begin(ros, clock, tmp_path):
         node.wait_for_output(r'no_clock.*/clock has not begun')
         assert not poses
         for step in range(1, 6):
-            own_clock.publish(Clock(clock=time_message(step * SECOND // 10)))
+            own_clock.publish(Clock(clock=MESSAGES.time(step * SECOND // 10)))
             ros.spin_for(0.05)
             robot.send(VelocityEvent(0, np.zeros(6)))
             ros.spin_for(0.05)
@@ -146,8 +146,8 @@ def test_a_clock_that_steps_back_a_little_has_not_jumped(ros, tmp_path):
 
         def play_a_second(start_ns):
             for stamp in range(start_ns, start_ns + SECOND, SECOND // 20):
-                own_clock.publish(Clock(clock=time_message(stamp)))
-                own_clock.publish(Clock(clock=time_message(stamp - 1_000_000)))
+                own_clock.publish(Clock(clock=MESSAGES.time(stamp)))
+                own_clock.publish(Clock(clock=MESSAGES.time(stamp - 1_000_000)))
                 robot.send(VelocityEvent(stamp, np.zeros(6)))
                 robot.send(ObservationEvent(stamp, np.array([1]), np.ones((1, 3))))
                 ros.spin_for(0.01)
@@ -156,7 +156,7 @@ def test_a_clock_that_steps_back_a_little_has_not_jumped(ros, tmp_path):
         play_a_second(101 * SECOND)
         ros.spin_until(lambda: landmark_count(maps), 'the map')
         assert 'The clock has jumped' not in node.output
-        own_clock.publish(Clock(clock=time_message(101 * SECOND + SECOND // 2)))
+        own_clock.publish(Clock(clock=MESSAGES.time(101 * SECOND + SECOND // 2)))
         node.wait_for_output('The clock has jumped')
 
 
@@ -202,8 +202,8 @@ class AnotherClock:
         self.node.resolve_topic_name = '/{}'.format
         self.estimator = Estimator(Settings(reorder_window=0.0))
         base_frame = BaseFrame(settings, self.transforms)
-        self.intake = Intake(self.node, settings, self.estimator, base_frame)
-        self.intake.is_active = True
+        self.feed = EstimatorFeed(self.node, settings, self.estimator, base_frame)
+        self.feed.is_active = True
 
     def send(self, received_ns):
         stamp_ns = received_ns - self.behind_ns
@@ -211,12 +211,12 @@ class AnotherClock:
         for child, pose in (('turret', se3.exp(angle * TURN)), ('tag_9', np.eye(4))):
             parent = 'base_link' if child == 'turret' else 'turret'
             self.transforms.insert(parent, child, stamp_ns, pose)
-        self.intake.add('twist', Measurement('', VelocityEvent(stamp_ns, STILL)), received_ns)
+        self.feed.add('twist', Measurement('', VelocityEvent(stamp_ns, STILL)), received_ns)
         seen = se3.transform(se3.exp(-angle * TURN), np.array([[3.0, 1.0, 0.0]]))
         event = ObservationEvent(stamp_ns, np.array([4]), seen)
-        self.intake.add_observation(Measurement('turret', event), received_ns)
+        self.feed.add_observation(Measurement('turret', event), received_ns)
         tags = TagDetections(stamp_ns, 'turret', (9,), ('none',))
-        self.intake.add('landmarks', tags, received_ns + 1)
+        self.feed.add('landmarks', tags, received_ns + 1)
 
     def send_all(self):
         for step in range(40):
@@ -232,7 +232,7 @@ TURN = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 def test_what_places_a_sensor_has_the_stamps_of_the_same_clock(behind_ns):
     robot = AnotherClock(behind_ns, correct_clock_offset=True)
     last_ns = robot.send_all()
-    assert robot.intake.dropped['no_transform'] == 0
+    assert robot.feed.dropped['no_transform'] == 0
     assert robot.estimator.dropped.total() == 0
     assert robot.estimator.stamp_ns == last_ns
     seen = dict(zip(robot.estimator.landmark_ids, robot.estimator.world_points, strict=True))
@@ -243,40 +243,40 @@ def test_what_places_a_sensor_has_the_stamps_of_the_same_clock(behind_ns):
 def test_nothing_is_recommended_that_is_done_already():
     robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
     robot.send_all()
-    told = [call.args[0] for call in robot.node.get_logger().info.call_args_list]
-    assert told == [
+    logged = [call.args[0] for call in robot.node.get_logger().info.call_args_list]
+    assert logged == [
         f"stamps on '/{name}' are 100.000 s behind this machine's clock, and corrected from now on"
         for name in ('landmarks', 'twist')
     ]
     warned = [call.args[0] for call in robot.node.get_logger().warning.call_args_list]
     assert not any('correct_clock_offset' in text for text in warned)
-    assert robot.intake.clock_troubles() == []
+    assert robot.feed.clock_problems() == []
     uncorrected = AnotherClock(100 * SECOND)
     uncorrected.send_all()
-    assert len(uncorrected.intake.clock_troubles()) == 2
+    assert len(uncorrected.feed.clock_problems()) == 2
 
 
 def test_until_the_offset_of_its_clock_is_known_what_an_input_says_is_dropped_and_counted():
     robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
     robot.send_all()
     # Ten of the twist, and ten of the landmarks, to which the fiducials belong.
-    assert robot.intake.dropped == {'clock_unknown': 20}
+    assert robot.feed.dropped == {'clock_unknown': 20}
     plain = AnotherClock(0)
     plain.send_all()
-    assert not plain.intake.dropped
+    assert not plain.feed.dropped
 
 
-def test_that_a_clock_was_put_right_is_told_and_its_stamps_are_then_taken_as_they_are():
+def test_that_a_clock_was_put_right_is_reported_and_its_stamps_are_then_taken_as_they_are():
     robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
     last_ns = robot.send_all()
     robot.node.get_logger().info.reset_mock()
     robot.behind_ns = 0
     for step in range(1, 21):
         robot.send(last_ns + step * SECOND // 20)
-    told = [call.args[0] for call in robot.node.get_logger().info.call_args_list]
-    assert len(told) == 2
-    assert all(text.endswith('and not corrected any more') for text in told)
-    assert all(robot.intake.clocks[name].correction_ns == 0 for name in ('twist', 'landmarks'))
+    logged = [call.args[0] for call in robot.node.get_logger().info.call_args_list]
+    assert len(logged) == 2
+    assert all(text.endswith('and not corrected any more') for text in logged)
+    assert all(robot.feed.clocks[name].correction_ns == 0 for name in ('twist', 'landmarks'))
 
 
 def test_a_stamp_that_was_left_out_is_the_time_of_reception(ros, tmp_path):
@@ -336,7 +336,7 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
 
 
 @pytest.mark.parametrize('choice', ['reset', 'hold'])
-def test_looped_recording_without_simulated_time_begins_path_and_tf_anew(ros, tmp_path, choice):
+def test_looped_recording_without_simulated_time_begins_path_and_tf_again(ros, tmp_path, choice):
     if TFMessage is None:
         pytest.skip('tf2_msgs is not installed')
     namespace = f'/looped_{choice}'

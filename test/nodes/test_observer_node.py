@@ -26,11 +26,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_cloud2_message,
-    pose_message,
-)
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.pose_broadcaster import DISCOVERY_S
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -50,7 +46,7 @@ def shared_observer(ros, tmp_path_factory):
 
 @pytest.fixture
 def observer(ros, shared_observer):
-    """Give a node that has forgotten what the test before told it."""
+    """Give a node that has forgotten what the test before sent."""
     ros.call(Trigger, '/observer_node/reset', Trigger.Request())
     return shared_observer
 
@@ -60,7 +56,7 @@ def as_received(event):
     if isinstance(event, VelocityEvent):
         return event
     raw = serialize_message(
-        point_cloud2_message(event.stamp_ns, 'base_link', event.ids, event.points)
+        MESSAGES.point_cloud2(event.stamp_ns, 'base_link', event.ids, event.points)
     )
     return decode_point_cloud2(raw).event
 
@@ -97,7 +93,7 @@ def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
     poses, known = {}, {}
     for event in sorted(map(as_received, events), key=_order):
         assert replay.add(event)
-        poses[event.stamp_ns] = pose_message(replay.pose)
+        poses[event.stamp_ns] = MESSAGES.pose(replay.pose)
         known[event.stamp_ns] = (replay.landmark_ids, replay.world_points.astype(np.float32))
     assert len(odometry) > 5
     for message in odometry:
@@ -249,7 +245,7 @@ def test_malformed_and_impossible_messages_are_counted_and_do_no_harm(ros, obser
     malformed, dropped = _malformed(diagnostics[-1]), _dropped(diagnostics[-1])
     with Robot(ros) as robot:
         robot.run(RUN)
-        no_fields = PointCloud2(header=header_message(time.time_ns(), 'base_link'), width=1)
+        no_fields = PointCloud2(header=MESSAGES.header(time.time_ns(), 'base_link'), width=1)
         no_fields.height = 1
         robot.landmarks.publish(no_fields)
         robot.send(VelocityEvent(time.time_ns(), np.full(6, np.nan)))
@@ -409,7 +405,7 @@ def test_large_ids_are_warned_about(ros, observer):
         for step in range(5):
             stamp = start_ns + step * 100_000_000
             point = np.array([[1.0, 0.0, 0.0]])
-            cloud = point_cloud2_message(stamp, 'base_link', np.array([large_id]), point)
+            cloud = MESSAGES.point_cloud2(stamp, 'base_link', np.array([large_id]), point)
             robot.landmarks.publish(cloud)
         ros.spin_until(
             lambda: (

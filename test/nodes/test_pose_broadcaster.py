@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
+import time
 from unittest.mock import Mock
 
 import numpy as np
@@ -12,7 +12,6 @@ from robots import pose_of, stamp_ns
 
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.nodes.publishing import pose_broadcaster
 from slam_observer_ros.nodes.publishing.pose_broadcaster import (
     DISCOVERY_S,
     MAX_WAITING_NS,
@@ -39,8 +38,7 @@ class Robot:
         self.now_ns = 1_000_000_000_000
         self.step_ns = STEP_NS // rate_factor
         self.ahead_ns = round((WINDOW_S + self.settings.transform_tolerance) * 1e9)
-        clock = SimpleNamespace(monotonic=lambda: self.now_ns * 1e-9)
-        monkeypatch.setattr(pose_broadcaster, 'time', clock)
+        monkeypatch.setattr(time, 'monotonic', lambda: self.now_ns * 1e-9)
         self.broadcaster = PoseBroadcaster(self.node, self.settings, self.buffer, WINDOW_S)
 
     def wait(self, duration_s):
@@ -117,13 +115,13 @@ def test_the_base_gets_no_second_parent(robot, parent, is_static):
     robot.buffer.insert(parent, 'base_link', robot.now_ns, ODOMETRY, is_static=is_static)
     robot.run(DISCOVERY_S + 1.0)
     assert not robot.take()
-    assert f"'base_link' has the parent '{parent}' on /tf" in robot.broadcaster.trouble
+    assert f"'base_link' has the parent '{parent}' on /tf" in robot.broadcaster.problem
     assert 'set odom_frame to the frame of the odometry' in robot.logged
     robot.buffer.insert('odom', parent, robot.now_ns, ODOMETRY, is_static=True)
     robot.buffer.insert(parent, 'base_link', robot.now_ns + STEP_NS, ODOMETRY, is_static=is_static)
     robot.run(0.1)
     assert children(robot.take()) == {'odom'}
-    assert not robot.broadcaster.trouble
+    assert not robot.broadcaster.problem
 
 
 def test_a_parent_that_comes_later_ends_the_bases_own_transform(robot):
@@ -134,7 +132,7 @@ def test_a_parent_that_comes_later_ends_the_bases_own_transform(robot):
     robot.take()
     robot.run(1.0)
     assert not robot.take()
-    assert "'base_link' has the parent 'odom_combined'" in robot.broadcaster.trouble
+    assert "'base_link' has the parent 'odom_combined'" in robot.broadcaster.problem
 
 
 @pytest.mark.parametrize('rate_factor', [1, 10])
@@ -146,45 +144,46 @@ def test_odometry_that_is_late_is_waited_for(monkeypatch, rate_factor, lag_s):
     assert children(sent) == {'odom'}
     age_ns = robot.now_ns + robot.ahead_ns - stamp_ns(sent[-1])
     assert age_ns == pytest.approx(lag_s * 1e9, abs=robot.step_ns)
-    assert (f'is {lag_s} s behind the estimate' in robot.broadcaster.trouble) == (lag_s > 0.5)
+    assert (f'is {lag_s} s behind the estimate' in robot.broadcaster.problem) == (lag_s > 0.5)
 
 
 def test_odometry_that_is_stamped_far_ahead_is_reported(robot):
     robot.run(15.0, lag_s=-20.0)
     assert not robot.take()
-    assert 'odometry on /tf is stamped far ahead of the estimate' in robot.broadcaster.trouble
-    assert robot.broadcaster.trouble in robot.logged
+    text = 'odometry on /tf is stamped far ahead of the estimate'
+    assert text in robot.broadcaster.problem
+    assert text in robot.logged
 
 
-def test_odometry_that_begins_after_the_pose_is_no_trouble(robot):
+def test_odometry_that_begins_after_the_pose_is_no_problem(robot):
     robot.run(0.1)
     robot.buffer.insert('odom', 'base_link', robot.now_ns + STEP_NS // 2, ODOMETRY)
     robot.broadcaster.retry()
     assert not robot.take()
-    assert not robot.broadcaster.trouble
+    assert not robot.broadcaster.problem
 
 
 def test_odometry_that_ends_is_reported_until_it_is_back(robot):
     robot.run(1.0, lag_s=0.0)
-    assert not robot.broadcaster.trouble
+    assert not robot.broadcaster.problem
     robot.take()
     robot.run(3.0)
     assert not robot.take()
-    assert "'odom' to 'base_link' on /tf is 3.0 s behind" in robot.broadcaster.trouble
+    assert "'odom' to 'base_link' on /tf is 3.0 s behind" in robot.broadcaster.problem
     assert "'map' to 'odom' waits for it" in robot.logged
     robot.run(0.1, lag_s=0.0)
-    assert not robot.broadcaster.trouble
+    assert not robot.broadcaster.problem
     assert children(robot.take()) == {'odom'}
 
 
 def test_odometry_that_does_not_come_back_after_a_jump_of_the_clock_is_reported(robot):
     robot.run(1.0, lag_s=0.0)
     robot.buffer.clear()
-    robot.broadcaster.forget()
+    robot.broadcaster.clear()
     robot.run(0.4)
-    assert not robot.broadcaster.trouble
+    assert not robot.broadcaster.problem
     robot.run(1.0)
-    assert 's behind' in robot.broadcaster.trouble
+    assert 's behind' in robot.broadcaster.problem
 
 
 def test_while_poses_are_held_the_last_correction_holds_on(robot):
@@ -205,7 +204,7 @@ def test_after_a_reset_nothing_of_before_goes_out(robot):
     robot.run(1.0, lag_s=0.0)
     robot.run(0.4)  # poses that wait for their odometry
     robot.take()
-    robot.broadcaster.forget()
+    robot.broadcaster.clear()
     robot.buffer.insert('odom', 'base_link', robot.now_ns, ODOMETRY)
     robot.broadcaster.retry()
     robot.broadcaster.repeat(robot.now_ns)

@@ -29,8 +29,7 @@ from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
 from slam_observer_ros.recording.writer import RecordingWriter
 
-CAUGHT_UP_NS = 500_000_000
-"""What an estimate may lag behind at the end, as the last events are held back for others."""
+CAUGHT_UP_NS = 500_000_000  # lag of an estimate at the end: the last events are held back
 
 DEEP_QOS = QoSProfile(depth=10_000)
 
@@ -49,20 +48,10 @@ LATCHED = {'/map': PointCloud2, '/ground_truth/landmarks': PointCloud2}
 
 
 class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped
-    """Records all topics, and keeps those that the demo's figures need.
+    """Records all topics byte for byte, and keeps what the demo's figures need.
 
-    Parameters
-    ----------
-    writer : RecordingWriter
-        Where every message goes, byte for byte.
-    is_simulated_time : bool
-        Whether messages are recorded at the time of ``/clock``.
-
-    Attributes
-    ----------
-    lyapunov : list of float
-        Lyapunov values, one an estimate.
-
+    Messages are recorded at the time of ``/clock`` if ``is_simulated_time``. ``lyapunov`` has one
+    value an estimate.
     """
 
     def __init__(self, writer: RecordingWriter, is_simulated_time: bool) -> None:

@@ -15,29 +15,13 @@ from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.nodes.demo.demo_listener import DemoListener
 from slam_observer_ros.runs.simulated_run import fit_slope
 
-CHECKED_S = 60.0
-"""Simulated time at which the observer must have converged."""
-
-CONVERGED_LOG10 = -10.0
-"""log10 L below which it has."""
-
-FLOAT32_FLOOR = 1e-10
-"""L below which the rounding of the point clouds' float32 coordinates is felt."""
+CHECKED_S = 60.0  # simulated time at which the observer must have converged
+CONVERGED_LOG10 = -10.0  # log10 L below which it has
+FLOAT32_FLOOR = 1e-10  # L below which the rounding of the clouds' float32 coordinates is felt
 
 
 def report(listener: DemoListener, folder: Path, console: Console) -> bool:
-    """Draw the figures, print the summary and return whether the observer converged.
-
-    Parameters
-    ----------
-    listener : DemoListener
-        What was heard.
-    folder : Path
-        Where the figures go.
-    console : Console
-        Where the summary goes.
-
-    """
+    """Draw the figures, print the summary and return whether the observer converged."""
     times_s, lyapunov = listener.times_s, np.array(listener.lyapunov)
     # Both topics carry one message an estimate; only one at the very end may be missing.
     count = min(len(times_s), len(lyapunov))
@@ -88,10 +72,10 @@ def _accuracy(listener: DemoListener) -> dict[str, str]:
     """Return position errors, each after its own rigid alignment."""
     estimate, truth = listener.trajectories()
     half = len(estimate) // 2
-    settled = Trajectory(estimate.stamps_ns[half:], estimate.poses[half:])
+    second_half = Trajectory(estimate.stamps_ns[half:], estimate.poses[half:])
     return {
         'ATE, whole run': f'{trajectory_errors(estimate, truth).ate_rmse_m:.4f} m',
-        'ATE, second half': f'{trajectory_errors(settled, truth).ate_rmse_m:.1e} m',
+        'ATE, second half': f'{trajectory_errors(second_half, truth).ate_rmse_m:.1e} m',
     }
 
 

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-BEHIND_S = 0.3
-"""Messages that wait for less, as while a map is loaded, are no matter, seconds."""
-
-LASTING_S = 2.0
-"""How long messages have to wait for more than that before it is said, seconds."""
+BEHIND_S = 0.3  # messages that wait for less, as while a map is loaded, are no matter
+LASTING_S = 2.0  # how long messages have to wait for more than that before it is reported
 
 
 class Backlog:
     """Distinguishes a program that can't keep up with a topic from one busy for a moment.
 
-    Attributes
-    ----------
-    wait_s : float
-        How long the last message has waited, seconds.
-
+    ``wait_s`` is how long the last message has waited, seconds.
     """
 
     def __init__(self) -> None:
@@ -25,15 +18,9 @@ class Backlog:
         self._behind_since_s: float | None = None
 
     def add(self, wait_s: float, now_s: float) -> None:
-        """Take how long a message has waited that is read now.
+        """Take how long a message that is read now, at a steady time, has waited, seconds.
 
-        Parameters
-        ----------
-        wait_s : float
-            Seconds from its reception; less than zero if the clock was set meanwhile.
-        now_s : float
-            Steady time, seconds.
-
+        That is less than zero if the clock was set meanwhile.
         """
         is_long_ago = now_s - self._last_s > LASTING_S
         self.wait_s, self._last_s = max(wait_s, 0.0), now_s
@@ -42,8 +29,8 @@ class Backlog:
         elif self._behind_since_s is None or is_long_ago:
             self._behind_since_s = now_s
 
-    def trouble(self, topic: str, now_s: float) -> str:
-        """Say that messages have waited for long and still do; empty if not, or if none come."""
+    def problem(self, topic: str, now_s: float) -> str:
+        """Report that messages have waited for long and still do; empty if not."""
         since_s, last_s = self._behind_since_s, self._last_s
         if since_s is None or last_s - since_s < LASTING_S or now_s - last_s > LASTING_S:
             return ''

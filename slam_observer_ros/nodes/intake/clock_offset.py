@@ -12,17 +12,12 @@ SAMPLES = 11
 
 
 class ClockOffset:
-    """Offset of the stamps of one publisher.
-
-    Parameters
-    ----------
-    limit_ns : int
-        An offset beyond this, either way, comes from another clock, nanoseconds.
+    """Offset of the stamps of one publisher; beyond ``limit_ns`` they are of another clock.
 
     Attributes
     ----------
     offset_ns : int or None
-        Stamp minus time of reception, as the median of the last messages; None until known.
+        Stamp minus time of reception, median of the last messages; None until known.
     correction_ns : int
         What must be added to the stamps to have them in this machine's time; it changes only
         when the stamps so corrected leave the limit, so that their order is kept.
@@ -46,17 +41,17 @@ class ClockOffset:
         side = 'ahead of' if offset_ns > 0 else 'behind'
         return f"{to_s(abs(offset_ns)):.3f} s {side} this machine's clock"
 
-    def trouble(self, source: str, is_simulated: bool) -> str:
-        """Say how far off the stamps on the topic ``source`` are; empty if they are right.
+    def problem(self, topic: str, is_simulated: bool) -> str:
+        """Report how far off the stamps on a topic are; empty if they are right.
 
-        ``is_simulated`` says that this machine's clock is /clock.
+        ``is_simulated``: this machine's clock is /clock.
         """
         if not self.is_off:
             return ''
         advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
         if is_simulated:
             advice = 'does what publishes it use /clock, and does this machine keep up with it'
-        return f'stamps on {source} are {self}: {advice}, or set correct_clock_offset'
+        return f'stamps on {topic} are {self}: {advice}, or set correct_clock_offset'
 
     def add(self, stamp_ns: int, receive_ns: int) -> None:
         """Take the stamp and the time of reception of a message."""
@@ -68,7 +63,7 @@ class ClockOffset:
             self.correction_ns = -self.offset_ns if self.is_off else 0
 
     def clear(self) -> None:
-        """Begin anew, as after a jump of this machine's clock."""
+        """Forget all offsets, as after a jump of this machine's clock."""
         self._recent.clear()
         self.offset_ns = None
         self.correction_ns = 0

@@ -16,6 +16,7 @@ from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.poses_and_velocities import decode_transforms, pose_matrices
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
 try:
     import tf2_ros
@@ -27,21 +28,16 @@ TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCA
 
 
 class TopicTransforms:
-    """A listener of /tf and /tf_static of our own.
+    """A listener of /tf and /tf_static of our own; without tf2_msgs no transform is ever known.
 
-    Parameters
-    ----------
-    node : Node
-        Node that subscribes; without tf2_msgs no transform is ever known.
-    own : tuple of str
-        Parent and child of the transform that the node itself publishes where nobody else tells
-        the child's parent: heard back, it would take the place of another parent.
-
+    ``own`` are parent and child of the transform that the node itself publishes where nobody else
+    gives the child a parent: heard back, it would replace another parent.
     """
 
     def __init__(self, node: Node, own: tuple[str, str]) -> None:
         self._node = node
         self._own = own
+        self._log = ThrottledLog(node)
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
         self.newest_ns = self._buffer.newest_ns
@@ -56,9 +52,7 @@ class TopicTransforms:
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
-                self._node.get_logger().warning(
-                    f"malformed message on '{topic}' dropped: {error}", throttle_duration_sec=10.0
-                )
+                self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
                 return
             others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
             insert_transforms(self._buffer, others, is_static=is_static)
@@ -67,14 +61,7 @@ class TopicTransforms:
 
 
 class Tf2Transforms:
-    """tf2_ros's buffer and listener.
-
-    Parameters
-    ----------
-    node : Node
-        Node that subscribes.
-
-    """
+    """tf2_ros's buffer and listener."""
 
     def __init__(self, node: Node) -> None:
         self._buffer = tf2_ros.Buffer()
@@ -112,9 +99,6 @@ class Tf2Transforms:
 
 
 def open_transforms(node: Node, own: tuple[str, str]) -> TransformSource:
-    """Return tf2_ros's buffer where ROS provides it, else a listener of our own.
-
-    ``own`` are parent and child of what the node itself may publish.
-    """
-    # tf2 keeps the parent of each stamp, so that one does not take the place of another.
+    """Return tf2_ros's buffer where ROS provides it, else :class:`TopicTransforms`."""
+    # tf2 keeps the parent of each stamp, so that one does not replace another.
     return TopicTransforms(node, own) if tf2_ros is None else Tf2Transforms(node)

@@ -13,60 +13,38 @@ from rclpy.node import Node
 from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import is_automatic
-from slam_observer_ros.nodes.intake.intake import Intake
-from slam_observer_ros.nodes.intake.subscriptions import Input
-from slam_observer_ros.nodes.publishing.publishers import Outputs
+from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
+from slam_observer_ros.nodes.intake.input_topic import InputTopic
+from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
 
-SILENT_S = 2.0
-"""An input without messages for this long is a warning."""
-
-RECENT = 30
-"""Statuses, of about a second each, over which rejected points are looked at."""
-
-MIN_POINTS = 50
-"""Points that it takes to tell how large a share of them is rejected."""
-
-MANY_UNUSED = 20
-"""Messages of an input none of which was used: it is no transient of the start."""
+SILENT_S = 2.0  # an input without messages for this long is a warning
+RECENT = 30  # statuses, of about a second each, over which rejected points are counted
+MIN_POINTS = 50  # points that it takes to say how large a share of them is rejected
+MANY_UNUSED = 20  # messages, none of which was used, that are no transient of the start
 
 USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
 """Inputs, and what their messages are counted as when they are used."""
 
 LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id', 'reserved_id')
-"""Points not used for something that is wrong; those that a known map lacks may well be there."""
+"""Points not used for something that is wrong; those that are not in a known map may be right."""
 
 
-class Diagnostics:
-    """Publishes what comes in, what is dropped and why, on ``/diagnostics``.
-
-    Parameters
-    ----------
-    node : Node
-        Node whose health is told.
-    estimator : Estimator
-        Source of counts and drops.
-    intake : Intake
-        Source of further drops, and of the clocks' offsets.
-    inputs : sequence of Input
-        Topics to watch.
-    outputs : Outputs
-        What can't be published.
-
-    """
+class DiagnosticsPublisher:
+    """Publishes what comes in, what is dropped and why, on ``/diagnostics``."""
 
     def __init__(
         self,
         node: Node,
         estimator: Estimator,
-        intake: Intake,
-        inputs: Sequence[Input[Any]],
-        outputs: Outputs,
+        feed: EstimatorFeed,
+        inputs: Sequence[InputTopic[Any]],
+        estimate_publisher: EstimatePublisher,
     ) -> None:
         self._node = node
         self._estimator = estimator
-        self._intake = intake
+        self._feed = feed
         self._inputs = inputs
-        self._outputs = outputs
+        self._estimate_publisher = estimate_publisher
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
@@ -83,7 +61,7 @@ class Diagnostics:
         warnings = unused + self._warnings(dropped, new)
         used = new['velocity'] + new['observation']
         level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
-        none_is_used = bool(dropped) and not used and not self._intake.is_paused
+        none_is_used = bool(dropped) and not used and not self._feed.is_paused
         if none_is_used or unused:
             level = DiagnosticStatus.ERROR
         values = self._input_values() | self._estimator_values()
@@ -117,18 +95,18 @@ class Diagnostics:
     def _estimator_values(self) -> dict[str, str]:
         estimator, update = self._estimator, self._estimator.last_update
         values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
-        dropped = estimator.dropped + self._intake.dropped
+        dropped = estimator.dropped + self._feed.dropped
         values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
         values['landmarks known'] = str(len(estimator.landmark_ids))
         values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
-        values['processing time, mean [ms]'] = f'{self._intake.take_mean_processing_ms():.3f}'
+        values['processing time, mean [ms]'] = f'{self._feed.take_mean_processing_ms():.3f}'
         values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
         values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
         return values
 
     def _progress(self) -> tuple[Counter[str], Counter[str]]:
         """Return why messages were dropped since the last time, and what else was counted."""
-        dropped = self._estimator.dropped + self._intake.dropped
+        dropped = self._estimator.dropped + self._feed.dropped
         dropped['malformed'] += sum(source.malformed for source in self._inputs)
         counts = self._estimator.counts
         since_last = dropped - self._last_dropped, counts - self._last_counts
@@ -137,8 +115,8 @@ class Diagnostics:
 
     def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
-        warnings += self._intake.clock_troubles()
-        if self._intake.is_paused:
+        warnings += self._feed.clock_problems()
+        if self._feed.is_paused:
             warnings.append('paused')
         elif dropped:
             (reason, _), *others = dropped.most_common()
@@ -150,23 +128,23 @@ class Diagnostics:
         if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
             warnings.append('no velocity in force: the pose is held')
         warnings += [part.problem for part in self._estimator.calibration]
-        warnings.append(self._outputs.trouble)
+        warnings.append(self._estimate_publisher.problem)
         if not self._estimator.is_localised:
-            warnings.append('the place in the loaded map is not known yet: no pose is published')
+            warnings.append('the pose in the loaded map is not known yet: no pose is published')
             warnings.append(self._ids_warning())
         return [warning for warning in warnings if warning]
 
-    def _unused_warning(self, source: Input[Any]) -> str:
-        """Tell that an input's messages come, and that not one of them was used so far."""
+    def _unused_warning(self, source: InputTopic[Any]) -> str:
+        """Report an input whose messages come, and not one of them was used so far."""
         kind = USED_AS.get(source.name)
-        if kind is None or source.received < MANY_UNUSED or self._intake.is_paused:
+        if kind is None or source.received < MANY_UNUSED or self._feed.is_paused:
             return ''
         if self._last_counts[kind]:
             return ''
         return f"none of {source.received} messages on '{source.topic}' was used"
 
     def _ids_warning(self) -> str:
-        """Tell that the place in a map is not found by what is seen: nothing of it has an id."""
+        """Report that the pose in a map can't be found: nothing that is seen has an id."""
         # Landmarks that came without an id have one that was given here.
         ids = self._estimator.landmark_ids
         if not len(ids) or not is_automatic(ids).all():
@@ -174,7 +152,7 @@ class Diagnostics:
         return 'points have no ids: give the pose on initialpose'
 
     def _rejections_warning(self, new: Counter[str]) -> str:
-        """Tell that more points were rejected of late than a sensor has outliers."""
+        """Report that more points were rejected of late than a sensor has outliers."""
         self._recent_counts.append(new)
         recent = sum(self._recent_counts, Counter())
         share = point_share(recent, 'rejected_landmark')
@@ -184,18 +162,18 @@ class Diagnostics:
 
     @staticmethod
     def _points_warning(new: Counter[str]) -> str:
-        """Tell of points left out since the last time: most of them, or for their ids."""
+        """Report points left out since the last time: most of them, or for their ids."""
         left_out = {name: new[name] for name in LEFT_OUT if new[name]}
         of_wrong_ids = new['repeated_id'] + new['reserved_id']
         if not (of_wrong_ids or 2 * sum(left_out.values()) > new['observed_point']):
             return ''
-        told = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())
-        return f'of {new["observed_point"]} points seen {told}'
+        reasons = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())
+        return f'of {new["observed_point"]} points seen {reasons}'
 
     @staticmethod
-    def _input_warning(source: Input[Any]) -> str:
-        if source.trouble:
-            return source.trouble
+    def _input_warning(source: InputTopic[Any]) -> str:
+        if source.problem:
+            return source.problem
         if (source.age_s or 0.0) > SILENT_S:
             return f"no message on '{source.topic}'"
         return ''

@@ -9,11 +9,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.nodes.publishing.conversions import (
-    point_message,
-    quaternion_message,
-    vector_message,
-)
+from slam_observer_ros.nodes.message_classes import MESSAGES
 
 POINT_SIZE_M = 0.2
 TEXT_HEIGHT_M = 0.3
@@ -24,28 +20,15 @@ WHITE = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
 PALE_GREEN = ColorRGBA(r=0.0, g=0.62, b=0.45, a=0.3)
 ORANGE = ColorRGBA(r=0.84, g=0.37, b=0.0, a=1.0)
 
-MAX_LABELS = 200
-"""Landmarks that get a text; more could not be read, and each is a message of its own."""
-
-ELLIPSOID_SIGMAS = 3.0
-"""Half axes of the ellipsoids, in standard deviations."""
-
-MIN_SIZE_M = 1e-3
-"""RViz complains about markers without a size."""
+MAX_LABELS = 200  # more could not be read, and each is a message of its own
+ELLIPSOID_SIGMAS = 3.0  # half axes, in standard deviations
+MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
 
 
 def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
     """Return markers that replace all earlier ones.
 
-    Points, ids, the last residuals and, where covariances are known, ellipsoids.
-
-    Parameters
-    ----------
-    header : Header
-        Map frame and stamp of the state.
-    estimator : Estimator
-        Whose map is drawn.
-
+    They are points, ids, the last residuals and, where covariances are known, ellipsoids.
     """
     points = estimator.world_points
     if not len(points):
@@ -63,13 +46,13 @@ def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
 
 
 def no_markers(header: Header) -> MarkerArray:
-    """Return what takes all earlier markers away."""
+    """Return what removes all earlier markers."""
     return MarkerArray(markers=[Marker(header=header, action=Marker.DELETEALL)])
 
 
 def _points(header: Header, points: FloatArray) -> Marker:
     marker = _marker(header, 'landmarks', Marker.SPHERE_LIST, GREEN, POINT_SIZE_M)
-    marker.points = [point_message(point) for point in points]
+    marker.points = [MESSAGES.point(point) for point in points]
     return marker
 
 
@@ -86,9 +69,9 @@ def _ellipsoids(
     for number, (point, size, turn) in enumerate(zip(points, sizes_m, axes, strict=False)):
         marker = _marker(header, 'uncertainties', Marker.SPHERE, PALE_GREEN, MIN_SIZE_M)
         marker.id = number
-        marker.pose.position = point_message(point)
-        marker.pose.orientation = quaternion_message(turn)
-        marker.scale = vector_message(np.maximum(size, MIN_SIZE_M))
+        marker.pose.position = MESSAGES.point(point)
+        marker.pose.orientation = MESSAGES.quaternion(turn)
+        marker.scale = MESSAGES.vector(np.maximum(size, MIN_SIZE_M))
         markers.append(marker)
     return markers
 
@@ -101,7 +84,7 @@ def _residual_lines(header: Header, estimator: Estimator) -> Marker:
         _, seen, rows = np.intersect1d(update.ids, estimator.landmark_ids, return_indices=True)
         ends = estimator.world_points[rows]
         lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
-        marker.points = [point_message(point) for point in lines]
+        marker.points = [MESSAGES.point(point) for point in lines]
     return marker
 
 
@@ -109,7 +92,7 @@ def _label(header: Header, number: int, landmark_id: int, point: FloatArray) -> 
     marker = _marker(header, 'ids', Marker.TEXT_VIEW_FACING, WHITE, TEXT_HEIGHT_M)
     marker.id = number
     marker.text = str(landmark_id)
-    marker.pose.position = point_message(point)
+    marker.pose.position = MESSAGES.point(point)
     marker.pose.position.z += TEXT_HEIGHT_M
     return marker
 

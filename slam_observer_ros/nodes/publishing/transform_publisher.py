@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.nodes.publishing.conversions import header_message, transform_message
+from slam_observer_ros.nodes.message_classes import MESSAGES
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -18,17 +17,9 @@ __all__ = ['TFMessage', 'TransformPublisher']
 
 
 class TransformPublisher:
-    """Publishes single transforms; without tf2_msgs it says so once and does nothing.
+    """Publishes single transforms on ``/tf``, or latched on ``/tf_static``.
 
-    Parameters
-    ----------
-    node : Node
-        Node that publishes.
-    topic : str
-        ``/tf`` or ``/tf_static``.
-    qos : QoSProfile
-        Volatile for the one, latched for the other.
-
+    Without tf2_msgs it logs so once and does nothing.
     """
 
     def __init__(self, node: Node, topic: str, qos: QoSProfile) -> None:
@@ -42,9 +33,5 @@ class TransformPublisher:
         """Publish the pose (4, 4) of frame ``child`` in frame ``parent``."""
         if self._publisher is None:
             return
-        transform = TransformStamped(
-            header=header_message(stamp_ns, parent),
-            child_frame_id=child,
-            transform=transform_message(pose),
-        )
+        transform = MESSAGES.transform_stamped(stamp_ns, parent, child, pose)
         self._publisher.publish(TFMessage(transforms=[transform]))

@@ -27,21 +27,8 @@ TOPICS = ('initialpose', '~/set_pose')
 _MAX_POSITION_M = next(row.maximum for row in table(Settings) if row.name == 'initial_position')
 
 
-class InitialPose:
-    """Subscriptions whose poses move the robot.
-
-    Parameters
-    ----------
-    node : Node
-        Node that subscribes.
-    map_frame : str
-        Frame that the poses must be in.
-    estimator : Estimator
-        Whose robot is moved.
-    on_move : callable
-        Called after each move.
-
-    """
+class InitialPoseListener:
+    """Moves the robot to the poses in ``map_frame`` that come on ``TOPICS``."""
 
     def __init__(
         self, node: Node, map_frame: str, estimator: Estimator, on_move: Callable[[], None]
@@ -83,12 +70,7 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
 
     RViz's 2D Pose Estimate, for one, gives those of x, y and yaw only, and zeros else. Those
     that are so large that they only say 'unknown' are made less, lest they drown all others.
-
-    Raises
-    ------
-    MessageError
-        If the covariance is not finite, or negative in some direction.
-
+    Raises a MessageError if the covariance is not finite, or negative in some direction.
     """
     given = np.zeros((6, 6)) if covariance is None else covariance
     if np.isfinite(given).all():

@@ -1,4 +1,4 @@
-"""Maps loaded and saved by the observer node."""
+"""MapServices loaded and saved by the observer node."""
 
 from __future__ import annotations
 
@@ -19,19 +19,11 @@ from slam_observer_ros.known_map.map_file import check_writable, read_map, write
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 
-class Maps:
+class MapServices:
     """The map file of the start, ``~/load_map``, ``~/save_map`` and the autosave at the end.
 
-    Parameters
-    ----------
-    node : Node
-        Node that offers the services; its parameter ``map_path`` names their file.
-    settings : ObserverNodeSettings
-        Files and frame.
-    estimator : Estimator
-        What is saved, and what loads.
-    on_load : callable
-        Called after a map was loaded: the estimate is in another frame then.
+    The node's parameter ``map_path`` names the services' file. ``on_load`` is called after a map
+    was loaded: the estimate is in another frame then.
 
     Raises
     ------
@@ -68,14 +60,7 @@ class Maps:
         node.create_service(Trigger, '~/load_map', self._answer_load)
 
     def save_at_end(self) -> None:
-        """Save the map if that was asked for and there is one.
-
-        Raises
-        ------
-        MapError
-            If it can't be saved.
-
-        """
+        """Save the map if that was asked for and there is one; MapError if it can't be saved."""
         self._node.remove_on_set_parameters_callback(self._check_changes)
         if not self._autosave or not len(self._estimator.landmark_ids):
             return
@@ -101,7 +86,7 @@ class Maps:
         check_writable(_absolute(map_path))
 
     def _warn_of_another(self, map_path: str) -> None:
-        """Warn that the map of the end will take the place of one that is not loaded."""
+        """Warn that the map of the end will replace one that is not loaded."""
         path = _absolute(map_path)
         if self._autosave and self._is_another(path):
             self._node.get_logger().warning(
@@ -110,7 +95,7 @@ class Maps:
             )
 
     def _keep(self, path: Path) -> str:
-        """Keep a copy of a map that is not this node's own; return how to tell of it."""
+        """Keep a copy of a map that is not this node's own; return a note about it."""
         try:
             if not self._is_another(path):
                 return ''
@@ -154,7 +139,7 @@ class Maps:
         estimator = self._estimator
         estimator.release()
         if not estimator.is_localised:
-            raise MapError('the place in the loaded map is not known yet: nothing is saved')
+            raise MapError('the pose in the loaded map is not known yet: nothing is saved')
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
         kept = self._keep(path)
         write_map(path, landmark_map, estimator.settings)
@@ -175,9 +160,9 @@ class Maps:
         self._estimator.load_map(landmark_map)
         self._own_files.add(path)
         self._on_load()
-        return f'loaded {len(landmark_map.ids)} landmarks from {path}; {self._place()}'
+        return f'loaded {len(landmark_map.ids)} landmarks from {path}; {self._pose_in_map()}'
 
-    def _place(self) -> str:
+    def _pose_in_map(self) -> str:
         estimator = self._estimator
         if not estimator.is_localised:
             number = 'two' if estimator.settings.two_d_mode else 'three'
@@ -188,7 +173,7 @@ class Maps:
         if estimator.last_update is None:
             x, y, z = estimator.pose[:3, 3].tolist()
             return f'the robot starts at ({x:.2f}, {y:.2f}, {z:.2f}) m'
-        return 'the robot has found its place in it'
+        return 'the robot has found its pose in it'
 
 
 def free_name(path: Path) -> Path:

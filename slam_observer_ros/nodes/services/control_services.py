@@ -7,32 +7,21 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.nodes.intake.intake import Intake
-from slam_observer_ros.nodes.publishing.publishers import Outputs
+from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
+from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
 
 
-class Controls:
-    """``~/reset``, ``~/pause``, ``~/resume`` and ``~/forget_landmark``.
+class ControlServices:
+    """``~/reset``, ``~/pause``, ``~/resume`` and ``~/forget_landmark``."""
 
-    Parameters
-    ----------
-    node : Node
-        Node that offers them.
-    estimator : Estimator
-        What is steered.
-    intake : Intake
-        What is paused.
-    outputs : Outputs
-        What has to follow.
-
-    """
-
-    def __init__(self, node: Node, estimator: Estimator, intake: Intake, outputs: Outputs) -> None:
+    def __init__(
+        self, node: Node, estimator: Estimator, feed: EstimatorFeed, publisher: EstimatePublisher
+    ) -> None:
         self._node = node
         self._estimator = estimator
-        self._intake = intake
-        self._outputs = outputs
+        self._feed = feed
+        self._publisher = publisher
         node.create_service(Trigger, '~/reset', self._reset)
         node.create_service(Trigger, '~/pause', self._pause)
         node.create_service(Trigger, '~/resume', self._resume)
@@ -40,16 +29,16 @@ class Controls:
 
     def _reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._estimator.reset()
-        self._outputs.begin_anew()
+        self._publisher.reset()
         return self._answer(response, 'pose and what was mapped are forgotten')
 
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._estimator.release()  # what has come before the pause counts
-        self._intake.is_paused = True
+        self._feed.is_paused = True
         return self._answer(response, 'paused: the pose is held, and all that comes in is dropped')
 
     def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._intake.is_paused = False
+        self._feed.is_paused = False
         return self._answer(response, 'resumed')
 
     def _answer(self, response: Trigger.Response, text: str) -> Trigger.Response:
@@ -62,7 +51,7 @@ class Controls:
         self._estimator.release()  # else a sighting that is held back would bring it back
         was_known = self._estimator.forget(message.data)
         if was_known:
-            self._outputs.renew_landmarks()
+            self._publisher.replace_landmarks()
         self._node.get_logger().info(
             f'landmark {message.data} is {"forgotten" if was_known else "not known"}'
         )

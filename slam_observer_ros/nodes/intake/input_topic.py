@@ -1,9 +1,8 @@
-"""Subscriptions whose message type is given or found on the topic."""
+"""One input topic, whose message type is given or found on the topic."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import importlib
 import time
 from typing import Any, Generic, TypeVar
 
@@ -12,13 +11,12 @@ from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from slam_observer_ros.common.errors import MessageError, ParameterError
+from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.intake.backlog import Backlog
-
-REPORT_PERIOD_S = 10.0
-"""Shortest time between two reports about one topic."""
+from slam_observer_ros.nodes.message_classes import message_class
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.
@@ -30,47 +28,33 @@ MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
 
 
-class Input(Generic[MessageT]):
-    """One input topic of the observer.
+class InputTopic(Generic[MessageT]):
+    """Subscribes to a topic, decodes its messages and reports why none come.
 
     Parameters
     ----------
     node : Node
-        Node that subscribes.
     name : str
         Topic name before remapping.
     decoders : mapping of str to callable
         From full type names to decoders, the preferred type first. If there is only one, it is
-        subscribed to at once; of several, the one that is found on the topic.
+        subscribed to at once (a ParameterError if its package is not installed); of several, the
+        one that is found on the topic.
     on_message : callable
         Called with each decoded message and the ROS time of its reception in nanoseconds.
     qos : QoSProfile
-        Quality of service that is asked for.
 
     Attributes
     ----------
-    name : str
-        The same.
     topic : str
         Topic name after remapping.
-    received : int
-        Messages so far.
-    malformed : int
-        Messages that could not be decoded.
-    backlog : Backlog
-        How long messages wait to be read.
-    last_received_s : float or None
-        Steady time of the last message, seconds.
-    read_first : sequence of Input
+    received, malformed : int
+        Messages so far, and those that could not be decoded.
+    read_first : sequence of InputTopic
         Other inputs, of which what was received before a message of this one is read before it.
         An executor reads one message of each topic in turn, so after the node was busy a slow
-        topic would run far ahead of a fast one. Where the middleware does not tell when it has
-        received a message it does.
-
-    Raises
-    ------
-    ParameterError
-        If the package that defines the only type is not installed.
+        topic would run far ahead of a fast one. It still does where the middleware does not
+        report when it has received a message.
 
     """
 
@@ -86,7 +70,7 @@ class Input(Generic[MessageT]):
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
-        self.read_first: Sequence[Input[Any]] = ()
+        self.read_first: Sequence[InputTopic[Any]] = ()
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
         self._type_name = ''
@@ -97,7 +81,7 @@ class Input(Generic[MessageT]):
         self._fault = ''
         self.backlog = Backlog()
         self.last_received_s: float | None = None
-        self._quiet_until_s = time.monotonic() + DISCOVERY_S
+        self._log = ThrottledLog(node, DISCOVERY_S)
         if len(decoders) == 1:
             self._subscribe(next(iter(decoders)))
 
@@ -109,7 +93,7 @@ class Input(Generic[MessageT]):
         return time.monotonic() - self.last_received_s
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why no message comes, or comes late; empty while they come in time."""
         if self._fault:
             return self._fault
@@ -119,18 +103,18 @@ class Input(Generic[MessageT]):
         age_s = self.age_s or 0.0
         if age_s > DISCOVERY_S:
             return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
-        return self.backlog.trouble(self.topic, time.monotonic())
+        return self.backlog.problem(self.topic, time.monotonic())
 
-    def look(self) -> None:
-        """Look at what the topic carries; subscribe to it, or report why nothing comes."""
+    def check_publishers(self) -> None:
+        """See what the topic carries; subscribe to it, or report why nothing comes."""
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         found = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in found]
         if usable and self._type_name not in usable:
             self._subscribe(usable[0])
         self._fault = self._find_fault(publishers, usable)
-        if trouble := self.trouble:
-            self._warn(trouble)
+        if problem := self.problem:
+            self._log.warning(self.topic, problem)
 
     def close(self) -> None:
         """Stop receiving."""
@@ -148,12 +132,12 @@ class Input(Generic[MessageT]):
 
     def read_until(self, received_ns: int) -> None:
         """Read what waits, up to what DDS has received at a time, nanoseconds."""
-        source = self._subscription
+        subscription = self._subscription
         for _ in range(self._qos.depth):
-            if source is None or self._received_ns >= received_ns:
+            if subscription is None or self._received_ns >= received_ns:
                 return
-            with source.handle:
-                taken = source.handle.take_message(source.msg_type, source.raw)
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 return
             self._receive(*taken)
@@ -169,29 +153,20 @@ class Input(Generic[MessageT]):
             message = self._decoders[self._type_name](raw, receive_ns)
         except MessageError as error:
             self.malformed += 1
-            self._warn(f"malformed message on '{self.topic}' dropped: {error}")
+            self._log.warning(self.topic, f"malformed message on '{self.topic}' dropped: {error}")
             return
         self._on_message(message, receive_ns)
 
     def _reception_ns(self, received_ns: int) -> int:
-        """Return when a message was received, by the ROS clock.
-
-        That is not now: while the node is busy messages wait, as the system clock tells. A
-        simulated clock only has the present time, and some middlewares tell no time but zero.
-        """
+        """Return when a message was received, by the ROS clock."""
+        # That is not now: while the node is busy messages wait, as the system clock shows. A
+        # simulated clock only has the present time, and some middlewares give none but zero.
         clock = self._node.get_clock()
         if received_ns > 0:
             self.backlog.add(to_s(time.time_ns() - received_ns), time.monotonic())
             if not clock.ros_time_is_active:
                 return received_ns
         return int(clock.now().nanoseconds)
-
-    def _warn(self, text: str) -> None:
-        # rclpy throttles by line of code, so one topic's report would silence the other's.
-        now_s = time.monotonic()
-        if now_s >= self._quiet_until_s:
-            self._quiet_until_s = now_s + REPORT_PERIOD_S
-            self._node.get_logger().warning(text)
 
     def _find_fault(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
         """Return why no publisher can be heard; empty if all can."""
@@ -209,22 +184,3 @@ class Input(Generic[MessageT]):
                     f'service does not fit: {reason.strip()}'
                 )
         return ''
-
-
-def message_class(type_name: str) -> Any:
-    """Import the class of a message type such as ``vision_msgs/msg/Detection3DArray``.
-
-    Raises
-    ------
-    ParameterError
-        If its package is not installed.
-
-    """
-    package, _, name = type_name.split('/')
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), name)
-    except ImportError as error:
-        raise ParameterError(
-            f'{type_name} needs the package {package}: '
-            f'apt install ros-jazzy-{package.replace("_", "-")}'
-        ) from error

@@ -1,4 +1,4 @@
-"""From decoded messages to the estimator: time, frames, pauses, and what has to wait."""
+"""From decoded messages to the estimator's events: time, frames, pauses, and what has to wait."""
 
 from __future__ import annotations
 
@@ -27,12 +27,10 @@ from slam_observer_ros.inputs.event_builder import (
 )
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.point_clouds import scan_trouble
+from slam_observer_ros.messages.point_clouds import scan_problem
 from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
-
-REPORT_PERIOD_S = 10.0
-"""Shortest time between two reports of one kind of drop."""
 
 SOURCES: dict[type[Event], str] = {
     VelocityEvent: 'twist',
@@ -42,21 +40,8 @@ SOURCES: dict[type[Event], str] = {
 """Inputs by the events that come of them; each has stamps of a clock of its own."""
 
 
-class Intake:
-    """Hands what comes in to the estimator, in the base frame and in this machine's time.
-
-    While the observer is paused all that comes in is dropped.
-
-    Parameters
-    ----------
-    node : Node
-        Node that logs.
-    settings : ObserverNodeSettings
-        Frames, timeouts and clocks.
-    estimator : Estimator
-        Where events go.
-    base_frame : BaseFrame
-        Brings measurements into the base frame.
+class EstimatorFeed:
+    """Gives what comes in to the estimator, in the base frame and in this machine's time.
 
     Attributes
     ----------
@@ -65,7 +50,7 @@ class Intake:
     clocks : dict of str to ClockOffset
         How far off the stamps are, by input.
     is_active : bool
-        Whether what comes in is looked at at all.
+        Else all that comes in is ignored.
     is_paused : bool
         Whether all that comes in is dropped and counted.
 
@@ -87,7 +72,7 @@ class Intake:
             estimator.settings.velocity_timeout,
             self._drop_measured,
         )
-        self._quiet_until_s: dict[str, float] = {}
+        self._log = ThrottledLog(node)
         self._processing_s = 0.0
         self._processed = 0
         self.dropped: Counter[str] = Counter()
@@ -99,21 +84,21 @@ class Intake:
         self.is_active = False
         self.is_paused = False
 
-    def add(self, source: str, measured: Measured, receive_ns: int) -> None:
+    def add(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Take what an input measures; without a stamp it has that of its reception."""
         timed = with_receive_time(measured, receive_ns)
-        if not self._is_usable(source, timed.stamp_ns, receive_ns):
+        if not self._is_usable(name, timed.stamp_ns, receive_ns):
             return
         if timed is not measured:
-            told = f'stamps are zero on {self._topics[source]}'
-            self._warn(told, f'{told}: the time of reception is taken instead')
-        self._use(self._builder.add(timed, time.monotonic_ns()))
+            reason = f'stamps are zero on {self._topics[name]}'
+            self._log.warning(reason, f'{reason}: the time of reception is taken instead')
+        self._give(self._builder.add(timed, time.monotonic_ns()))
 
     def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
         """Take landmarks, unless they are a lidar's scan."""
-        trouble = scan_trouble(measured.event)
-        if self.is_active and trouble:
-            self._drop('scan', trouble)
+        problem = scan_problem(measured.event)
+        if self.is_active and problem:
+            self._drop('scan', problem)
         else:
             self.add('landmarks', measured, receive_ns)
 
@@ -121,25 +106,25 @@ class Intake:
         self, measured: Sequence[Measurement[ObservationEvent]], receive_ns: int
     ) -> None:
         """Take landmarks of several cameras."""
-        for one in measured:
-            self.add_observation(one, receive_ns)
+        for each in measured:
+            self.add_observation(each, receive_ns)
 
     def retry(self) -> None:
         """Try again what waits for a transform; call it often."""
-        self._use(self._builder.retry(time.monotonic_ns()))
+        self._give(self._builder.retry(time.monotonic_ns()))
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Drop what waits, and what is known of clocks, as after a jump of the clock."""
         self._builder.clear()
         for clock in self.clocks.values():
             clock.clear()
 
-    def clock_troubles(self) -> list[str]:
-        """Return which inputs have stamps of another clock that are not corrected."""
+    def clock_problems(self) -> list[str]:
+        """Report the inputs with stamps of another clock that are not corrected."""
         if self._settings.correct_clock_offset:
             return []
         return [
-            clock.trouble(self._topics[name], self._is_simulated)
+            clock.problem(self._topics[name], self._is_simulated)
             for name, clock in self.clocks.items()
             if clock.is_off
         ]
@@ -149,20 +134,20 @@ class Intake:
         return bool(self._node.get_clock().ros_time_is_active)
 
     def take_mean_processing_ms(self) -> float:
-        """Return the mean time that an event took since this was asked last, milliseconds."""
+        """Return the mean time an event took, milliseconds, since this was asked last."""
         mean_s = self._processing_s / max(self._processed, 1)
         self._processing_s, self._processed = 0.0, 0
         return mean_s * 1e3
 
-    def _use(self, events: list[Event]) -> None:
+    def _give(self, events: list[Event]) -> None:
         # All before the first is used: if that shows a jump of the clock, offsets are forgotten.
-        for event in [self._by_own_clock(event) for event in events]:
+        for event in [self._in_own_time(event) for event in events]:
             start_s = time.perf_counter()
             self._estimator.add(event)
             self._processing_s += time.perf_counter() - start_s
             self._processed += 1
 
-    def _by_own_clock(self, event: Event) -> Event:
+    def _in_own_time(self, event: Event) -> Event:
         stamp_ns = event.stamp_ns
         if self._settings.correct_clock_offset:
             # Not before: what places the sensor on /tf has, as a rule, stamps of the same clock.
@@ -174,7 +159,7 @@ class Intake:
         why = f"no transform to '{self._settings.base_frame}': " if is_unplaced else ''
         self._drop(drop_reason(error), f'{why}{error}')
 
-    def _is_usable(self, source: str, stamp_ns: int, receive_ns: int) -> bool:
+    def _is_usable(self, name: str, stamp_ns: int, receive_ns: int) -> bool:
         if not self.is_active:
             return False
         if self.is_paused:
@@ -183,31 +168,25 @@ class Intake:
         if receive_ns == 0:
             self._drop('no_clock', 'use_sim_time is set and /clock has not begun')
             return False
-        self._look_at_clock(source, stamp_ns, receive_ns)
-        if self._settings.correct_clock_offset and self.clocks[source].offset_ns is None:
-            self._drop('clock_unknown', f'the clock of {self._topics[source]} is not known yet')
+        self._check_clock(name, stamp_ns, receive_ns)
+        if self._settings.correct_clock_offset and self.clocks[name].offset_ns is None:
+            self._drop('clock_unknown', f'the clock of {self._topics[name]} is not known yet')
             return False
         return True
 
-    def _look_at_clock(self, source: str, stamp_ns: int, receive_ns: int) -> None:
-        """Compare a stamp with this machine's clock, and tell if that is another one."""
-        clock = self.clocks[source]
+    def _check_clock(self, name: str, stamp_ns: int, receive_ns: int) -> None:
+        """Compare a stamp with this machine's clock, and report if that is another one."""
+        clock, topic = self.clocks[name], self._topics[name]
         before_ns = clock.correction_ns
         clock.add(stamp_ns, receive_ns)
         if not self._settings.correct_clock_offset:
             if clock.is_off:
-                self._warn(source, clock.trouble(self._topics[source], self._is_simulated))
+                self._log.warning(name, clock.problem(topic, self._is_simulated))
         elif clock.correction_ns != before_ns:
-            fate = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
-            topic = self._topics[source]
-            self._node.get_logger().info(f'stamps on {topic} are {clock}, and {fate}')
+            outcome = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
+            self._node.get_logger().info(f'stamps on {topic} are {clock}, and {outcome}')
 
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
-        self._warn(reason, f'dropped a message ({reason}, {self.dropped[reason]} so far): {text}')
-
-    def _warn(self, subject: str, text: str) -> None:
-        now_s = time.monotonic()
-        if now_s >= self._quiet_until_s.get(subject, now_s):
-            self._quiet_until_s[subject] = now_s + REPORT_PERIOD_S
-            self._node.get_logger().warning(text)
+        count = self.dropped[reason]
+        self._log.warning(reason, f'dropped a message ({reason}, {count} so far): {text}')

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from geometry_msgs.msg import (
-    PoseStamped,
-    PoseWithCovariance,
-    PoseWithCovarianceStamped,
-    TwistWithCovariance,
-)
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 from rclpy.node import Node
@@ -20,15 +15,9 @@ from visualization_msgs.msg import MarkerArray
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import TransformSource
-from slam_observer_ros.messages.point_cloud_layout import encode_point_cloud, FLOAT32_ID_LIMIT
-from slam_observer_ros.nodes.publishing.conversions import (
-    header_message,
-    point_cloud2_message,
-    pose_covariance_field,
-    pose_message,
-    twist_message,
-    unknown_covariance_field,
-)
+from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
+from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
@@ -41,24 +30,12 @@ PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
 
 
-class Outputs:
-    """Publishers of the estimate.
+class EstimatePublisher:
+    """Publishes the estimate on ``TOPICS`` and /tf; ``transforms`` has others' odometry.
 
     Each message carries the stamp of the estimator's state, never the present time, and no stamp
-    is published twice, unless landmarks were forgotten. Nothing is published while the place in a
-    loaded map is unknown, but an empty map in place of one that is out.
-
-    Parameters
-    ----------
-    node : Node
-        Node that publishes.
-    settings : ObserverNodeSettings
-        Frames, rates and lengths.
-    estimator : Estimator
-        Where the estimate comes from.
-    transforms : TransformSource
-        Where others' odometry is.
-
+    is published twice, unless landmarks were forgotten. Nothing is published while the pose in a
+    loaded map is unknown, but an empty map instead of one that is out.
     """
 
     def __init__(
@@ -89,9 +66,9 @@ class Outputs:
             )
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why the transform is not published as it should be; empty while it is."""
-        return '' if self._broadcaster is None else self._broadcaster.trouble
+        return '' if self._broadcaster is None else self._broadcaster.problem
 
     def publish_state(self) -> None:
         """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
@@ -115,11 +92,11 @@ class Outputs:
         if stamp_ns in (None, self._slow_stamp_ns) or not self._estimator.is_localised:
             return
         self._slow_stamp_ns = stamp_ns
-        header = header_message(stamp_ns, self._settings.map_frame)
+        header = MESSAGES.header(stamp_ns, self._settings.map_frame)
         self._path_publisher.publish(Path(header=header, poses=list(self._path)))
         self._publish_landmarks(stamp_ns)
 
-    def renew_landmarks(self) -> None:
+    def replace_landmarks(self) -> None:
         """Replace map and markers, if any are out, as some of their landmarks are forgotten."""
         if self._slow_stamp_ns is None:
             return
@@ -130,33 +107,29 @@ class Outputs:
             self._publish_landmarks(stamp_ns)
             return
         no_ids = np.empty(0, dtype=np.int64)
-        self._map.publish(point_cloud2_message(stamp_ns, map_frame, no_ids, np.empty((0, 3))))
-        self._markers.publish(no_markers(header_message(stamp_ns, map_frame)))
+        self._map.publish(MESSAGES.point_cloud2(stamp_ns, map_frame, no_ids, np.empty((0, 3))))
+        self._markers.publish(no_markers(MESSAGES.header(stamp_ns, map_frame)))
 
     def repeat_transform(self) -> None:
         """Publish the odometry's correction as of now, while no new one comes."""
         if self._broadcaster is not None:
             self._broadcaster.repeat(self._node.get_clock().now().nanoseconds)
 
-    def begin_anew(self) -> None:
-        """Forget the path and what waits: the estimate is at another place, frame or time.
+    def reset(self) -> None:
+        """Forget the path and what waits: the estimate has another pose, frame or time.
 
         The map that is out, which is latched, and the markers are replaced.
         """
         self._path.clear()
         self._path_stamp_ns = None
         if self._broadcaster is not None:
-            self._broadcaster.forget()
-        self.renew_landmarks()
+            self._broadcaster.clear()
+        self.replace_landmarks()
 
     def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
-        header = header_message(stamp_ns, self._settings.map_frame)
-        covariance = pose_covariance_field(self._estimator.pose_covariance)
-        uncertain = PoseWithCovariance(pose=pose_message(pose), covariance=covariance)
-        twist = TwistWithCovariance(
-            twist=twist_message(self._estimator.body_velocity),
-            covariance=unknown_covariance_field(),
-        )
+        header = MESSAGES.header(stamp_ns, self._settings.map_frame)
+        uncertain = MESSAGES.pose_with_covariance(pose, self._estimator.pose_covariance)
+        twist = MESSAGES.twist_with_covariance(self._estimator.body_velocity, None)
         self._pose.publish(PoseWithCovarianceStamped(header=header, pose=uncertain))
         self._odometry.publish(
             Odometry(
@@ -171,7 +144,7 @@ class Outputs:
         estimator, map_frame = self._estimator, self._settings.map_frame
         velocities = estimator.landmark_velocities
         self._map.publish(
-            point_cloud2_message(
+            MESSAGES.point_cloud2(
                 stamp_ns,
                 map_frame,
                 estimator.landmark_ids,
@@ -181,7 +154,7 @@ class Outputs:
             )
         )
         if self._markers.get_subscription_count() > 0:
-            header = header_message(stamp_ns, map_frame)
+            header = MESSAGES.header(stamp_ns, map_frame)
             self._markers.publish(landmark_markers(header, estimator))
 
     def _publish_estimates(self, stamp_ns: int) -> None:
@@ -201,5 +174,4 @@ class Outputs:
         if last_ns is not None and 0 <= stamp_ns - last_ns < PATH_SPACING_NS:
             return
         self._path_stamp_ns = stamp_ns
-        header = header_message(stamp_ns, self._settings.map_frame)
-        self._path.append(PoseStamped(header=header, pose=pose_message(pose)))
+        self._path.append(MESSAGES.pose_stamped(stamp_ns, self._settings.map_frame, pose))

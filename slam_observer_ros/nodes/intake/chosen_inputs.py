@@ -1,4 +1,4 @@
-"""The observer's input topics, as the parameters ask for them."""
+"""Which topics the observer reads, and how they are decoded, as the parameters choose."""
 
 from __future__ import annotations
 
@@ -29,35 +29,36 @@ from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
 )
-from slam_observer_ros.nodes.intake.decoders import CloudDecoder, OdometryDecoder, TagDecoder
-from slam_observer_ros.nodes.intake.intake import Intake
-from slam_observer_ros.nodes.intake.subscriptions import Input
+from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
+from slam_observer_ros.nodes.intake.input_topic import InputTopic
+from slam_observer_ros.nodes.intake.warning_decoders import (
+    CloudDecoder,
+    OdometryDecoder,
+    TagDecoder,
+)
 from slam_observer_ros.settings.input_settings import AUTO, ON_TF, POSE_DIFFERENCES
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 ValueT = TypeVar('ValueT')
 
 
-def open_inputs(node: Node, settings: ObserverNodeSettings, intake: Intake) -> list[Input[Any]]:
-    """Subscribe to what the parameters name.
-
-    Raises
-    ------
-    ParameterError
-        If the package of a message type is not installed.
-
-    """
-    velocity = _velocity_input(node, settings, intake)
-    landmarks = _landmark_input(node, settings, intake)
-    imu: list[Input[Any]] = []
+def open_inputs(
+    node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
+) -> list[InputTopic[Any]]:
+    """Subscribe to what the parameters name; ParameterError if a type's package is missing."""
+    velocity = _velocity_input(node, settings, feed)
+    landmarks = _landmark_input(node, settings, feed)
+    imu: list[InputTopic[Any]] = []
     if settings.use_imu:
         qos = _qos(settings.twist_qos, settings.queue_depth)
-        imu.append(Input(node, 'imu', {IMU: decode_imu}, partial(intake.add, 'imu'), qos))
+        imu.append(InputTopic(node, 'imu', {IMU: decode_imu}, partial(feed.add, 'imu'), qos))
     velocity.read_first, landmarks.read_first = imu, [velocity, *imu]
     return [velocity, landmarks, *imu]
 
 
-def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+def _velocity_input(
+    node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
+) -> InputTopic[Any]:
     qos = _qos(settings.twist_qos, settings.queue_depth)
     if settings.velocity_source == POSE_DIFFERENCES:
         if settings.velocity_type not in (AUTO, 'Odometry'):
@@ -70,23 +71,25 @@ def _velocity_input(node: Node, settings: ObserverNodeSettings, intake: Intake) 
         decoders = _chosen(
             VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
         )
-    return Input(node, 'twist', decoders, partial(intake.add, 'twist'), qos)
+    return InputTopic(node, 'twist', decoders, partial(feed.add, 'twist'), qos)
 
 
-def _landmark_input(node: Node, settings: ObserverNodeSettings, intake: Intake) -> Input[Any]:
+def _landmark_input(
+    node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
+) -> InputTopic[Any]:
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
     if settings.landmarks_type == ON_TF:
         decoder = TagDecoder(node, settings.tag_frame_prefix)
-        return Input(node, '/tf', {TRANSFORMS: decoder}, intake.add_observations, qos)
+        return InputTopic(node, '/tf', {TRANSFORMS: decoder}, feed.add_observations, qos)
     if settings.landmarks_type == 'AprilTagDetectionArray':
         decoders: dict[str, Any] = {APRILTAGS: decode_apriltags}
-        return Input(node, 'landmarks', decoders, partial(intake.add, 'landmarks'), qos)
+        return InputTopic(node, 'landmarks', decoders, partial(feed.add, 'landmarks'), qos)
     if settings.landmarks_type == AUTO:
         # Not detections: their package, which need not be installed, would be imported unasked.
         decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
-        return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+        return InputTopic(node, 'landmarks', decoders, feed.add_observation, qos)
     decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
-    return Input(node, 'landmarks', decoders, intake.add_observation, qos)
+    return InputTopic(node, 'landmarks', decoders, feed.add_observation, qos)
 
 
 def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:

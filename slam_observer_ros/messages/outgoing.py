@@ -1,0 +1,238 @@
+"""Numpy arrays to ROS messages, each laid out once for what is published and what is recorded.
+
+Stamps are nanoseconds, positions metres, poses (4, 4), body velocities (6,) ordered (Ω, v) in
+rad/s and m/s, ids (n,), points (n, 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.events import MAX_ID, UNKNOWN_ID
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.messages.cloud_fields import (
+    COVARIANCE_NAMES,
+    FLOAT32_ID_LIMIT,
+    ID_NAME,
+    POINT_FIELD_FLOAT32,
+    POINT_FIELD_UINT32,
+    POINT_NAMES,
+    UNKNOWN_UINT32_ID,
+    VELOCITY_NAMES,
+)
+
+_LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
+_MATRIX_TO_UPPER_TRIANGLE = [0, 1, 2, 4, 5, 8]
+_PACK_STAMP = struct.Struct('<BBBBiI')
+
+
+class OutgoingMessages:
+    """Makes messages of rclpy's classes or of rosbags', which have the same fields.
+
+    Every float field gets a Python float: rclpy does not check that.
+
+    Parameters
+    ----------
+    class_of : callable
+        Returns the class of a type such as ``geometry_msgs/msg/Pose``.
+    octets : callable
+        Returns bytes as these classes want them in a field ``uint8[]``.
+
+    """
+
+    def __init__(
+        self, class_of: Callable[[str], Callable[..., Any]], octets: Callable[[bytes], Any]
+    ) -> None:
+        self._class_of = class_of
+        self._octets = octets
+
+    def time(self, stamp_ns: int) -> Any:
+        """Make a builtin_interfaces/Time."""
+        seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
+        return self._make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
+
+    def header(self, stamp_ns: int, frame_id: str) -> Any:
+        """Make a std_msgs/Header."""
+        return self._make('std_msgs/msg/Header', stamp=self.time(stamp_ns), frame_id=frame_id)
+
+    def point(self, position: FloatArray) -> Any:
+        """Make a geometry_msgs/Point of a position (3,)."""
+        x, y, z = position.tolist()
+        return self._make('geometry_msgs/msg/Point', x=x, y=y, z=z)
+
+    def vector(self, components: FloatArray) -> Any:
+        """Make a geometry_msgs/Vector3 of its components (3,)."""
+        x, y, z = components.tolist()
+        return self._make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
+
+    def quaternion(self, rotation: FloatArray) -> Any:
+        """Make a geometry_msgs/Quaternion of a rotation matrix (3, 3)."""
+        x, y, z, w = so3.to_quaternion(rotation).tolist()
+        return self._make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
+
+    def pose(self, pose: FloatArray) -> Any:
+        """Make a geometry_msgs/Pose."""
+        position, orientation = self.point(pose[:3, 3]), self.quaternion(pose[:3, :3])
+        return self._make('geometry_msgs/msg/Pose', position=position, orientation=orientation)
+
+    def pose_stamped(self, stamp_ns: int, frame_id: str, pose: FloatArray) -> Any:
+        """Make a geometry_msgs/PoseStamped."""
+        header = self.header(stamp_ns, frame_id)
+        return self._make('geometry_msgs/msg/PoseStamped', header=header, pose=self.pose(pose))
+
+    def pose_with_covariance(self, pose: FloatArray, covariance: FloatArray | None) -> Any:
+        """Make a geometry_msgs/PoseWithCovariance.
+
+        The covariance (6, 6) is of (rotation vector, position) about the fixed axes, rad² and m²;
+        None if unknown.
+        """
+        return self._make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=self.pose(pose),
+            covariance=_covariance_field(covariance),
+        )
+
+    def transform_stamped(self, stamp_ns: int, parent: str, child: str, pose: FloatArray) -> Any:
+        """Make a geometry_msgs/TransformStamped of the pose of ``child`` in ``parent``."""
+        transform = self._make(
+            'geometry_msgs/msg/Transform',
+            translation=self.vector(pose[:3, 3]),
+            rotation=self.quaternion(pose[:3, :3]),
+        )
+        return self._make(
+            'geometry_msgs/msg/TransformStamped',
+            header=self.header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=transform,
+        )
+
+    def twist(self, body_velocity: FloatArray) -> Any:
+        """Make a geometry_msgs/Twist."""
+        angular, linear = self.vector(body_velocity[:3]), self.vector(body_velocity[3:])
+        return self._make('geometry_msgs/msg/Twist', linear=linear, angular=angular)
+
+    def twist_stamped(self, stamp_ns: int, frame_id: str, body_velocity: FloatArray) -> Any:
+        """Make a geometry_msgs/TwistStamped."""
+        header, twist = self.header(stamp_ns, frame_id), self.twist(body_velocity)
+        return self._make('geometry_msgs/msg/TwistStamped', header=header, twist=twist)
+
+    def twist_with_covariance(
+        self, body_velocity: FloatArray, covariance: FloatArray | None
+    ) -> Any:
+        """Make a geometry_msgs/TwistWithCovariance; covariance (6, 6), None if unknown."""
+        return self._make(
+            'geometry_msgs/msg/TwistWithCovariance',
+            twist=self.twist(body_velocity),
+            covariance=_covariance_field(covariance),
+        )
+
+    def point_cloud2(
+        self,
+        stamp_ns: int,
+        frame_id: str,
+        ids: IntArray,
+        points: FloatArray,
+        covariances: FloatArray | None = None,
+        velocities: FloatArray | None = None,
+    ) -> Any:
+        """Make a sensor_msgs/PointCloud2: x y z float32, id uint32, and what else is given.
+
+        RViz and Foxglove display these fields. Covariances are (n, 3, 3), m², and velocities of
+        the landmarks themselves (n, 3), m/s. ``UNKNOWN_ID`` becomes 2³² - 1; any other id that
+        doesn't fit into a uint32 raises a MessageError.
+        """
+        records = _cloud_records(ids, points, covariances, velocities)
+        fields = [
+            self._make(
+                'sensor_msgs/msg/PointField',
+                name=name,
+                offset=4 * index,
+                datatype=POINT_FIELD_UINT32 if name == ID_NAME else POINT_FIELD_FLOAT32,
+                count=1,
+            )
+            for index, name in enumerate(records.dtype.names or ())
+        ]
+        return self._make(
+            'sensor_msgs/msg/PointCloud2',
+            header=self.header(stamp_ns, frame_id),
+            height=1,
+            width=len(records),
+            fields=fields,
+            is_bigendian=False,
+            point_step=records.itemsize,
+            row_step=records.nbytes,
+            data=self._octets(records.tobytes()),
+            is_dense=True,
+        )
+
+    def _make(self, type_name: str, **fields: Any) -> Any:
+        return self._class_of(type_name)(**fields)
+
+
+def encode_point_cloud(stamp_ns: int, frame_id: str, ids: IntArray, points: FloatArray) -> bytes:
+    """Serialise a sensor_msgs/PointCloud with a channel ``id`` as little-endian CDR.
+
+    An rclpy publisher sends such bytes as they are, without an object per point. Raises a
+    MessageError if an id isn't exact in float32.
+    """
+    if np.any((ids < UNKNOWN_ID) | (ids >= FLOAT32_ID_LIMIT)):
+        raise MessageError(f'landmark ids in a PointCloud must lie between -1 and {2**24 - 1}')
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
+    count = struct.pack('<I', len(points))
+    return b''.join(
+        (
+            _PACK_STAMP.pack(0, 1, 0, 0, seconds, nanoseconds),
+            _encode_string(frame_id),
+            count,
+            points.astype('<f4').tobytes(),
+            struct.pack('<I', 1),
+            _encode_string(ID_NAME),
+            count,
+            ids.astype('<f4').tobytes(),
+        )
+    )
+
+
+def _covariance_field(covariance: FloatArray | None) -> FloatArray:
+    """Return 36 numbers, position first; −1 first, as in Imu, if it is unknown."""
+    if covariance is None:
+        return np.array([-1.0] + [0.0] * 35)
+    field: FloatArray = covariance[_LINEAR_FIRST][:, _LINEAR_FIRST].ravel()
+    return field
+
+
+def _cloud_records(
+    ids: IntArray,
+    points: FloatArray,
+    covariances: FloatArray | None,
+    velocities: FloatArray | None,
+) -> NDArray[np.void]:
+    """Return one record a point, little endian, every field of four bytes."""
+    if np.any((ids < UNKNOWN_ID) | (ids > MAX_ID)):
+        raise MessageError('landmark ids must lie between 0 and 2³² - 2, or be -1 for unknown')
+    columns: dict[str, FloatArray | IntArray] = dict(zip(POINT_NAMES, points.T, strict=True))
+    columns[ID_NAME] = ids & UNKNOWN_UINT32_ID
+    if covariances is not None:
+        upper_triangles = covariances.reshape(-1, 9)[:, _MATRIX_TO_UPPER_TRIANGLE]
+        columns |= zip(COVARIANCE_NAMES, upper_triangles.T, strict=True)
+    if velocities is not None:
+        columns |= zip(VELOCITY_NAMES, velocities.T, strict=True)
+    dtype = [(name, '<u4' if name == ID_NAME else '<f4') for name in columns]
+    records: NDArray[np.void] = np.empty(len(points), dtype=dtype)
+    for name, column in columns.items():
+        records[name] = column
+    return records
+
+
+def _encode_string(text: str) -> bytes:
+    """Serialise a string, with padding so that a 4-byte value may follow."""
+    characters = text.encode() + b'\0'
+    return struct.pack('<I', len(characters)) + characters + bytes(-len(characters) % 4)

@@ -1,0 +1,28 @@
+"""The classes of ROS messages, imported when a message of theirs is needed."""
+
+from __future__ import annotations
+
+from array import array
+from functools import cache
+import importlib
+from typing import Any
+
+from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.messages.outgoing import OutgoingMessages
+
+
+@cache
+def message_class(type_name: str) -> Any:
+    """Import a type such as ``sensor_msgs/msg/Imu``; ParameterError without its package."""
+    package, _, name = type_name.split('/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except ImportError as error:
+        raise ParameterError(
+            f'{type_name} needs the package {package}: '
+            f'apt install ros-jazzy-{package.replace("_", "-")}'
+        ) from error
+
+
+MESSAGES = OutgoingMessages(message_class, lambda data: array('B', data))
+"""Makes what the nodes publish."""
