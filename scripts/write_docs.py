@@ -127,7 +127,7 @@ def main() -> int:
     """Write the tables, or check them; return the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     choice = parser.add_mutually_exclusive_group()
-    choice.add_argument('--check', action='store_true', help='only tell which pages are stale')
+    choice.add_argument('--check', action='store_true', help='only say which pages are stale')
     choice.add_argument('--json', action='store_true', help='only print what the nodes publish')
     options = parser.parse_args()
     observer = interface_of(ObserverNode, *SUBSCRIBE_AT_ONCE)

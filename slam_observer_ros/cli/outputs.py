@@ -18,6 +18,14 @@ def add_force_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--force', action='store_true', help='replace files that exist already')
 
 
+def add_result_options(parser: argparse._ActionsContainer, figures: Iterable[str]) -> None:
+    """Add ``--plot`` and ``--json``."""
+    parser.add_argument(
+        '--plot', type=_figures_path, metavar='DIR', help=f'draw {", ".join(figures)}'
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+
+
 def recording_path(text: str) -> Path:
     """Take the name of a recording to be made, as an argparse type."""
     path = Path(text)
@@ -26,7 +34,7 @@ def recording_path(text: str) -> Path:
     return path
 
 
-def figures_path(text: str) -> Path:
+def _figures_path(text: str) -> Path:
     """Take the name of a directory for figures, as an argparse type."""
     if not text:
         raise argparse.ArgumentTypeError('a directory is needed: . for this one')

@@ -67,7 +67,7 @@ class Contents:
         """Return the frame that the poses of an odometry are told in."""
         return self._frame(odometry, lambda raw: [decode_pose(raw)]).lstrip('/')
 
-    def transform_places(self, frame: str, selected: SelectedTopics) -> bool:
+    def has_transform_of(self, frame: str, selected: SelectedTopics) -> bool:
         """Return whether /tf_static or /tf has a frame."""
         transforms = selected.transforms
         return any(

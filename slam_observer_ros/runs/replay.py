@@ -88,7 +88,7 @@ class Replay:
     angular_velocities: int
 
     @property
-    def restarts(self) -> int:
+    def resets(self) -> int:
         """How often all started again after a jump of the clock."""
         resets = self.estimator.settings.on_time_jump == 'reset'
         return self.estimator.jumps if resets else 0

@@ -1,4 +1,4 @@
-"""``slam-observer replay`` and ``convert``: recordings of every kind, and what they tell."""
+"""``slam-observer replay`` and ``convert``: recordings of every kind, and what they hold."""
 
 from __future__ import annotations
 
@@ -153,8 +153,8 @@ class TestReport:
     ):
         half = recordings.true_poses()[:50]
         path = write_events(tmp_path / 'half.mcap', recordings.events(), half)
-        told = slam_observer('replay', path).output
-        assert re.search(r'truth +│ covers (49|50)\.\d % of the trajectory', told)
+        output = slam_observer('replay', path).output
+        assert re.search(r'truth +│ covers (49|50)\.\d % of the trajectory', output)
 
     def test_truth_at_another_time_is_no_truth(self, slam_observer, tmp_path):
         early = [
@@ -209,7 +209,7 @@ class TestReport:
         bias, delay = calibration['angular_bias_z'], calibration['velocity_delay']
         assert abs(bias['value']) < 3.0 * bias['deviation'] < 0.3
         assert bias['unit'] == 'rad/s'
-        assert delay['deviation'] == pytest.approx(0.1)  # a circle at constant speed does not tell
+        assert delay['deviation'] == pytest.approx(0.1)  # a circle at constant speed does not show
         output = slam_observer.succeed('replay', simulated, *options).output
         assert 'velocity_delay' in output
         assert '±' in output
@@ -276,7 +276,7 @@ class TestPoints:
         output = slam_observer('replay', path, *options).output
         row = r'slips +│ \d+ × the robot was not where odometry had it'
         if not has_ids:
-            row = r'strange places +│ \d+ × nothing seen was where the map has it'
+            row = r'unexpected places +│ \d+ × nothing seen was where the map has it'
         assert re.search(row, output)
 
     def test_gains_that_use_no_point_without_id_say_so(self, slam_observer, tmp_path):
@@ -317,9 +317,9 @@ def test_landmarks_without_ids_are_named(slam_observer, tmp_path, message, note)
         writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
         writer.write('/landmarks', message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
     cells = [line.split('│') for line in slam_observer.succeed('replay', path).output.split('\n')]
-    told = ' '.join(' '.join(cell[2] for cell in cells if len(cell) > 2).split())
-    assert note in told.partition('events')[0] + ' '
-    assert ('without ids' in told) == ('without ids' in note)
+    cells_text = ' '.join(' '.join(cell[2] for cell in cells if len(cell) > 2).split())
+    assert note in cells_text.partition('events')[0] + ' '
+    assert ('without ids' in cells_text) == ('without ids' in note)
 
 
 def test_in_the_plane_the_height_of_landmarks_is_no_error(slam_observer, tmp_path):
@@ -347,7 +347,7 @@ class TestOutputs:
             'map.png', 'errors.png', 'residuals.png'
         }  # fmt: skip
 
-    def test_map_tells_what_the_gains_know_of_its_accuracy(
+    def test_map_states_what_the_gains_know_of_its_accuracy(
         self, slam_observer, simulated, tmp_path
     ):
         for gains in ('constant', 'riccati'):
@@ -641,7 +641,7 @@ class TestTroubledRecordings:
     def test_malformed_and_impossible_messages_are_dropped_by_reason(
         self, slam_observer, tmp_path
     ):
-        path = tmp_path / 'troubled.mcap'
+        path = tmp_path / 'problems.mcap'
         good = ros.serialise(ros.twist_stamped([0.1] * 6))
         with RecordingWriter(path) as writer:
             for data in (good, good[:20], ros.serialise(ros.twist_stamped([np.nan] * 6))):

@@ -210,20 +210,20 @@ def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observ
 def test_tags_that_tf_has_by_another_name_are_told(tmp_path, monkeypatch, slam_observer):
     monkeypatch.setitem(MESSAGES, '/tf', MESSAGES['/tags/tf'])
     path = record(tmp_path / 'run', '/detections', '/tf')
-    told = slam_observer('replay', path).errors
-    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in told
-    assert 'dock0' in told
-    assert 'sensor_pose' not in told
+    errors = slam_observer('replay', path).errors
+    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in errors
+    assert 'dock0' in errors
+    assert 'sensor_pose' not in errors
     renamed = slam_observer('replay', path, '--tag-frame-prefix', 'dock', '--json')
     assert renamed.json['dropped'] == {}
 
 
 def test_fiducials_on_tf_by_another_name_are_told(recordings, slam_observer):
     options = ('--landmarks-topic', '/tags/tf')
-    told = slam_observer('replay', recordings['all'], *options).errors
-    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in told
-    assert 'dock0' in told
-    assert 'set tag_frame_prefix' in told
+    errors = slam_observer('replay', recordings['all'], *options).errors
+    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in errors
+    assert 'dock0' in errors
+    assert 'set tag_frame_prefix' in errors
 
 
 @pytest.mark.parametrize(

@@ -241,7 +241,7 @@ def test_of_very_many_landmarks_some_are_normalised_together() -> None:
 
 
 @pytest.mark.parametrize(('inflation', 'inside'), [(1.0, True), (0.7, False), (1.4, False)])
-def test_the_band_tells_honest_covariances_from_others(inflation: float, inside: bool) -> None:
+def test_the_band_separates_honest_covariances_from_others(inflation: float, inside: bool) -> None:
     rng = np.random.default_rng(5)
     covariance = random_covariance(rng, 6)
     errors = rng.multivariate_normal(np.zeros(6), covariance, size=200)
@@ -299,7 +299,7 @@ def test_the_anees_is_honest_or_not_told_where_the_truth_begins_late() -> None:
     """What counts is not how late, but how uncertain the pose is by then."""
     rng = np.random.default_rng(0)
     steps = np.diag([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
-    told = []
+    values = []
     for _ in range(100):
         random = rng.normal(size=(len(STAMPS_NS), 6)) @ steps
         random[:5] = 0.0  # it stands still
@@ -311,12 +311,12 @@ def test_the_anees_is_honest_or_not_told_where_the_truth_begins_late() -> None:
         estimate = Trajectory(STAMPS_NS, moved)
         for start in (0, 4):
             late = Trajectory(STAMPS_NS[start:], rest[start:])
-            told.append(consistency.anchored_average_nees(estimate, covariances, late))
+            values.append(consistency.anchored_average_nees(estimate, covariances, late))
         for start in (7, 30):
             late = Trajectory(STAMPS_NS[start:], truth.poses[start:])
             with pytest.raises(EvaluationError, match=r'begins .* s after the estimate'):
                 consistency.anchored_average_nees(estimate, covariances, late)
-    assert 0.7 < np.mean(told) < 1.3
+    assert 0.7 < np.mean(values) < 1.3
 
 
 @pytest.mark.parametrize('count', [0, 1, 2])

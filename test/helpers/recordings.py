@@ -92,7 +92,7 @@ def write_rosbag2(
 
 
 def write_rosbag1(path: Path) -> Path:
-    """Write the run as a ROS 1 .bag, which begins with a message of a type that ROS 2 lacks."""
+    """Write the run as a ROS 1 .bag, which begins with a message of a type that ROS 2 has not."""
     typestore = get_typestore(Stores.ROS1_NOETIC)
     with rosbag1.Writer(path) as bag:
         log_type = 'rosgraph_msgs/msg/Log'

@@ -599,19 +599,19 @@ def test_last_position_of_a_true_landmark_counts(tmp_path):
     assert landmarks.world_points[:, 0].tolist() == [1.0, 2.0]
 
 
-def landmark_messages(*told):
+def landmark_messages(*stated):
     """Messages of (second, ids, x of all of them)."""
     return [
         Measurement(
             'world',
             ObservationEvent(s * 1_000_000_000, np.array(ids), np.full((len(ids), 3), float(x))),
         )
-        for s, ids, x in told
+        for s, ids, x in stated
     ]
 
 
 @pytest.mark.parametrize(
-    ('told', 'expected'),
+    ('stated', 'expected'),
     [
         ([(0, [7], 0), (1, [7], 0), (2, [7, 8], 1), (3, [7, 8], 2)],
          {0.0: (0, 1), 1.5: (0.5, 1), 2.5: (1.5, 1.5), 3.0: (2, 2), 9.0: (2, 2)}),
@@ -622,18 +622,18 @@ def landmark_messages(*told):
         ([(0, [7], 0), (0, [7], 3)], {-1.0: (3,), 0.0: (3,), 1.0: (3,)}),
         ([(0, [-1], 0), (5, [7], 3)], {0.0: (3,)}),
     ],
-    ids=['moves', 'at rest, then put', 'one each message', 'unsorted', 'told anew', 'unknown'],
+    ids=['moves', 'at rest, then put', 'one each message', 'unsorted', 'stated again', 'unknown'],
 )  # fmt: skip
-def test_true_landmarks_are_where_they_are_at_the_time(told, expected):
-    tracks = LandmarkTracks.from_messages(landmark_messages(*told))
+def test_true_landmarks_are_where_they_are_at_the_time(stated, expected):
+    tracks = LandmarkTracks.from_messages(landmark_messages(*stated))
     for time_s, x in expected.items():
         landmarks = tracks.at(int(time_s * 1e9))
         assert_allclose(landmarks.world_points[:, 0], x)
 
 
 def test_nothing_told_of_true_landmarks_is_no_truth():
-    for told in ((), ((0, [-1], 0),)):
-        assert LandmarkTracks.from_messages(landmark_messages(*told)) is None
+    for stated in ((), ((0, [-1], 0),)):
+        assert LandmarkTracks.from_messages(landmark_messages(*stated)) is None
 
 
 def test_bag_of_several_files_is_read_whole(tmp_path):

@@ -33,19 +33,9 @@ def label_points(
 ) -> None:
     """Write each name beside its point, if there it hits no marker and no name written before.
 
-    Of all sides that is tried first which leads away from what else is drawn near it.
-
-    Parameters
-    ----------
-    axes : Axes
-        Of a figure whose layout is done.
-    names : sequence of str
-        n names, the most important ones first.
-    points : FloatArray
-        (n, 2) what they name.
-    markers : FloatArray
-        (m, 2) what is not to be hit, the points among it.
-
+    Of all sides that is tried first which leads away from what else is drawn near it. The layout
+    of the figure must be done. The names are those of ``points`` (n, 2), the most important ones
+    first; ``markers`` (m, 2) must not be hit, and have the points among them.
     """
     px = axes.figure.dpi / 72.0
     obstacles = axes.transData.transform(markers)

@@ -112,7 +112,7 @@ def _read(file: Path) -> dict[str, FloatArray]:
         raise DataSetError(f'{file}: not a MATLAB file, or damaged: {error}') from error
     missing = [name for name in _SHAPES if name not in variables]
     if missing:
-        raise DataSetError(f'{file}: not Starry Night: it lacks {" ".join(missing)}')
+        raise DataSetError(f'{file}: not Starry Night: it has no {" ".join(missing)}')
     frames = variables['t'].size
     for name, shape in _SHAPES.items():
         expected = tuple(frames if size == -1 else size for size in shape)
