@@ -75,14 +75,7 @@ def make_parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Default: those that the program was started with.
-
-    """
+    """Run the command line; return the exit code."""
     if sys.stdout is None:  # a shell has closed it
         sys.stdout = Path(os.devnull).open('w', encoding='utf-8')  # noqa: SIM115 (till the end)
     if isinstance(sys.stdout, io.TextIOWrapper):

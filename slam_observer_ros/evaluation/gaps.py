@@ -11,21 +11,8 @@ from slam_observer_ros.geometry import se3
 def fill_gaps(estimate: Trajectory, motion: Trajectory) -> Trajectory:
     """Add the poses between those of an estimate, as a motion that drifts passed through them.
 
-    From each estimated pose on the motion's shape is kept; what it misses the next estimated
-    pose by is made up for in proportion to the time.
-
-    Parameters
-    ----------
-    estimate : Trajectory
-        k poses.
-    motion : Trajectory
-        Poses in another world, as of dead reckoning; used where it covers the estimate.
-
-    Returns
-    -------
-    Trajectory
-        The k poses, and those of the motion between them.
-
+    The motion, such as dead reckoning, may be in another world. From each estimated pose on its
+    shape is kept; what it misses the next one by is made up for in proportion to the time.
     """
     reckoned, covered = interpolate(motion, estimate.stamps_ns, max_gap_ns=np.iinfo(np.int64).max)
     if covered.sum() < 2:

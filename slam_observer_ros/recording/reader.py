@@ -45,36 +45,21 @@ _Decoded = TypeVar('_Decoded')
 class Recording:
     """An open MCAP file, rosbag2 (directory or bare .db3) or ROS 1 .bag: use it in ``with``.
 
-    A truncated MCAP file is read up to the damage; :attr:`warning` says so.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file or directory.
+    A truncated MCAP file is read up to the damage. Raises a RecordingError that says in one line
+    what to do if there is nothing to read, also later if the file turns out to be damaged.
 
     Attributes
     ----------
-    path : Path
-        The same.
-    topics : tuple of Topic
-        All topics, with types and message counts.
     warning : str or None
         Why only a part of the recording can be read; None if it is whole.
-    malformed : Counter
-        Messages that could not be decoded so far, by topic; the first of each is logged.
+    malformed, unstamped : Counter
+        Messages that could not be decoded, and measurements without stamp, so far, by topic.
     dropped : Counter
-        Measurements that did not become events so far, by reason; the first is logged.
-    unstamped : Counter
-        Measurements without stamp so far, by topic.
+        Measurements that did not become events so far, by reason.
     arrivals : dict of str to Arrivals
         When the measurements so far were received, by topic.
     contents : Contents
-        What its messages tell before they are used.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing to read; one line that says what to do.
+        What is known of its messages before they are used.
 
     """
 
@@ -126,18 +111,7 @@ class Recording:
     ) -> SelectedTopics:
         """Pick the topics of velocities, landmarks and truth, and that of an Imu if it is used.
 
-        Parameters
-        ----------
-        names : TopicNames
-            What the user chose; the rest is found by message type and name.
-        inputs : InputSettings
-            What of the messages is to be used.
-
-        Raises
-        ------
-        RecordingError
-            If no topic fits, or two do; it lists them, and names the option that decides.
-
+        What the user doesn't name is found by message type and name; see :func:`select_topics`.
         """
         contents = self.contents
         return select_topics(self.topics, names, inputs, contents.has_ids, contents.pose_frame)
@@ -158,22 +132,7 @@ class Recording:
         comes when that has been received, or is dropped after the timeout. Stamps are those of
         the messages' headers; an unstamped Twist has its receive time, and so has what leaves its
         stamp zero, which is counted in :attr:`unstamped`. Malformed messages are left out and
-        counted in :attr:`malformed`, what was dropped in :attr:`dropped`.
-
-        Parameters
-        ----------
-        selected : SelectedTopics
-            From :meth:`find_topics`.
-        inputs : InputSettings
-            What of the messages is used, and in which frames it is.
-        velocity_timeout_s : float
-            How long a velocity holds, seconds.
-
-        Raises
-        ------
-        RecordingError
-            If the file turns out to be damaged.
-
+        counted in :attr:`malformed`, what was dropped in :attr:`dropped`; the first is logged.
         """
         transforms = self._static_transforms(selected)
         builder = EventBuilder(
@@ -197,21 +156,9 @@ class Recording:
         yield from builder.finish()
 
     def truth(self, selected: SelectedTopics, base_frame: str = '') -> Truth:
-        """Read the true poses and landmarks.
+        """Read the true landmarks, and the true poses of the base frame.
 
-        Parameters
-        ----------
-        selected : SelectedTopics
-            From :meth:`find_topics`.
-        base_frame : str
-            Whose poses these shall be. Those of another frame are moved to it by /tf_static, or
-            left as they are, with a warning.
-
-        Raises
-        ------
-        RecordingError
-            If the file turns out to be damaged.
-
+        Poses of another frame are moved to it by /tf_static, or left as they are, with a warning.
         """
         poses = list(self._all_decoded(selected.pose_truth, decode_pose))
         base_in: dict[str, FloatArray] = {}

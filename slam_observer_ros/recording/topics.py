@@ -33,14 +33,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class TopicNames:
-    """Names that the user gives; None where the topic is to be found.
-
-    Attributes
-    ----------
-    velocity, landmarks, pose_truth, landmark_truth, imu : str or None
-        Topic names, with or without leading slash.
-
-    """
+    """Names that the user gives, with or without leading slash; None where it is to be found."""
 
     velocity: str | None = None
     landmarks: str | None = None
@@ -51,19 +44,9 @@ class TopicNames:
 
 @dataclass(frozen=True, slots=True)
 class SelectedTopics:
-    """The topics of a replay.
+    """The topics of a replay; None are the truth where not recorded, and the imu if not used.
 
-    Attributes
-    ----------
-    velocity, landmarks : Topic
-        What the estimator takes in.
-    pose_truth, landmark_truth : Topic or None
-        What its estimate is compared with, where the recording has it.
-    transforms : TransformTopics
-        What places the sensors.
-    imu : Topic or None
-        Where the angular velocity comes from; None if it comes with the velocity.
-
+    Transforms place the sensors. An imu gives the angular velocity instead of ``velocity``.
     """
 
     velocity: Topic
@@ -104,31 +87,23 @@ def select_topics(
     topics: Sequence[Topic],
     names: TopicNames,
     inputs: InputSettings,
-    identifies: Callable[[Topic], bool],
+    has_ids: Callable[[Topic], bool],
     pose_frame: Callable[[Topic], str],
 ) -> SelectedTopics:
     """Pick one topic for each purpose.
 
+    Raises a RecordingError if none fits or two do, which lists them and the option that decides.
+
     Parameters
     ----------
-    topics : sequence of Topic
-        All topics of a recording.
-    names : TopicNames
-        What the user chose; any topic of a fitting type is allowed.
-    inputs : InputSettings
-        What of the velocities is used, whether an Imu is, and of which type landmarks are.
-    identifies : callable
-        Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
-        them, such as a lidar's, are taken only if they are chosen by name or by their type, or
-        are called ``landmarks``.
+    topics, names, inputs
+        All topics of a recording, those that the user chose, and what of them is used.
+    has_ids : callable
+        Whether the points of a cloud have ids. Clouds without them, such as a lidar's, are taken
+        only if they are chosen by name or by their type, or are called ``landmarks``.
     pose_frame : callable
-        Tells the frame of an odometry's poses. Where it is that of the map, the velocity is an
-        estimate, as an observer's own, and taken only if there is no other.
-
-    Raises
-    ------
-    RecordingError
-        If no topic fits, or two do; it lists them, and names the option that decides.
+        The frame of an odometry's poses. Where it is that of the map, the velocity is an estimate,
+        as an observer's own, and taken only if there is no other.
 
     """
     used = [topic for topic in topics if topic.count > 0]
@@ -138,7 +113,7 @@ def select_topics(
             return topic.message_type in role.all_types
         if topic.message_type not in role.message_types:
             return False
-        return topic.message_type not in CLOUD_DECODERS or identifies(topic)
+        return topic.message_type not in CLOUD_DECODERS or has_ids(topic)
 
     def is_estimate(topic: Topic) -> bool:
         return topic.message_type == ODOMETRY and pose_frame(topic) == inputs.map_frame

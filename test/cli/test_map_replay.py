@@ -90,7 +90,7 @@ def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path
     assert (len(after.ids) > len(known.ids)) == (mode == 'off')
 
 
-def test_a_mode_of_localising_without_a_map_is_told_to_have_no_effect(slam_observer, tmp_path):
+def test_a_mode_of_localising_without_a_map_is_said_to_have_no_effect(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     ended = slam_observer('replay', path, '--set', 'localization_mode=fixed', *SETTINGS)
     assert ended.code == 0
@@ -117,7 +117,7 @@ def test_a_map_keeps_the_name_of_its_frame(slam_observer, tmp_path):
     assert [read_map(file).frame_id for file in (first, again)] == ['hall', 'hall']
 
 
-def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
+def test_no_anees_is_reported_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
     slam_observer, tmp_path
 ):
     path, saved = record(tmp_path / 'run.mcap', np.eye(4), seed=1), tmp_path / 'map.yaml'
@@ -132,7 +132,7 @@ def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
 
 
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_no_anees_of_the_configuration_is_told_in_a_map_that_is_exact(
+def test_no_anees_of_the_configuration_is_reported_in_a_map_that_is_exact(
     slam_observer, tmp_path, gains
 ):
     path, saved = tmp_path / 'run.mcap', tmp_path / 'map.yaml'
@@ -229,7 +229,7 @@ class TestPoseInMapNotKnown:
         assert 'points without id' in ended.errors
         assert not again.exists()
 
-    def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
+    def test_a_pose_found_late_is_reported_with_its_time(self, slam_observer, tmp_path, saved):
         late = record(tmp_path / 'late.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s < 40))
         poses = tmp_path / 'poses.tum'
         arguments = ('replay', late, '--load-map', saved, '--force', '--tum', poses, *SETTINGS)
@@ -240,7 +240,7 @@ class TestPoseInMapNotKnown:
             f'found after {report["localised_after_s"]:.1f} s' in slam_observer(*arguments).output
         )
 
-    def test_more_rejections_than_a_sensor_has_outliers_are_told(
+    def test_more_rejections_than_a_sensor_has_outliers_are_reported(
         self, slam_observer, tmp_path, saved
     ):
         growing = record(
@@ -249,7 +249,7 @@ class TestPoseInMapNotKnown:
         ended = slam_observer('replay', growing, *SETTINGS)
         assert re.search('[0-9]+ % of the points were rejected: look at the signs', ended.errors)
 
-    def test_a_scale_that_nobody_can_mean_is_told(self, slam_observer, tmp_path, saved):
+    def test_a_scale_that_nobody_can_mean_is_reported(self, slam_observer, tmp_path, saved):
         twice = record(tmp_path / 'run.mcap', np.eye(4), seed=2, speed_factor=2.0)
         stated = '--set', 'linear_scale_error=[0.05,0.0,0.0]'
         ended = slam_observer('replay', twice, *SETTINGS, *stated)
@@ -339,7 +339,7 @@ def test_a_silence_of_the_sensors_is_no_jump_of_the_clock(slam_observer, tmp_pat
 
 
 @pytest.mark.parametrize('resets', [True, False])
-def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_told(
+def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_reported(
     slam_observer, tmp_path, resets
 ):
     path = record(

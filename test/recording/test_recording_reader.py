@@ -520,7 +520,7 @@ class TestTopics:
         assert self.find(tmp_path, messages)['landmarks'] == '/beacons'
 
     @pytest.mark.parametrize('command', [TWIST, None])
-    def test_an_odometry_that_is_told_in_the_map_is_taken_only_where_nothing_else_is(
+    def test_an_odometry_that_is_stated_in_the_map_is_taken_only_where_nothing_else_is(
         self, tmp_path, command
     ):
         estimate = ros.odometry([1.0] * 6, np.eye(6), frames=('map', 'base_link'))
@@ -631,7 +631,7 @@ def test_true_landmarks_are_where_they_are_at_the_time(stated, expected):
         assert_allclose(landmarks.world_points[:, 0], x)
 
 
-def test_nothing_told_of_true_landmarks_is_no_truth():
+def test_nothing_known_of_true_landmarks_is_no_truth():
     for stated in ((), ((0, [-1], 0),)):
         assert LandmarkTracks.from_messages(landmark_messages(*stated)) is None
 

@@ -35,19 +35,8 @@ def load_mrclam(folder: Path | str, robot: int) -> DataSet:
 
     Velocities are the commands that the robot was given: forward speed and yaw rate. Landmark ids
     are subject numbers; sightings of other robots and misread barcodes are left out and counted.
-
-    Parameters
-    ----------
-    folder : Path or str
-        For example ``MRCLAM_Dataset6``.
-    robot : int
-        1 to 5.
-
-    Raises
-    ------
-    DataSetError
-        If a file is missing or malformed, or there is no such robot; it lists those there are.
-
+    Raises a DataSetError if a file is missing or malformed; if there is no such robot it lists
+    those there are.
     """
     folder = Path(folder)
     _require_robot(folder, robot)
