@@ -62,7 +62,7 @@ class Contents:
         return self._frame(odometry, lambda raw: [decode_pose(raw)]).lstrip('/')
 
     def has_transform_of(self, frame: str, selected: SelectedTopics) -> bool:
-        """Return whether /tf_static or /tf has a frame."""
+        """Return whether a transform on /tf_static or /tf is from or to a frame."""
         transforms = selected.transforms
         return any(
             frame in (name.lstrip('/') for name in (transform.frame_id, transform.child_frame_id))

@@ -32,7 +32,7 @@ from slam_observer_ros.recording.decoding import (
     input_decoders,
 )
 from slam_observer_ros.recording.opening import open_source
-from slam_observer_ros.recording.recorded_truth import base_in_frames, frames_beside, Truth
+from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -162,7 +162,7 @@ class Recording:
         """
         poses = list(self._all_decoded(selected.pose_truth, decode_pose))
         base_in: dict[str, FloatArray] = {}
-        if frames := frames_beside(base_frame, poses):
+        if frames := other_frames(base_frame, poses):
             transforms = self._static_transforms(selected)
             base_in = base_in_frames(frames, base_frame, transforms)
         landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)

@@ -129,7 +129,7 @@ def _positions_by_stamp(
         yield stamp_ns, positions
 
 
-def frames_beside(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
+def other_frames(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
     """Return the frames of poses that say whose they are, and are not those of the base."""
     known = ('', base_frame.lstrip('/'))
     frames = {message.child_frame_id for message in poses}

@@ -21,7 +21,7 @@ from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.recorded_truth import frames_beside, LandmarkTracks
+from slam_observer_ros.recording.recorded_truth import LandmarkTracks, other_frames
 from slam_observer_ros.recording.sources import BagSource, SplitSource
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter
@@ -297,7 +297,7 @@ def test_a_split_recording_lasts_from_the_start_of_the_first_file_to_the_end_of_
 def test_true_poses_are_of_another_frame_only_where_the_robots_has_a_name(base_frame, expected):
     frames = ('', 'wheels', '/base_link')
     poses = [PoseMessage(0, 'map', frame, np.zeros(3), np.eye(4)[3]) for frame in frames]
-    assert frames_beside(base_frame, poses) == expected
+    assert other_frames(base_frame, poses) == expected
 
 
 @pytest.mark.parametrize('count', [500, 501])
