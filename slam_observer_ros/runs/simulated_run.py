@@ -14,7 +14,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.observer.observer import lyapunov
-from slam_observer_ros.runs.sampling import SAMPLE_PERIOD_NS
+from slam_observer_ros.runs.sampling import PoseSamples
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation
 
@@ -82,32 +82,30 @@ class _RunningSimulation:
         self.estimator = Estimator(settings, on_update=self._on_update)
         self._simulation = simulation
         self._lyapunov: dict[int, float] = {}
-        self._poses: dict[int, FloatArray] = {}
-        self._points: list[FloatArray] = []
-        self._sampled_ns = -SAMPLE_PERIOD_NS
+        self._samples = PoseSamples()
+        self._landmark_tracks: list[FloatArray] = []
 
     def _on_update(self, update: Update) -> None:
         if len(update.ids):
             self._lyapunov[update.stamp_ns] = update.lyapunov
-        if update.stamp_ns - self._sampled_ns < SAMPLE_PERIOD_NS:
+        if not self._samples.is_due(update.stamp_ns):
             return
-        self._sampled_ns = update.stamp_ns
+        self._samples.add(update.stamp_ns, update.pose)
         points = np.full((len(self._simulation.landmark_ids), 3), np.nan)
         points[self.estimator.landmark_ids] = self.estimator.world_points
-        self._poses[update.stamp_ns] = update.pose
-        self._points.append(points)
+        self._landmark_tracks.append(points)
 
     def result(self) -> SimulatedRun:
-        stamps_ns = np.array(list(self._poses), dtype=np.int64)
+        estimate = self._samples.trajectory
         times_s = to_s(np.array(list(self._lyapunov)) - self._simulation.start_ns)
         levels = np.array(list(self._lyapunov.values()))
         return SimulatedRun(
             times_s,
             levels,
             fit_slope(times_s, levels, ROUNDING_MARGIN * self._rounding()),
-            Trajectory(stamps_ns, np.array(list(self._poses.values()))),
-            Trajectory(stamps_ns, self._simulation.pose(stamps_ns)),
-            np.array(self._points),
+            estimate,
+            Trajectory(estimate.stamps_ns, self._simulation.pose(estimate.stamps_ns)),
+            np.array(self._landmark_tracks),
         )
 
     def _rounding(self) -> float:
