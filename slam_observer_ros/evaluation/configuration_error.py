@@ -69,9 +69,8 @@ class ConfigurationError:
         # Which true landmark each is
         new_ids = ids if seen_ids is None else seen_ids
         were_seen = np.isin(ids, [*self._votes, *new_ids.tolist()])
-        for row in np.flatnonzero(is_automatic(ids) & were_seen):
-            nearest = np.argmin(np.linalg.norm(true_seen - seen[row], axis=1))
-            self._votes[int(ids[row])][int(truth.ids[nearest])] += 1
+        without_id = is_automatic(ids) & were_seen
+        self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
         true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
         rows, true_rows = np.nonzero(true_ids[:, None] == truth.ids)
         if not len(rows):
@@ -86,6 +85,14 @@ class ConfigurationError:
             P = covariance_of(rows[some])
             if P is not None:
                 self.nees.append(_nees(errors[some], P))
+
+    def _vote(
+        self, ids: IntArray, seen: FloatArray, true_ids: IntArray, true_seen: FloatArray
+    ) -> None:
+        """Count for each landmark (n, 3) which true one (m, 3) is the nearest now."""
+        for landmark_id, point in zip(ids.tolist(), seen, strict=True):
+            nearest = np.argmin(np.linalg.norm(true_seen - point, axis=1))
+            self._votes[landmark_id][int(true_ids[nearest])] += 1
 
     def _true_id(self, landmark_id: int) -> int:
         votes = self._votes.get(landmark_id)

@@ -26,7 +26,7 @@ _SINGULAR = 1e-12
 def normalised_squared_errors(
     errors: FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Return NEES (...), χ²-distributed where covariances are honest, and degrees of freedom (...).
+    """Return NEES (...), χ²-distributed where covariances are honest, and degrees of freedom.
 
     A direction of no variance is one that is known exactly (roll, pitch and height in planar
     mode): it is left out, and counts for no degree of freedom. Raises an EvaluationError if a
