@@ -59,7 +59,7 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
             raise UsageError(f'{file} is named for two outputs')
 
 
-def check_inputs_stay(
+def check_inputs_are_kept(
     outputs: Mapping[str, Path | None], inputs: Mapping[str, Iterable[Path]]
 ) -> None:
     """Raise a UsageError if an output would replace a file which is read, by whatever name.

@@ -49,13 +49,8 @@ def write_mcap(path: Path) -> Path:
     """Write the run as the package does."""
     with RecordingWriter(path) as writer:
         writer.write_landmarks(ros.STAMP_NS, LANDMARKS)
-        for event in events():
-            if isinstance(event, VelocityEvent):
-                writer.write_velocity(event)
-            else:
-                writer.write_observation(event)
-        for truth in true_poses():
-            writer.write_pose(truth)
+        for item in (*events(), *true_poses()):
+            writer.write_event(item)
     return path
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from slam_observer_ros.cli.options import find_config
 from slam_observer_ros.cli.outputs import (
-    check_inputs_stay,
+    check_inputs_are_kept,
     check_outputs,
     check_plots,
     filled_directory,
@@ -35,8 +35,8 @@ def check_files(args: argparse.Namespace) -> None:
     if args.config is not None:
         read['the file of --config'] = [find_config(args.config)]
     loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
-    check_inputs_stay({'--tum': args.tum}, read | loaded)
-    check_inputs_stay({'--map': args.map}, read)
+    check_inputs_are_kept({'--tum': args.tum}, read | loaded)
+    check_inputs_are_kept({'--map': args.map}, read)
     check_outputs([args.tum, args.map], args.force)
     check_plots(args.plot, FIGURES, args.force)
 

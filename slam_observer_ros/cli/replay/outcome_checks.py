@@ -61,18 +61,31 @@ def check_used(
     # In a loaded map there may be none as its pose was not found, which check_localised reports.
     if result.observations or (counts['observed_point'] and not result.estimator.is_localised):
         return
-    unused = Counter({'without a point that is used': counts['observation']})
-    unused += Counter({f'points {why}': counts[name] for name, why in UNUSED_POINTS.items()})
-    why = f'observation was used (dropped: {list_dropped(unused + dropped)})'
-    hint = ''
-    if recording.dropped[NO_TRANSFORM] or not unused + dropped:
-        hint = recording.contents.missing_tags(selected, inputs.tag_frame_prefix)
-    if recording.dropped[NO_TRANSFORM]:
-        hint = hint or PLACE_THE_SENSOR
-    why += f'; {hint}' if hint else ''
+    dropped = _unused_points(counts) + dropped
+    why = f'observation was used (dropped: {list_dropped(dropped)})'
+    if hint := _hint_where_none_was_used(recording, selected, inputs, dropped):
+        why += f'; {hint}'
     if args.smooth or args.map is not None or args.load_map is not None:
         raise UsageError(f'no {why}; --smooth, --map and --load-map need some')
     logger.warning('No %s; the trajectory is that of the velocities alone.', why)
+
+
+def _unused_points(counts: Counter[str]) -> Counter[str]:
+    """Return how many observations had no point that is used, and why the points were not."""
+    return Counter({'without a point that is used': counts['observation']}) + Counter(
+        {f'points {why}': counts[name] for name, why in UNUSED_POINTS.items()}
+    )
+
+
+def _hint_where_none_was_used(
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings, dropped: Counter[str]
+) -> str:
+    """Return what may be wrong where no observation was used; empty if nothing is known."""
+    is_unplaced = recording.dropped[NO_TRANSFORM] > 0
+    if dropped and not is_unplaced:
+        return ''
+    missing_tags = recording.contents.missing_tags(selected, inputs.tag_frame_prefix)
+    return missing_tags or (PLACE_THE_SENSOR if is_unplaced else '')
 
 
 def _warn_of_unused_velocities(
