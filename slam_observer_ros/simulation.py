@@ -123,7 +123,7 @@ class Delivery:
 
 
 class Simulation:
-    """A deterministic run of a scenario, whose first event has the stamp ``start_ns``."""
+    """A deterministic run of a scenario, whose first event is at ``start_ns``, nanoseconds."""
 
     def __init__(self, scenario: Scenario, start_ns: int = 0) -> None:
         self.scenario = scenario

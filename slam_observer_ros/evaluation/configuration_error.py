@@ -27,7 +27,8 @@ class ConfigurationError:
 
     After each observation, the RMS over all landmarks known so far of |P̂⁻¹ p̂_i − P⁻¹ p_i|;
     over a run, the RMS of that. Where a world frame lies plays no part, so nothing is aligned.
-    ``nees`` are the normalised squared errors per degree of freedom, where covariances are known.
+    ``values_m`` are of ``stamps_ns``, when there were landmarks to compare; ``nees`` are the
+    normalised squared errors per degree of freedom, of those with a covariance.
     """
 
     stamps_ns: list[int] = field(default_factory=list)

@@ -17,12 +17,15 @@ def fill_gaps(estimate: Trajectory, motion: Trajectory) -> Trajectory:
     reckoned, covered = interpolate(motion, estimate.stamps_ns, max_gap_ns=np.iinfo(np.int64).max)
     if covered.sum() < 2:
         return estimate
+    # What lies between the poses that the motion covers
     stamps_ns, poses = estimate.stamps_ns[covered], estimate.poses[covered]
     reckoned = reckoned[covered]
     between = (motion.stamps_ns > stamps_ns[0]) & (motion.stamps_ns < stamps_ns[-1])
     between &= ~np.isin(motion.stamps_ns, stamps_ns)
     wanted_ns = motion.stamps_ns[between]
     before = np.searchsorted(stamps_ns, wanted_ns) - 1
+
+    # What the motion misses each next pose by, shared out over the time
     arrivals = poses[:-1] @ se3.inverse(reckoned[:-1]) @ reckoned[1:]
     misses = se3.log(se3.inverse(arrivals) @ poses[1:])
     shares = (wanted_ns - stamps_ns[before]) / np.diff(stamps_ns)[before]

@@ -20,7 +20,7 @@ MIN_POSES = 3
 
 
 def root_mean_square(errors: FloatArray) -> float:
-    """Return the root mean squared length of errors (k, d) or (k,), k > 0."""
+    """Return the root of the mean squared length of errors (k, d), or of values (k,); k > 0."""
     return float(np.sqrt(np.sum(errors**2) / len(errors)))
 
 
@@ -81,7 +81,8 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
 def pose_errors(poses: FloatArray, true_poses: FloatArray) -> FloatArray:
     """Return errors (..., 6) in the order and axes of the estimator's pose covariance.
 
-    The rotation vector log(R̂ Rᵀ), rad, then x̂ − x, m, in the axes of the world of both poses.
+    The rotation vector log(R̂ Rᵀ), rad, then x̂ − x, m, both in the axes of the one world in which
+    the poses (..., 4, 4) are.
     """
     R_error = poses[..., :3, :3] @ transpose(true_poses[..., :3, :3])
     return np.concatenate([so3.log(R_error), poses[..., :3, 3] - true_poses[..., :3, 3]], axis=-1)
@@ -108,7 +109,7 @@ class LandmarkErrors:
 def landmark_errors(
     ids: IntArray, world_points: FloatArray, truth: LandmarkTruth
 ) -> LandmarkErrors:
-    """Compare points (n, 3) of different ids (n,) with the truth after one rigid alignment.
+    """Compare a map, of ids (n,) that are each there once, with the truth after rigid alignment.
 
     Raises an EvaluationError if no landmark is in both maps.
     """

@@ -88,6 +88,7 @@ def interpolate(
     covered: BoolArray = before >= 0
     before, wanted_ns = before[covered], stamps_ns[covered]
     after = np.minimum(before + 1, len(trajectory) - 1)
+    # How far each is on its way from the pose before to the one after
     elapsed_ns = wanted_ns - trajectory.stamps_ns[before]
     gap_ns = trajectory.stamps_ns[after] - trajectory.stamps_ns[before]
     usable = (elapsed_ns == 0) | ((gap_ns > 0) & (gap_ns <= max_gap_ns))

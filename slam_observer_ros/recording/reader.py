@@ -146,6 +146,7 @@ class Recording:
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:
                 self._insert(transforms, raw, is_static=False)
+            # What waited for a transform, then what has just come
             events = builder.retry(raw.receive_stamp_ns)
             if raw.topic in decoders:
                 for measured in self._decoded(raw, decoders[raw.topic]) or ():

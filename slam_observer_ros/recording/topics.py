@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class TopicNames:
-    """Names that the user gives, with or without leading slash; None where it is to be found."""
+    """Names that the user gives, with or without leading slash; None for topics to be found."""
 
     velocity: str | None = None
     landmarks: str | None = None
@@ -44,9 +44,9 @@ class TopicNames:
 
 @dataclass(frozen=True, slots=True)
 class SelectedTopics:
-    """The topics of a replay; None are the truth where not recorded, and the imu if not used.
+    """The topics of a replay: of measurements, of the truth, and of what places the sensors.
 
-    Transforms place the sensors. An imu gives the angular velocity instead of ``velocity``.
+    Truth that is not recorded is None, and so is ``imu``, unless the angular velocity is its.
     """
 
     velocity: Topic
@@ -92,7 +92,7 @@ def select_topics(
 ) -> SelectedTopics:
     """Pick one topic for each purpose.
 
-    Raises a RecordingError if none fits or two do, which lists them and the option that decides.
+    Raises a RecordingError if none fits or two do: it lists them, and the option that decides.
 
     Parameters
     ----------

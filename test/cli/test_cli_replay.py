@@ -637,7 +637,7 @@ class TestSettings:
         assert "unknown parameter 'gain_q'; did you mean 'gain_" in error
 
 
-class TestTroubledRecordings:
+class TestRecordingsWithProblems:
     def test_malformed_and_impossible_messages_are_dropped_by_reason(
         self, slam_observer, tmp_path
     ):
