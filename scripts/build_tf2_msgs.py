@@ -89,7 +89,7 @@ def use_each_entry_point_once() -> None:
     """Hide the second copy of the generators, which the wheels register twice.
 
     Each rosidl package lies in site-packages as a wheel and as an egg-info, and rosidl_cli
-    refuses a name that it meets twice.
+    refuses a name that it finds twice.
     """
     distributions = importlib.metadata.distributions()
     entries = {(e.group, e.name): e for found in distributions for e in found.entry_points}

@@ -112,17 +112,9 @@ SimulatedEvent: TypeAlias = VelocityEvent | ObservationEvent | PoseTruth
 
 @dataclass(frozen=True, slots=True, order=True)
 class Delivery:
-    """An event and the time at which it arrives at its receiver.
+    """An event, and the time at which it arrives: its own stamp unless it is late.
 
-    Attributes
-    ----------
-    arrival_ns : int
-        Time of arrival, nanoseconds; the event's own stamp unless it is late.
-    number : int
-        Position in the order of stamps; breaks ties between equal arrivals.
-    event : VelocityEvent, ObservationEvent or PoseTruth
-        What arrives.
-
+    ``number``, the position in the order of stamps, breaks ties between equal arrivals.
     """
 
     arrival_ns: int
@@ -131,16 +123,7 @@ class Delivery:
 
 
 class Simulation:
-    """A deterministic run of a scenario.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        What to simulate.
-    start_ns : int
-        Stamp of the run's first event, nanoseconds.
-
-    """
+    """A deterministic run of a scenario, whose first event is at ``start_ns``, nanoseconds."""
 
     def __init__(self, scenario: Scenario, start_ns: int = 0) -> None:
         self.scenario = scenario
@@ -184,7 +167,7 @@ class Simulation:
         """Yield events and true poses in the order in which they arrive.
 
         At equal stamps the truth comes first, then the velocity, then the observation. Each call
-        starts the same run anew.
+        yields the same run.
         """
         delayed: list[Delivery] = []
         for delivery in self._deliveries_in_stamp_order():

@@ -10,7 +10,8 @@ from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+
+from slam_observer_ros.common.tables import table_of
 
 PROGRAM = 'slam-observer'
 
@@ -52,9 +53,4 @@ def print_json(result: Mapping[str, object]) -> None:
 
 def print_table(title: str, rows: Mapping[str, str]) -> None:
     """Print names and values on standard output."""
-    table = Table(title=title, title_justify='left', show_header=False)
-    for _ in ('name', 'value'):
-        table.add_column(overflow='fold')  # a narrow terminal shortens nothing
-    for name, value in rows.items():
-        table.add_row(name, value)
-    Console(highlight=False, markup=False).print(table)
+    Console(highlight=False, markup=False).print(table_of(title, rows))

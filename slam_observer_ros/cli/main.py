@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **settings)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse what is not known here, where the command whose help tells more is known."""
+        """Refuse what is not known here, where the command whose help says more is known."""
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             meant = suggestion(unknown[0].partition('=')[0], self._option_string_actions)
@@ -59,7 +59,7 @@ def make_parser() -> Parser:
     """Return the parser of the whole command line."""
     # These take a second to load. Here, Ctrl-C meanwhile is handled as it is at any other time.
     from slam_observer_ros.cli import convert, simulate
-    from slam_observer_ros.cli.replay import replay
+    from slam_observer_ros.cli.replay import command as replay
 
     parser = Parser(
         prog=PROGRAM,
@@ -75,14 +75,7 @@ def make_parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Default: those that the program was started with.
-
-    """
+    """Run the command line; return the exit code."""
     if sys.stdout is None:  # a shell has closed it
         sys.stdout = Path(os.devnull).open('w', encoding='utf-8')  # noqa: SIM115 (till the end)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -92,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args = make_parser().parse_args(arguments)
         use_one_thread()
         # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
-        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(EXIT_SIGNAL + number))
+        signal.signal(signal.SIGTERM, lambda number, _stack: sys.exit(EXIT_SIGNAL + number))
         args.run(args)
         sys.stdout.flush()
     except (SlamObserverError, OSError) as error:

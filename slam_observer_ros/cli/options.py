@@ -70,22 +70,9 @@ def read_settings(
 ) -> Settings:
     """Build settings from defaults, ``--config``, ``--set`` and ``--gains``; later ones win.
 
-    Parameters
-    ----------
-    args : Namespace
-        With the options of :func:`add_settings_options`.
-    other_names : collection of str
-        Names that ``--set`` takes for other settings of the command.
-    instead : mapping of str to str
-        Options that do what the node's parameters of these names do.
-    **defaults : Value
-        What the command sets if the user doesn't.
-
-    Raises
-    ------
-    SlamObserverError
-        If a file, a name or a value is wrong.
-
+    ``other_names`` are those that ``--set`` takes for other settings of the command; ``instead``
+    has the options that do what the node's parameters of these names do. A SlamObserverError is
+    raised if a file, a name or a value is wrong.
     """
     values: dict[str, object] = dict(defaults)
     values |= _for_estimator(read_config(args))

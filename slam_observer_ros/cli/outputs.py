@@ -18,6 +18,14 @@ def add_force_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--force', action='store_true', help='replace files that exist already')
 
 
+def add_result_options(parser: argparse._ActionsContainer, figures: Iterable[str]) -> None:
+    """Add ``--plot`` and ``--json``."""
+    parser.add_argument(
+        '--plot', type=_figures_path, metavar='DIR', help=f'draw {", ".join(figures)}'
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+
+
 def recording_path(text: str) -> Path:
     """Take the name of a recording to be made, as an argparse type."""
     path = Path(text)
@@ -26,7 +34,7 @@ def recording_path(text: str) -> Path:
     return path
 
 
-def figures_path(text: str) -> Path:
+def _figures_path(text: str) -> Path:
     """Take the name of a directory for figures, as an argparse type."""
     if not text:
         raise argparse.ArgumentTypeError('a directory is needed: . for this one')
@@ -34,22 +42,7 @@ def figures_path(text: str) -> Path:
 
 
 def check_outputs(files: Iterable[Path | None], force: bool) -> None:
-    """Refuse files that can't be written, before any work is done.
-
-    Parameters
-    ----------
-    files : iterable of Path or None
-        Files to be written; None for those not asked for.
-    force : bool
-        Whether files may be replaced.
-
-    Raises
-    ------
-    UsageError
-        If a file exists and may not be replaced, is a directory, a pipe or a device, or would
-        lie in no directory or one that may not be written to, or two are the same.
-
-    """
+    """Raise a UsageError if a file can't be written, or not without ``force``; None is none."""
     wanted = [file for file in files if file is not None]
     for number, file in enumerate(wanted):
         if file.is_dir():
@@ -66,23 +59,12 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
             raise UsageError(f'{file} is named for two outputs')
 
 
-def check_inputs_stay(
+def check_inputs_are_kept(
     outputs: Mapping[str, Path | None], inputs: Mapping[str, Iterable[Path]]
 ) -> None:
-    """Refuse outputs that would replace a file which is read, by whatever name.
+    """Raise a UsageError if an output would replace a file which is read, by whatever name.
 
-    Parameters
-    ----------
-    outputs : mapping of str to Path or None
-        Files to be written, by option; None for those not asked for.
-    inputs : mapping of str to iterable of Path
-        Files that are read, by what they are.
-
-    Raises
-    ------
-    UsageError
-        If a file is both.
-
+    Outputs are by option, None where not asked for; inputs by what they are.
     """
     read = {file.resolve(): what for what, files in inputs.items() for file in files}
     for option, file in outputs.items():
@@ -92,23 +74,9 @@ def check_inputs_stay(
 
 
 def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> None:
-    """Refuse a directory for figures that can't take them.
+    """Raise a UsageError if figures of these names can't be written to a directory.
 
-    Parameters
-    ----------
-    directory : Path or None
-        Where the figures go; it need not exist, but its parent must. None if none are asked for.
-    names : iterable of str
-        Names of the figures.
-    force : bool
-        Whether figures may be replaced.
-
-    Raises
-    ------
-    UsageError
-        If it is a file, lies in no directory or one that may not be written to, or holds one of
-        the figures already.
-
+    It need not exist, but its parent must; None if no figures are asked for.
     """
     if directory is None:
         return
@@ -126,13 +94,8 @@ def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> No
 def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """Give a directory to write in, whose files go to ``directory`` when all are written.
 
-    Of ``names`` those that were not written this time are removed from there.
-
-    Raises
-    ------
-    OutputError
-        If that fails.
-
+    Of ``names`` those that were not written this time are removed from there. Raises an
+    OutputError if that fails.
     """
     beside = directory if directory.is_dir() else directory.parent
     try:

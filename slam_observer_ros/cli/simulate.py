@@ -13,9 +13,9 @@ from slam_observer_ros.cli.console import print_json, print_table, show_progress
 from slam_observer_ros.cli.options import add_settings_options, read_settings, value_of
 from slam_observer_ros.cli.outputs import (
     add_force_option,
+    add_result_options,
     check_outputs,
     check_plots,
-    figures_path,
     filled_directory,
     recording_path,
 )
@@ -65,10 +65,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         '--output', type=recording_path, metavar='OUT.mcap', help='write a recording'
     )
-    parser.add_argument(
-        '--plot', type=figures_path, metavar='DIR', help=f'draw {", ".join(FIGURES)}'
-    )
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    add_result_options(parser, FIGURES)
     add_force_option(parser)
     add_settings_options(parser)
     parser.set_defaults(run=run)

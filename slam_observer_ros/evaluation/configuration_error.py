@@ -27,16 +27,8 @@ class ConfigurationError:
 
     After each observation, the RMS over all landmarks known so far of |P̂⁻¹ p̂_i − P⁻¹ p_i|;
     over a run, the RMS of that. Where a world frame lies plays no part, so nothing is aligned.
-
-    Attributes
-    ----------
-    stamps_ns : list of int
-        When :meth:`add` found landmarks to compare.
-    values_m : list of float
-        The error at these times, metres.
-    nees : list of float
-        Normalised squared errors per degree of freedom, of those that came with a covariance.
-
+    ``values_m`` are of ``stamps_ns``, when there were landmarks to compare; ``nees`` are the
+    normalised squared errors per degree of freedom, of those with a covariance.
     """
 
     stamps_ns: list[int] = field(default_factory=list)
@@ -55,44 +47,37 @@ class ConfigurationError:
         covariance_of: Callable[[IntArray], FloatArray | None] | None = None,
         seen_ids: IntArray | None = None,
     ) -> None:
-        """Take in one configuration, once after each observation.
+        """Take in one configuration and the truth at that time, once after each observation.
 
         Parameters
         ----------
-        stamp_ns : int
-            Time of the observation, nanoseconds.
-        pose : FloatArray
-            (4, 4) estimated pose.
         ids : IntArray
             (n,) landmarks known so far; those without truth are passed over. One whose sensor
             gave no id stands for the true landmark that it was nearest to most often since it was
             first seen, as seen by the robot; until then it is passed over, too.
-        world_points : FloatArray
-            (n, 3) their estimated positions in the estimate's world, metres.
-        true_pose : FloatArray
-            (4, 4) true pose at that time.
-        truth : LandmarkTruth
-            True landmark positions at that time.
         covariance_of : callable, optional
-            Gives the joint covariance (m k, m k) of m of the landmarks as seen by the robot, of
-            their first k coordinates, m²; None if it is not known.
+            Gives the joint covariance (m k, m k) of rows (m,) of the landmarks as seen by the
+            robot, of their first k coordinates, m²; None if it is not known.
         seen_ids : IntArray, optional
-            (m,) which of the landmarks were seen now; by default all.
+            Which of the landmarks were seen now; by default all.
 
         """
         if not len(truth.ids):
             return
         seen = se3.transform(se3.inverse(pose), world_points)
         true_seen = se3.transform(se3.inverse(true_pose), truth.world_points)
+
+        # Which true landmark each is
         new_ids = ids if seen_ids is None else seen_ids
         were_seen = np.isin(ids, [*self._votes, *new_ids.tolist()])
-        for row in np.flatnonzero(is_automatic(ids) & were_seen):
-            nearest = np.argmin(np.linalg.norm(true_seen - seen[row], axis=1))
-            self._votes[int(ids[row])][int(truth.ids[nearest])] += 1
+        without_id = is_automatic(ids) & were_seen
+        self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
         true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
         rows, true_rows = np.nonzero(true_ids[:, None] == truth.ids)
         if not len(rows):
             return
+
+        # How far it is off, and how likely that is
         self.stamps_ns.append(stamp_ns)
         errors = seen[rows] - true_seen[true_rows]
         self.values_m.append(root_mean_square(errors))
@@ -101,6 +86,14 @@ class ConfigurationError:
             P = covariance_of(rows[some])
             if P is not None:
                 self.nees.append(_nees(errors[some], P))
+
+    def _vote(
+        self, ids: IntArray, seen: FloatArray, true_ids: IntArray, true_seen: FloatArray
+    ) -> None:
+        """Count for each landmark (n, 3) which true one (m, 3) is the nearest now."""
+        for landmark_id, point in zip(ids.tolist(), seen, strict=True):
+            nearest = np.argmin(np.linalg.norm(true_seen - point, axis=1))
+            self._votes[landmark_id][int(true_ids[nearest])] += 1
 
     def _true_id(self, landmark_id: int) -> int:
         votes = self._votes.get(landmark_id)

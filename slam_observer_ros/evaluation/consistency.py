@@ -1,4 +1,7 @@
-"""Consistency: whether the covariances that are stated match the errors that are made."""
+"""Consistency: whether the covariances (..., d, d) that are stated match the errors (..., d) made.
+
+NEES: normalised estimation error squared, εᵀ Σ⁻¹ ε; ANEES: its mean, per degree of freedom.
+"""
 
 from __future__ import annotations
 
@@ -23,30 +26,11 @@ _SINGULAR = 1e-12
 def normalised_squared_errors(
     errors: FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Compute the NEES εᵀ Σ⁻¹ ε, χ²-distributed where the covariance is honest.
+    """Return NEES (...), χ²-distributed where covariances are honest, and degrees of freedom.
 
     A direction of no variance is one that is known exactly (roll, pitch and height in planar
-    mode): it is left out, and counts for no degree of freedom.
-
-    Parameters
-    ----------
-    errors : FloatArray
-        (..., d) errors.
-    covariances : FloatArray
-        (..., d, d) their covariances.
-
-    Returns
-    -------
-    nees : FloatArray
-        (...) normalised estimation errors squared.
-    degrees_of_freedom : IntArray
-        (...) number of directions that are not known exactly.
-
-    Raises
-    ------
-    EvaluationError
-        A covariance has a negative eigenvalue.
-
+    mode): it is left out, and counts for no degree of freedom. Raises an EvaluationError if a
+    covariance has a negative eigenvalue.
     """
     variances = np.diagonal(covariances, axis1=-2, axis2=-1)
     deviations = np.sqrt(np.where(variances > 0.0, variances, 1.0))
@@ -62,21 +46,9 @@ def normalised_squared_errors(
 
 
 def average_nees(errors: FloatArray, covariances: FloatArray) -> float | None:
-    """Compute the ANEES per degree of freedom: 1 where the covariances are honest.
+    """Return the ANEES of all runs and times: above 1 is overconfident, below 1 too cautious.
 
-    Parameters
-    ----------
-    errors : FloatArray
-        (..., d) errors of all runs and times.
-    covariances : FloatArray
-        (..., d, d) their covariances.
-
-    Returns
-    -------
-    float or None
-        Sum of the NEES over the sum of the degrees of freedom; above 1 is overconfident, below
-        1 too cautious; None where every component is known exactly.
-
+    None where every component is known exactly.
     """
     nees, degrees_of_freedom = normalised_squared_errors(errors, covariances)
     total = int(degrees_of_freedom.sum())
@@ -86,22 +58,10 @@ def average_nees(errors: FloatArray, covariances: FloatArray) -> float | None:
 def average_nees_band(
     degrees_of_freedom: int, runs: int, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Bound the ANEES per degree of freedom of an honest estimator, by the χ² distribution.
+    """Return the band in which the ANEES of an honest estimator lies with that confidence.
 
-    Parameters
-    ----------
-    degrees_of_freedom : int
-        Of one error: 6 for a pose, 3 for a landmark or a planar pose.
-    runs : int
-        Independent runs averaged.
-    confidence : float
-        Probability of lying inside the band.
-
-    Returns
-    -------
-    lower, upper : float
-        The band's limits, each missed with the same probability.
-
+    The χ² distribution of an error of so many degrees of freedom (6 for a pose, 3 for a landmark
+    or a planar pose), averaged over independent runs. Each limit is missed as often.
     """
     total = degrees_of_freedom * runs
     # chdtri inverts the χ² tail. scipy.stats has it too, but takes a second to import.
@@ -115,30 +75,12 @@ def average_nees_band(
 def anchored_average_nees(
     estimate: Trajectory, covariances: FloatArray, truth: Trajectory
 ) -> float | None:
-    """Compute the pose's ANEES of one run, with the truth moved onto its first estimated pose.
+    """Return the pose's ANEES of one run, with the truth moved onto its first estimated pose.
 
     An estimator declares its first pose certain: that is its gauge. A fit over the whole run
-    would hide errors that its covariance counts.
-
-    Parameters
-    ----------
-    estimate : Trajectory
-        k estimated poses.
-    covariances : FloatArray
-        (k, 6, 6) of world-axes rotation vector and position.
-    truth : Trajectory
-        True poses, at any rate.
-
-    Returns
-    -------
-    float or None
-        As :func:`average_nees`; None where the truth covers no pose.
-
-    Raises
-    ------
-    EvaluationError
-        The truth begins when the pose is uncertain already.
-
+    would hide errors that its covariance counts. The covariances (k, 6, 6) are of rotation vector
+    and position, world axes. None where the truth covers no pose; an EvaluationError is raised if
+    it begins when the pose is uncertain already.
     """
     paired, true_paired, covered = associate(estimate, truth)
     if len(paired) == 0:

@@ -11,31 +11,21 @@ from slam_observer_ros.geometry import se3
 def fill_gaps(estimate: Trajectory, motion: Trajectory) -> Trajectory:
     """Add the poses between those of an estimate, as a motion that drifts passed through them.
 
-    From each estimated pose on the motion's shape is kept; what it misses the next estimated
-    pose by is made up for in proportion to the time.
-
-    Parameters
-    ----------
-    estimate : Trajectory
-        k poses.
-    motion : Trajectory
-        Poses in another world, as of dead reckoning; used where it covers the estimate.
-
-    Returns
-    -------
-    Trajectory
-        The k poses, and those of the motion between them.
-
+    The motion, such as dead reckoning, may be in another world. From each estimated pose on its
+    shape is kept; what it misses the next one by is made up for in proportion to the time.
     """
     reckoned, covered = interpolate(motion, estimate.stamps_ns, max_gap_ns=np.iinfo(np.int64).max)
     if covered.sum() < 2:
         return estimate
+    # What lies between the poses that the motion covers
     stamps_ns, poses = estimate.stamps_ns[covered], estimate.poses[covered]
     reckoned = reckoned[covered]
     between = (motion.stamps_ns > stamps_ns[0]) & (motion.stamps_ns < stamps_ns[-1])
     between &= ~np.isin(motion.stamps_ns, stamps_ns)
     wanted_ns = motion.stamps_ns[between]
     before = np.searchsorted(stamps_ns, wanted_ns) - 1
+
+    # What the motion misses each next pose by, shared out over the time
     arrivals = poses[:-1] @ se3.inverse(reckoned[:-1]) @ reckoned[1:]
     misses = se3.log(se3.inverse(arrivals) @ poses[1:])
     shares = (wanted_ns - stamps_ns[before]) / np.diff(stamps_ns)[before]

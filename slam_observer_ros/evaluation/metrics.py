@@ -20,14 +20,7 @@ MIN_POSES = 3
 
 
 def root_mean_square(errors: FloatArray) -> float:
-    """Take the root of the mean squared length of error vectors.
-
-    Parameters
-    ----------
-    errors : FloatArray
-        (k, d) errors, k > 0, or (k,) scalar ones.
-
-    """
+    """Return the root of the mean squared length of errors (k, d), or of values (k,); k > 0."""
     return float(np.sqrt(np.sum(errors**2) / len(errors)))
 
 
@@ -35,19 +28,9 @@ def root_mean_square(errors: FloatArray) -> float:
 class TrajectoryErrors:
     """Errors of a trajectory after one rigid alignment of its positions.
 
-    Attributes
-    ----------
-    estimate : Trajectory
-        (k) estimated poses that the truth covers, moved into the truth's world.
-    truth : Trajectory
-        (k) true poses at the same stamps.
-    covered : BoolArray
-        Which poses of the whole estimate these k are.
-    alignment : FloatArray
-        (4, 4) transform from the estimate's world to the truth's.
-    errors : FloatArray
-        (k, 6) :func:`pose_errors` in the truth's world axes, rad and m.
-
+    ``estimate`` are the k poses that the truth covers, moved into the truth's world by
+    ``alignment`` (4, 4), and ``truth`` those at the same stamps; ``covered`` says which poses of
+    the whole estimate these are. ``errors`` are :func:`pose_errors` (k, 6) in the truth's axes.
     """
 
     estimate: Trajectory
@@ -81,18 +64,7 @@ class TrajectoryErrors:
 def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
     """Compare a trajectory with the truth after one rigid alignment of all positions.
 
-    Parameters
-    ----------
-    estimate : Trajectory
-        Estimated poses, in any world frame.
-    truth : Trajectory
-        True poses, at any rate.
-
-    Raises
-    ------
-    EvaluationError
-        The truth covers fewer than three poses of the estimate: others fit in any case.
-
+    Raises an EvaluationError if the truth covers fewer than three poses: these fit in any case.
     """
     paired, true_paired, covered = associate(estimate, truth)
     if len(paired) < MIN_POSES:
@@ -107,18 +79,10 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
 
 
 def pose_errors(poses: FloatArray, true_poses: FloatArray) -> FloatArray:
-    """Compute errors in the order and axes of the estimator's pose covariance.
+    """Return errors (..., 6) in the order and axes of the estimator's pose covariance.
 
-    Parameters
-    ----------
-    poses, true_poses : FloatArray
-        (..., 4, 4) estimated and true poses in one world frame.
-
-    Returns
-    -------
-    FloatArray
-        (..., 6) rotation vector log(R̂ Rᵀ), rad, then x̂ − x, m, both in world axes.
-
+    The rotation vector log(R̂ Rᵀ), rad, then x̂ − x, m, both in the axes of the one world in which
+    the poses (..., 4, 4) are.
     """
     R_error = poses[..., :3, :3] @ transpose(true_poses[..., :3, :3])
     return np.concatenate([so3.log(R_error), poses[..., :3, 3] - true_poses[..., :3, 3]], axis=-1)
@@ -128,15 +92,8 @@ def pose_errors(poses: FloatArray, true_poses: FloatArray) -> FloatArray:
 class LandmarkErrors:
     """Errors of a map after one rigid alignment of the landmarks whose truth is known.
 
-    Attributes
-    ----------
-    ids : IntArray
-        (m,) landmarks in both maps.
-    alignment : FloatArray
-        (4, 4) transform from the estimate's world to the truth's.
-    errors : FloatArray
-        (m, 3) aligned estimate minus truth, metres.
-
+    ``errors`` (m, 3) are aligned estimate minus truth, metres, of the landmarks ``ids`` (m,) in
+    both maps; ``alignment`` (4, 4) leads from the estimate's world to the truth's.
     """
 
     ids: IntArray
@@ -152,22 +109,9 @@ class LandmarkErrors:
 def landmark_errors(
     ids: IntArray, world_points: FloatArray, truth: LandmarkTruth
 ) -> LandmarkErrors:
-    """Compare a map with the truth after one rigid alignment of the common landmarks.
+    """Compare a map, of ids (n,) that are each there once, with the truth after rigid alignment.
 
-    Parameters
-    ----------
-    ids : IntArray
-        (n,) estimated landmarks, each once.
-    world_points : FloatArray
-        (n, 3) their positions in the estimate's world, metres.
-    truth : LandmarkTruth
-        True positions.
-
-    Raises
-    ------
-    EvaluationError
-        No landmark is in both maps.
-
+    Raises an EvaluationError if no landmark is in both maps.
     """
     common, rows, true_rows = np.intersect1d(ids, truth.ids, return_indices=True)
     if len(common) == 0:

@@ -22,20 +22,9 @@ _TUM_HEADER = '# timestamp[s] x y z [m] qx qy qz qw\n'
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Poses in strictly increasing time.
+    """Poses (k, 4, 4), body to world, at strictly increasing stamps (k,).
 
-    Attributes
-    ----------
-    stamps_ns : IntArray
-        (k,) stamps, nanoseconds.
-    poses : FloatArray
-        (k, 4, 4) transforms from the body to the world.
-
-    Raises
-    ------
-    EvaluationError
-        The shapes don't fit, a pose isn't finite, or the stamps don't increase.
-
+    Raises an EvaluationError if shapes don't fit, a pose isn't finite or stamps don't increase.
     """
 
     stamps_ns: IntArray
@@ -54,16 +43,7 @@ class Trajectory:
 
     @classmethod
     def from_samples(cls, stamps_ns: Sequence[int], poses: Sequence[FloatArray]) -> Trajectory:
-        """Collect poses in any order; of those with one stamp, the last given counts.
-
-        Parameters
-        ----------
-        stamps_ns : sequence of int
-            k stamps, nanoseconds.
-        poses : sequence of FloatArray
-            k transforms (4, 4) from the body to the world.
-
-        """
+        """Collect poses (4, 4) in any order; of those with one stamp, the last given counts."""
         latest = dict(zip(stamps_ns, poses, strict=True))
         ordered = sorted(latest)
         stacked = np.array([latest[stamp] for stamp in ordered], dtype=np.float64)
@@ -83,21 +63,14 @@ class Trajectory:
         return self.poses[:, :3, :3]
 
     def during(self, other: Trajectory) -> Trajectory:
-        """Return the least part that spans the time of another trajectory, as far as it does."""
+        """Return the shortest part that spans the time of another one, as far as this one does."""
         first = np.searchsorted(self.stamps_ns, other.stamps_ns[0], side='right') - 1
         last = np.searchsorted(self.stamps_ns, other.stamps_ns[-1])
         kept = slice(max(first, 0), last + 1)
         return Trajectory(self.stamps_ns[kept], self.poses[kept])
 
     def moved(self, transform: FloatArray) -> Trajectory:
-        """Express the trajectory in another world frame.
-
-        Parameters
-        ----------
-        transform : FloatArray
-            (4, 4) from this world to the other one.
-
-        """
+        """Express it in another world frame, to which ``transform`` (4, 4) leads from this one."""
         return Trajectory(self.stamps_ns, transform @ self.poses)
 
 
@@ -106,31 +79,16 @@ def interpolate(
 ) -> tuple[FloatArray, BoolArray]:
     """Interpolate poses: linear in position, constant angular velocity in rotation (slerp).
 
-    At the trajectory's own stamps its poses are returned bit for bit. Nothing is extrapolated
-    before the first or after the last stamp, nor bridged over gaps that are too long.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        k poses.
-    stamps_ns : IntArray
-        (m,) times wanted, in any order, nanoseconds.
-    max_gap_ns : int
-        Longest time between two neighbouring poses that is bridged.
-
-    Returns
-    -------
-    poses : FloatArray
-        (m, 4, 4) poses, NaN where not covered.
-    covered : BoolArray
-        (m,) whether the trajectory covers that time.
-
+    Returns poses (m, 4, 4) at stamps (m,) of any order, NaN where the trajectory does not cover
+    that time, and whether it does (m,). At its own stamps its poses are returned bit for bit.
+    Nothing is extrapolated before the first or after the last, nor bridged over longer gaps.
     """
     poses = np.full((len(stamps_ns), 4, 4), np.nan)
     before = np.searchsorted(trajectory.stamps_ns, stamps_ns, side='right') - 1
     covered: BoolArray = before >= 0
     before, wanted_ns = before[covered], stamps_ns[covered]
     after = np.minimum(before + 1, len(trajectory) - 1)
+    # How far each is on its way from the pose before to the one after
     elapsed_ns = wanted_ns - trajectory.stamps_ns[before]
     gap_ns = trajectory.stamps_ns[after] - trajectory.stamps_ns[before]
     usable = (elapsed_ns == 0) | ((gap_ns > 0) & (gap_ns <= max_gap_ns))
@@ -143,22 +101,9 @@ def interpolate(
 
 
 def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory, BoolArray]:
-    """Pair each estimated pose with the true one at the same time.
+    """Pair each estimated pose that the truth covers with the true one, interpolated, at its time.
 
-    Parameters
-    ----------
-    estimate : Trajectory
-        k estimated poses.
-    truth : Trajectory
-        True poses at any rate, interpolated (:func:`interpolate`).
-
-    Returns
-    -------
-    estimate, truth : Trajectory
-        The pairs, at the stamps of the estimate that the truth covers.
-    covered : BoolArray
-        (k,) which of the estimated poses these are.
-
+    Returns estimate and truth at these stamps, and which (k,) of the estimated poses these are.
     """
     true_poses, covered = interpolate(truth, estimate.stamps_ns)
     stamps_ns = estimate.stamps_ns[covered]
@@ -173,25 +118,8 @@ def write_tum(trajectory: Trajectory, path: Path) -> Path:
     """Write a TUM file (``t x y z qx qy qz qw``), as evo and others read it.
 
     Stamps are written to the nanosecond and numbers with all their digits, so reading the file
-    gives the stamps and positions back bit for bit. The file appears whole or not at all.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Poses to write.
-    path : Path
-        File to create or replace; its folder must exist.
-
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written.
-
+    gives the stamps and positions back bit for bit. The file appears whole or not at all. Returns
+    its path; raises an EvaluationError if it can't be written.
     """
     numbers = np.hstack([trajectory.positions, so3.to_quaternion(trajectory.rotations)]).tolist()
     lines = (

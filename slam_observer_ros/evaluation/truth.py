@@ -9,16 +9,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class PoseTruth:
-    """True pose of the robot.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Time of validity, nanoseconds.
-    pose : FloatArray
-        (4, 4) transform from the base frame to the world.
-
-    """
+    """True pose (4, 4) of the robot, base frame to world, at a time."""
 
     stamp_ns: int
     pose: FloatArray
@@ -26,16 +17,7 @@ class PoseTruth:
 
 @dataclass(frozen=True, slots=True)
 class LandmarkTruth:
-    """True landmark positions.
-
-    Attributes
-    ----------
-    ids : IntArray
-        (n,) landmark ids.
-    world_points : FloatArray
-        (n, 3) positions in the world, metres.
-
-    """
+    """True positions (n, 3) of landmarks, in the world, metres, and their ids (n,)."""
 
     ids: IntArray
     world_points: FloatArray

@@ -10,16 +10,7 @@ from slam_observer_ros.common.units import to_s
 
 
 class Arrivals:
-    """Times of what one topic measured, in the order in which it was received.
-
-    Attributes
-    ----------
-    received_s : array
-        (k,) when each measurement was received, seconds.
-    delays_s : array
-        (k,) how long after its stamp that was, seconds.
-
-    """
+    """When each measurement of a topic was received, and how long after its stamp; seconds."""
 
     def __init__(self) -> None:
         self.received_s = array('d')
@@ -35,7 +26,7 @@ class Arrivals:
         self.delays_s.append(to_s(received_ns - stamp_ns))
 
     def silence_s(self, start_s: float, end_s: float, timeout_s: float) -> float:
-        """Return for how long of a time nothing was known, if each measurement holds so long."""
+        """Return for how long nothing was known, if each measurement holds until the timeout."""
         waits_s = np.diff([start_s, *self.received_s, end_s])
         return float(np.maximum(waits_s - timeout_s, 0.0).sum())
 

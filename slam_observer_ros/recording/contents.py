@@ -31,21 +31,15 @@ from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.settings.input_settings import InputSettings
 
 MAX_EMPTY_CLOUDS = 1000
-"""Most clouds of a topic that are looked at for one with points, which tells of ids."""
+"""Most clouds of a topic that are looked at for one with points, which shows the ids."""
 
 _Decoded = TypeVar('_Decoded')
 
 
 class Contents:
-    """Frames, ids and clocks of a recording, from as few of its messages as tell.
+    """Frames, ids and clocks of an open recording, from as few of its messages as show them.
 
-    Malformed messages tell nothing.
-
-    Parameters
-    ----------
-    source : MessageSource
-        The open recording.
-
+    Malformed messages are passed over.
     """
 
     def __init__(self, source: MessageSource) -> None:
@@ -63,11 +57,11 @@ class Contents:
         return velocity_frame, self._frame(selected.landmarks, decoders[selected.landmarks])
 
     def pose_frame(self, odometry: Topic) -> str:
-        """Return the frame that the poses of an odometry are told in."""
+        """Return the frame that the poses of an odometry are in."""
         return self._frame(odometry, lambda raw: [decode_pose(raw)]).lstrip('/')
 
-    def transform_places(self, frame: str, selected: SelectedTopics) -> bool:
-        """Return whether /tf_static or /tf has a frame."""
+    def has_transform_of(self, frame: str, selected: SelectedTopics) -> bool:
+        """Return whether a transform on /tf_static or /tf is from or to a frame."""
         transforms = selected.transforms
         return any(
             frame in (name.lstrip('/') for name in (transform.frame_id, transform.child_frame_id))

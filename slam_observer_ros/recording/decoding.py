@@ -81,9 +81,9 @@ def _one(decode: Callable[[Buffer, int], Measured]) -> Decode:
 
 def _landmarks(raw: RawMessage) -> list[Measurement[ObservationEvent]]:
     message = decode_landmarks(raw)
-    trouble = scan_problem(message.event)
-    if trouble:
-        raise RecordingError(f'{raw.topic}: {trouble}')
+    problem = scan_problem(message.event)
+    if problem:
+        raise RecordingError(f'{raw.topic}: {problem}')
     return [message]
 
 

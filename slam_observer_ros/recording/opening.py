@@ -22,25 +22,10 @@ _ZSTD_MAGIC = bytes.fromhex('28b52ffd')
 
 
 def open_source(path: Path) -> tuple[MessageSource, str | None]:
-    """Open a recording of any of the formats, damaged or not.
+    """Open a .mcap, .db3 or .bag file or a rosbag2 directory, damaged or not.
 
-    Parameters
-    ----------
-    path : Path
-        A .mcap, .db3 or .bag file, or a rosbag2 directory.
-
-    Returns
-    -------
-    MessageSource
-        The open recording.
-    str or None
-        A warning, if only a part of it could be read.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing to read; one line that says what to do.
-
+    Also returns a warning, if only a part of it could be read. Raises a RecordingError that says
+    in one line what to do if there is nothing to read.
     """
     if not path.exists():
         raise RecordingError(f'{path}: no such file or directory')
@@ -107,7 +92,7 @@ def _open_parts(files: Sequence[Path]) -> tuple[MessageSource, str | None]:
 
 
 def _listed_files(directory: Path) -> list[Path]:
-    """List the files that metadata.yaml names; none if it is damaged, which rosbags tells of."""
+    """List the files that metadata.yaml names; none if it is damaged, which rosbags reports."""
     try:
         metadata = yaml.safe_load((directory / 'metadata.yaml').read_text(encoding='utf-8'))
         names = metadata['rosbag2_bagfile_information']['relative_file_paths']
@@ -143,7 +128,7 @@ def _storage_files(path: Path) -> list[Path]:
 
 
 def _refuse_compressed_messages(path: Path, source: MessageSource) -> None:
-    """Refuse a file whose messages are compressed one by one: only metadata.yaml tells so."""
+    """Refuse a file whose messages are compressed one by one: only metadata.yaml says so."""
     first = next(iter(source.messages(source.topics)), None)
     if first is not None and bytes(first.data[: len(_ZSTD_MAGIC)]) == _ZSTD_MAGIC:
         raise RecordingError(

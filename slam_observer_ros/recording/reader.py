@@ -32,7 +32,7 @@ from slam_observer_ros.recording.decoding import (
     input_decoders,
 )
 from slam_observer_ros.recording.opening import open_source
-from slam_observer_ros.recording.recorded_truth import base_in_frames, frames_beside, Truth
+from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -45,36 +45,21 @@ _Decoded = TypeVar('_Decoded')
 class Recording:
     """An open MCAP file, rosbag2 (directory or bare .db3) or ROS 1 .bag: use it in ``with``.
 
-    A truncated MCAP file is read up to the damage; :attr:`warning` says so.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file or directory.
+    A truncated MCAP file is read up to the damage. Raises a RecordingError that says in one line
+    what to do if there is nothing to read, also later if the file turns out to be damaged.
 
     Attributes
     ----------
-    path : Path
-        The same.
-    topics : tuple of Topic
-        All topics, with types and message counts.
     warning : str or None
         Why only a part of the recording can be read; None if it is whole.
-    malformed : Counter
-        Messages that could not be decoded so far, by topic; the first of each is logged.
+    malformed, unstamped : Counter
+        Messages that could not be decoded, and measurements without stamp, so far, by topic.
     dropped : Counter
-        Measurements that did not become events so far, by reason; the first is logged.
-    unstamped : Counter
-        Measurements without stamp so far, by topic.
+        Measurements that did not become events so far, by reason.
     arrivals : dict of str to Arrivals
         When the measurements so far were received, by topic.
     contents : Contents
-        What its messages tell before they are used.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing to read; one line that says what to do.
+        What is known of its messages before they are used.
 
     """
 
@@ -126,18 +111,7 @@ class Recording:
     ) -> SelectedTopics:
         """Pick the topics of velocities, landmarks and truth, and that of an Imu if it is used.
 
-        Parameters
-        ----------
-        names : TopicNames
-            What the user chose; the rest is found by message type and name.
-        inputs : InputSettings
-            What of the messages is to be used.
-
-        Raises
-        ------
-        RecordingError
-            If no topic fits, or two do; it lists them, and names the option that decides.
-
+        What the user doesn't name is found by message type and name; see :func:`select_topics`.
         """
         contents = self.contents
         return select_topics(self.topics, names, inputs, contents.has_ids, contents.pose_frame)
@@ -158,22 +132,7 @@ class Recording:
         comes when that has been received, or is dropped after the timeout. Stamps are those of
         the messages' headers; an unstamped Twist has its receive time, and so has what leaves its
         stamp zero, which is counted in :attr:`unstamped`. Malformed messages are left out and
-        counted in :attr:`malformed`, what was dropped in :attr:`dropped`.
-
-        Parameters
-        ----------
-        selected : SelectedTopics
-            From :meth:`find_topics`.
-        inputs : InputSettings
-            What of the messages is used, and in which frames it is.
-        velocity_timeout_s : float
-            How long a velocity holds, seconds.
-
-        Raises
-        ------
-        RecordingError
-            If the file turns out to be damaged.
-
+        counted in :attr:`malformed`, what was dropped in :attr:`dropped`; the first is logged.
         """
         transforms = self._static_transforms(selected)
         builder = EventBuilder(
@@ -187,6 +146,7 @@ class Recording:
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:
                 self._insert(transforms, raw, is_static=False)
+            # What waited for a transform, then what has just come
             events = builder.retry(raw.receive_stamp_ns)
             if raw.topic in decoders:
                 for measured in self._decoded(raw, decoders[raw.topic]) or ():
@@ -197,25 +157,13 @@ class Recording:
         yield from builder.finish()
 
     def truth(self, selected: SelectedTopics, base_frame: str = '') -> Truth:
-        """Read the true poses and landmarks.
+        """Read the true landmarks, and the true poses of the base frame.
 
-        Parameters
-        ----------
-        selected : SelectedTopics
-            From :meth:`find_topics`.
-        base_frame : str
-            Whose poses these shall be. Those of another frame are moved to it by /tf_static, or
-            left as they are, with a warning.
-
-        Raises
-        ------
-        RecordingError
-            If the file turns out to be damaged.
-
+        Poses of another frame are moved to it by /tf_static, or left as they are, with a warning.
         """
         poses = list(self._all_decoded(selected.pose_truth, decode_pose))
         base_in: dict[str, FloatArray] = {}
-        if frames := frames_beside(base_frame, poses):
+        if frames := other_frames(base_frame, poses):
             transforms = self._static_transforms(selected)
             base_in = base_in_frames(frames, base_frame, transforms)
         landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)

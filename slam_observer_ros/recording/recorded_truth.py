@@ -28,17 +28,10 @@ _Positions: TypeAlias = dict[int, tuple[float, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTracks:
-    """Where landmarks truly were, at the times between which they moved in a line or were at rest.
+    """Where landmarks truly were: (j, n, 3) positions of ``ids`` (n,) at j increasing stamps.
 
-    Attributes
-    ----------
-    stamps_ns : IntArray
-        (j,) the times, increasing, nanoseconds.
-    ids : IntArray
-        (n,) landmark ids.
-    world_points : FloatArray
-        (j, n, 3) their positions in the world, metres; of one that was not told of yet, its first.
-
+    Between these they moved in a line or were at rest; one that was not seen yet is where it is
+    first. In the world, metres.
     """
 
     stamps_ns: IntArray
@@ -52,8 +45,8 @@ class LandmarkTracks:
         """Gather positions of any order; None if no message has a landmark."""
         stamps_ns: list[int] = []
         states: list[_Positions] = []
-        for stamp_ns, told in _told_at(messages):
-            state = states[-1] | told if states else told
+        for stamp_ns, positions in _positions_by_stamp(messages):
+            state = states[-1] | positions if states else positions
             if states[-2:] == [state, state]:  # at rest: its beginning and its end are enough
                 stamps_ns[-1] = stamp_ns
                 continue
@@ -86,15 +79,8 @@ class LandmarkTracks:
 class Truth:
     """What the estimate is compared with, in the axes of the recording's world frame.
 
-    Attributes
-    ----------
-    stamps_ns : IntArray
-        (k,) strictly increasing stamps of the true poses, nanoseconds.
-    poses : FloatArray
-        (k, 4, 4) true poses, body to world; k is 0 if the recording has none.
-    tracks : LandmarkTracks or None
-        Where the landmarks truly were; None if the recording doesn't tell.
-
+    The true poses (k, 4, 4), body to world, have strictly increasing stamps (k,), nanoseconds;
+    k is 0 and ``tracks`` of landmarks are None if the recording has none.
     """
 
     stamps_ns: IntArray
@@ -113,11 +99,7 @@ class Truth:
         base_in: Mapping[str, FloatArray],
         landmarks: Iterable[Measurement[ObservationEvent]],
     ) -> Truth:
-        """Gather poses and landmarks of any order.
-
-        ``base_in`` has the pose (4, 4) of the robot's base in each other frame whose poses these
-        are.
-        """
+        """Gather poses and landmarks of any order; ``base_in`` is of :func:`base_in_frames`."""
         stamps_ns = np.array([message.stamp_ns for message in poses], dtype=np.int64)
         stamps_ns, order = np.unique(stamps_ns, return_index=True)
         bases = np.array([base_in.get(message.child_frame_id, _AT_BASE) for message in poses])
@@ -132,22 +114,22 @@ class Truth:
         return replace(self, tracks=self.tracks.flattened(height_m))
 
 
-def _told_at(
+def _positions_by_stamp(
     messages: Iterable[Measurement[ObservationEvent]],
 ) -> Iterator[tuple[int, _Positions]]:
-    """Yield what all messages of a stamp tell together, in the order of the stamps."""
+    """Yield what all messages of a stamp hold together, in the order of the stamps."""
     by_stamp = attrgetter('stamp_ns')
     events = sorted((message.event for message in messages), key=by_stamp)
     for stamp_ns, together in groupby(events, key=by_stamp):
-        told: _Positions = {}
+        positions: _Positions = {}
         for event in together:
             points = map(tuple, event.points.tolist())
-            told |= zip(event.ids.tolist(), points, strict=True)
-        told.pop(UNKNOWN_ID, None)
-        yield stamp_ns, told
+            positions |= zip(event.ids.tolist(), points, strict=True)
+        positions.pop(UNKNOWN_ID, None)
+        yield stamp_ns, positions
 
 
-def frames_beside(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
+def other_frames(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
     """Return the frames of poses that say whose they are, and are not those of the base."""
     known = ('', base_frame.lstrip('/'))
     frames = {message.child_frame_id for message in poses}
@@ -157,10 +139,7 @@ def frames_beside(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
 def base_in_frames(
     frames: Collection[str], base_frame: str, transforms: TransformSource
 ) -> dict[str, FloatArray]:
-    """Return the pose (4, 4) of the base frame in each of ``frames``, by name.
-
-    Identity, with a warning, where ``transforms`` don't have both.
-    """
+    """Return the pose (4, 4) of the base in each frame: identity, with a warning, if unknown."""
     base_in = dict.fromkeys(frames, np.eye(4))
     for frame in frames:
         try:
@@ -168,7 +147,7 @@ def base_in_frames(
         except TransformError as error:
             logger.warning(
                 "The true poses are of '%s', and the estimated ones of '%s': they are compared "
-                'as if that were one place (%s).',
+                'as if that were one frame (%s).',
                 frame,
                 base_frame,
                 error,

@@ -22,17 +22,7 @@ from slam_observer_ros.messages.cdr import Buffer
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic of a recording.
-
-    Attributes
-    ----------
-    name : str
-    message_type : str
-        As ROS 2 writes it, for example ``geometry_msgs/msg/Twist``; ROS 1 types too.
-    count : int
-        Number of messages.
-
-    """
+    """One topic, its type as ROS 2 names it (ROS 1 types, too), and its number of messages."""
 
     name: str
     message_type: str
@@ -56,15 +46,7 @@ class RawMessage(NamedTuple):
 
 
 class MessageSource(Protocol):
-    """An open recording, whatever its format.
-
-    Attributes
-    ----------
-    topics : tuple of Topic
-    start_ns, end_ns : int
-        Receive times of the first and the last message.
-
-    """
+    """An open recording, whatever its format; it was received from ``start_ns`` to ``end_ns``."""
 
     topics: tuple[Topic, ...]
     start_ns: int
@@ -80,16 +62,7 @@ class MessageSource(Protocol):
 class BagSource:
     """A whole MCAP file, rosbag2 (directory or bare .db3) or ROS 1 .bag.
 
-    Parameters
-    ----------
-    path : Path
-        The file or directory.
-
-    Raises
-    ------
-    RecordingError
-        If rosbags can't read it.
-
+    Raises a RecordingError if rosbags can't read it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -135,20 +108,8 @@ class BagSource:
 class SalvagedMcap:
     """What is whole in a truncated MCAP file: all chunks, or bare messages, before the damage.
 
-    Whole files that rosbags refuses, as those that hold other than ROS messages, are read, too.
-
-    Parameters
-    ----------
-    path : Path
-        The .mcap file.
-
-    Attributes
-    ----------
-    is_whole : bool
-        Whether it could be read to its end.
-    other_encodings : dict of int to str
-        How the messages of those channels are encoded that are left out, as they are no CDR.
-
+    Whole files that rosbags refuses, as those that hold other than ROS messages, are read, too:
+    ``other_encodings`` are those of the channels that are left out, as they are no CDR.
     """
 
     def __init__(self, path: Path) -> None:
@@ -202,14 +163,7 @@ class SalvagedMcap:
 
 
 class SplitSource:
-    """Several files that one recording was split into.
-
-    Parameters
-    ----------
-    parts : sequence of MessageSource
-        The open files.
-
-    """
+    """The open files that one recording was split into."""
 
     def __init__(self, parts: Sequence[MessageSource]) -> None:
         self._parts = sorted(parts, key=lambda part: part.start_ns)

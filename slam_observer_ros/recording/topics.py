@@ -33,14 +33,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class TopicNames:
-    """Names that the user gives; None where the topic is to be found.
-
-    Attributes
-    ----------
-    velocity, landmarks, pose_truth, landmark_truth, imu : str or None
-        Topic names, with or without leading slash.
-
-    """
+    """Names that the user gives, with or without leading slash; None for topics to be found."""
 
     velocity: str | None = None
     landmarks: str | None = None
@@ -51,19 +44,9 @@ class TopicNames:
 
 @dataclass(frozen=True, slots=True)
 class SelectedTopics:
-    """The topics of a replay.
+    """The topics of a replay: of measurements, of the truth, and of what places the sensors.
 
-    Attributes
-    ----------
-    velocity, landmarks : Topic
-        What the estimator takes in.
-    pose_truth, landmark_truth : Topic or None
-        What its estimate is compared with, where the recording has it.
-    transforms : TransformTopics
-        What places the sensors.
-    imu : Topic or None
-        Where the angular velocity comes from; None if it comes with the velocity.
-
+    Truth that is not recorded is None, and so is ``imu``, unless the angular velocity is its.
     """
 
     velocity: Topic
@@ -104,74 +87,77 @@ def select_topics(
     topics: Sequence[Topic],
     names: TopicNames,
     inputs: InputSettings,
-    identifies: Callable[[Topic], bool],
+    has_ids: Callable[[Topic], bool],
     pose_frame: Callable[[Topic], str],
 ) -> SelectedTopics:
     """Pick one topic for each purpose.
 
+    Raises a RecordingError if none fits or two do: it lists them, and the option that decides.
+
     Parameters
     ----------
-    topics : sequence of Topic
-        All topics of a recording.
-    names : TopicNames
-        What the user chose; any topic of a fitting type is allowed.
-    inputs : InputSettings
-        What of the velocities is used, whether an Imu is, and of which type landmarks are.
-    identifies : callable
-        Tells whether the points of a PointCloud or PointCloud2 topic have ids. Clouds without
-        them, such as a lidar's, are taken only if they are chosen by name or by their type, or
-        are called ``landmarks``.
+    topics, names, inputs
+        All topics of a recording, those that the user chose, and what of them is used.
+    has_ids : callable
+        Whether the points of a cloud have ids. Clouds without them, such as a lidar's, are taken
+        only if they are chosen by name or by their type, or are called ``landmarks``.
     pose_frame : callable
-        Tells the frame of an odometry's poses. Where it is that of the map, the velocity is an
-        estimate, as an observer's own, and taken only if there is no other.
-
-    Raises
-    ------
-    RecordingError
-        If no topic fits, or two do; it lists them, and names the option that decides.
+        The frame of an odometry's poses. Where it is that of the map, the velocity is an estimate,
+        as an observer's own, and taken only if there is no other.
 
     """
     used = [topic for topic in topics if topic.count > 0]
+    choice = _Choice(topics, used, inputs.map_frame, has_ids, pose_frame)
+    is_of_poses = inputs.velocity_source == POSE_DIFFERENCES
+    velocity = choice.require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity)
+    landmarks = choice.require(*_landmark_choice(names.landmarks, inputs.landmarks_type))
+    selected = SelectedTopics(
+        velocity,
+        landmarks,
+        choice.pick(_POSE_TRUTH, names.pose_truth),
+        choice.pick(_LANDMARK_TRUTH, names.landmark_truth),
+        transform_topics(topics, (velocity, landmarks)),
+        choice.require(_IMU, names.imu) if inputs.use_imu else None,
+    )
+    if selected.pose_truth is None:
+        _warn_of_unread_truth(used)
+    return selected
 
-    def fits(topic: Topic, role: _Role) -> bool:
-        if not role.is_truth and last_part(topic.name) == 'landmarks':
-            return topic.message_type in role.all_types
-        if topic.message_type not in role.message_types:
-            return False
-        return topic.message_type not in CLOUD_DECODERS or identifies(topic)
 
-    def is_estimate(topic: Topic) -> bool:
-        return topic.message_type == ODOMETRY and pose_frame(topic) == inputs.map_frame
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """The topics of a recording, those of them that have messages, and what to choose them by."""
 
-    def pick(role: _Role, name: str | None) -> Topic | None:
+    topics: Sequence[Topic]
+    used: Sequence[Topic]
+    map_frame: str
+    has_ids: Callable[[Topic], bool]
+    pose_frame: Callable[[Topic], str]
+
+    def require(self, role: _Role, name: str | None) -> Topic:
+        return _required(self.pick(role, name), role, self.used)
+
+    def pick(self, role: _Role, name: str | None) -> Topic | None:
         if name is not None:
-            return _named(topics, role, name)
-        right = [topic for topic in used if _is_truth(topic.name) == role.is_truth]
-        fitting = [topic for topic in right if fits(topic, role)]
+            return _named(self.topics, role, name)
+        right = [topic for topic in self.used if _is_truth(topic.name) == role.is_truth]
+        fitting = [topic for topic in right if self._fits(topic, role)]
         if len(fitting) > 1 and not role.is_truth:
-            fitting = [topic for topic in fitting if not is_estimate(topic)] or fitting
+            fitting = [topic for topic in fitting if not self._is_estimate(topic)] or fitting
         found = _best(fitting, role)
         if found is None and role.is_typed:
             return _best([t for t in right if t.message_type in role.message_types], role)
         return found
 
-    def require(role: _Role, name: str | None) -> Topic:
-        return _required(pick(role, name), role, used)
+    def _fits(self, topic: Topic, role: _Role) -> bool:
+        if not role.is_truth and last_part(topic.name) == 'landmarks':
+            return topic.message_type in role.all_types
+        if topic.message_type not in role.message_types:
+            return False
+        return topic.message_type not in CLOUD_DECODERS or self.has_ids(topic)
 
-    is_of_poses = inputs.velocity_source == POSE_DIFFERENCES
-    velocity = require(_ODOMETRY if is_of_poses else _VELOCITY, names.velocity)
-    landmarks = require(*_landmark_choice(names.landmarks, inputs.landmarks_type))
-    selected = SelectedTopics(
-        velocity,
-        landmarks,
-        pick(_POSE_TRUTH, names.pose_truth),
-        pick(_LANDMARK_TRUTH, names.landmark_truth),
-        transform_topics(topics, (velocity, landmarks)),
-        require(_IMU, names.imu) if inputs.use_imu else None,
-    )
-    if selected.pose_truth is None:
-        _warn_of_unread_truth(used)
-    return selected
+    def _is_estimate(self, topic: Topic) -> bool:
+        return topic.message_type == ODOMETRY and self.pose_frame(topic) == self.map_frame
 
 
 def _warn_of_unread_truth(topics: Sequence[Topic]) -> None:

@@ -15,14 +15,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class TransformTopics:
-    """The topics that place the sensors; each one topic, or none.
-
-    Attributes
-    ----------
-    static, moving : tuple of Topic
-        /tf_static and /tf, or those of a namespace.
-
-    """
+    """/tf_static and /tf, or those of a namespace: each one topic, or none."""
 
     static: tuple[Topic, ...]
     moving: tuple[Topic, ...]
@@ -34,14 +27,6 @@ def transform_topics(topics: Sequence[Topic], inputs: Sequence[Topic]) -> Transf
     Robots in namespaces may each have their own, with the same names of frames. Those of the
     namespace that the inputs share come first, then those further out, /tf at last. Where none
     of these is recorded, those of another namespace are taken if there is only one.
-
-    Parameters
-    ----------
-    topics : sequence of Topic
-        All topics of a recording.
-    inputs : sequence of Topic
-        Those of velocities and landmarks.
-
     """
     trees = [
         topic

@@ -55,20 +55,10 @@ _LATCHED = Qos(
 
 
 class RecordingWriter:
-    """Writes messages to a file that appears, whole, when the ``with`` block ends without error.
+    """Writes messages to a .mcap file that appears, whole, when the ``with`` block ends.
 
-    Parameters
-    ----------
-    path : Path or str
-        The .mcap file to be made, in an existing directory.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    RecordingError
-        If the file exists, isn't named .mcap, or can't be written.
-
+    After an error in the block there is none. Raises a RecordingError if the file exists and may
+    not be replaced, isn't named .mcap, or can't be written, as on a full disk.
     """
 
     def __init__(self, path: Path | str, overwrite: bool = False) -> None:
@@ -136,26 +126,10 @@ class RecordingWriter:
         receive_stamp_ns: int,
         latched: bool = False,
     ) -> None:
-        """Write a serialised message.
+        """Write a message of a type such as ``geometry_msgs/msg/Twist`` from its CDR bytes.
 
-        Parameters
-        ----------
-        topic : str
-            Name with its leading slash.
-        message_type : str
-            For example ``geometry_msgs/msg/Twist``.
-        data : Buffer
-            CDR bytes, as a raw subscription gives them.
-        receive_stamp_ns : int
-            Time of reception, nanoseconds; messages play in this order.
-        latched : bool
-            Whether players shall keep the message for late subscribers.
-
-        Raises
-        ------
-        RecordingError
-            If the file can't be written, as on a full disk.
-
+        Messages play in the order of their receive stamps, nanoseconds; players keep latched ones
+        for late subscribers.
         """
         key = (topic, message_type)
         if key not in self._connections:
@@ -186,16 +160,7 @@ class RecordingWriter:
         frame_id: str = BASE_FRAME,
         receive_stamp_ns: int | None = None,
     ) -> None:
-        """Write a TwistStamped; it has no place for a covariance.
-
-        Parameters
-        ----------
-        event : VelocityEvent
-        topic, frame_id : str
-        receive_stamp_ns : int or None
-            Time of reception if it isn't the event's stamp.
-
-        """
+        """Write a TwistStamped, received at its stamp by default; it can hold no covariance."""
         message = self._messages.twist_stamped(event.stamp_ns, frame_id, event.body_velocity)
         self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
@@ -206,16 +171,7 @@ class RecordingWriter:
         frame_id: str = BASE_FRAME,
         receive_stamp_ns: int | None = None,
     ) -> None:
-        """Write a PointCloud2 with ids, and covariances and velocities if the event has them.
-
-        Parameters
-        ----------
-        event : ObservationEvent
-        topic, frame_id : str
-        receive_stamp_ns : int or None
-            Time of reception if it isn't the event's stamp.
-
-        """
+        """Write a PointCloud2 with ids, and covariances and velocities if the event has them."""
         message = self._messages.point_cloud2(
             event.stamp_ns,
             frame_id,

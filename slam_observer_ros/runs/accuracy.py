@@ -26,24 +26,11 @@ logger = logging.getLogger(__name__)
 class Accuracy:
     """Errors of a replay; None where the truth that it takes is not in the recording.
 
-    Attributes
-    ----------
-    pose_errors : TrajectoryErrors or None
-        Of the online trajectory, after one rigid alignment.
-    dead_reckoning_errors : TrajectoryErrors or None
-        The same of the velocities alone.
-    landmark_rmse_m : float or None
-        Of the final map, after a rigid alignment of its own, metres.
-    configuration_rmse_m : float or None
-        See :class:`ConfigurationError`, metres.
-    anees : float or None
-        Of the pose, per degree of freedom; None where the gains know no covariance, too, and
-        where no pose is certain to which the truth could be moved: in a known map, or if the
-        truth begins too late.
-    configuration_anees : float or None
-        Of the map as the robot sees it, jointly, per degree of freedom: it needs no pose that is
-        certain. None where the gains know no joint covariance.
-
+    Poses, those of the velocities alone and the map are each compared after one rigid alignment of
+    their own; the configuration (:class:`.ConfigurationError`) takes none. ``anees`` of the pose
+    is also None where the gains know no covariance, and where no pose is certain to which the
+    truth could be moved: in a known map, or if the truth begins too late. ``configuration_anees``
+    needs no certain pose, but a joint covariance.
     """
 
     pose_errors: TrajectoryErrors | None
@@ -70,16 +57,7 @@ def measure(result: Replay, truth: Truth) -> Accuracy:
 def measure_smoothed(
     smoothed: Smoothed, truth: Truth
 ) -> tuple[TrajectoryErrors | None, float | None]:
-    """Compare what was smoothed with the truth.
-
-    Returns
-    -------
-    pose_errors : TrajectoryErrors or None
-        Of the poses at the observations, after one rigid alignment.
-    landmark_rmse_m : float or None
-        Of the map, after a rigid alignment of its own, metres.
-
-    """
+    """Return errors of the smoothed poses and of the map, as :class:`Accuracy` has them."""
     pose_truth = Trajectory(truth.stamps_ns, truth.poses)
     return (
         _pose_errors('smoothed trajectory', trajectory_of(smoothed), pose_truth),
@@ -108,7 +86,7 @@ def _anees(result: Replay, truth: Trajectory) -> float | None:
     try:
         return anchored_average_nees(result.trajectory, result.pose_covariances, truth)
     except EvaluationError as error:
-        logger.warning('No ANEES is told: %s', error)
+        logger.warning('The ANEES is not known: %s', error)
         return None
 
 

@@ -1,8 +1,8 @@
 """Events of a recording through the estimator.
 
 What is measured is the *online* estimate: the pose as it was known at each moment, from the events
-received until then, never corrected in hindsight. The trajectory is sampled at the stamps of
-velocities and observations alike, so that stretches in which nothing is seen count too.
+received until then, never smoothed. The trajectory is sampled at the stamps of velocities and
+observations alike, so that stretches in which nothing is seen count too.
 """
 
 from __future__ import annotations
@@ -35,39 +35,28 @@ NEES_PERIOD_NS = 5_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What came of a replay; since its last start, if the clock jumped and all started again.
+    """What came of a replay; since the last reset, if the clock jumped.
 
     Attributes
     ----------
     estimator : Estimator
         In its final state, with the map and the events dropped.
-    trajectory : Trajectory
-        (k) poses of the online estimate.
-    pose_covariances : FloatArray or None
-        (k, 6, 6) their covariances, as :attr:`Estimator.pose_covariance` gives them; None
-        without truth to compare their errors with.
+    trajectory, pose_covariances : Trajectory, FloatArray or None
+        k poses of the online estimate, and (k, 6, 6) :attr:`.Estimator.pose_covariance` of each;
+        None without truth to compare their errors with.
     dead_reckoning : Trajectory
         What the velocities alone give, from the identity pose.
     configuration : ConfigurationError
         Gauge-free error after each observation; empty without truth.
-    residual_stamps_ns : IntArray
-        (m,) stamp of each residual, nanoseconds.
-    residuals : FloatArray
-        (m, 3) residuals of the landmarks seen, metres.
-    rejected : BoolArray
-        (m,) which of them were too large to be used.
-    events : int
-        Events taken in, dropped ones included.
+    residual_stamps_ns, residuals, rejected : (m,), (m, 3), (m,)
+        Residuals of the landmarks seen, metres, and which were too large to be used.
     seconds : float
         CPU time of the estimator alone, without reading and measuring.
-    in_known_map : bool
-        Whether the poses are in the frame of a map that was known in advance.
     start_ns : int
         Stamp of the first event that was used, nanoseconds; 0 if none was.
-    observations : int
-        Observations of which points were used, also before the last start.
-    angular_velocities : int
-        Angular velocities of an Imu that were taken in, also before the last start.
+    events, observations, angular_velocities : int
+        Events, dropped ones included; observations of which points were used; angular velocities
+        of an Imu that were taken in: all of them also before the last reset.
 
     """
 
@@ -87,8 +76,8 @@ class Replay:
     angular_velocities: int
 
     @property
-    def restarts(self) -> int:
-        """How often all started again after a jump of the clock."""
+    def resets(self) -> int:
+        """How often the estimator was reset by a jump of the clock."""
         resets = self.estimator.settings.on_time_jump == 'reset'
         return self.estimator.jumps if resets else 0
 
@@ -105,26 +94,17 @@ def replay(
 ) -> Replay:
     """Run events through an estimator, from where the settings say or anywhere in a known map.
 
-    Parameters
-    ----------
-    events : iterable of Event
-        In the order in which they were received.
-    settings : Settings
-        Settings of the estimator.
-    truth : Truth, optional
-        What the configuration error is measured against.
-    landmark_map : LandmarkMap, optional
-        Landmarks known in advance.
-
+    The events are in the order in which they were received; the truth is what the configuration
+    error is measured against.
     """
-    run = _Run(settings, truth, landmark_map)
+    run = _RunningReplay(settings, truth, landmark_map)
     for event in events:
         run.add(event)
     return run.finish()
 
 
-class _Run:
-    """A replay under way: keeps what the metrics need, and the estimator's time apart from it."""
+class _RunningReplay:
+    """Keeps what the metrics need, and the estimator's time apart from it."""
 
     def __init__(
         self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
@@ -146,9 +126,9 @@ class _Run:
         self._observations = self._used_points = self._angular_velocities = 0
         self._events = 0
         self._seconds = 0.0
-        self._start()
+        self._clear_figures()
 
-    def _start(self) -> None:
+    def _clear_figures(self) -> None:
         has_truth = self._pose_truth is not None and len(self._pose_truth.poses) > 0
         self._sampler = TrajectorySampler(self._estimator, with_covariances=has_truth)
         self._dead_reckoning = DeadReckoning()
@@ -190,7 +170,7 @@ class _Run:
         )
 
     def _untimed(self, callback: Callable[P, None]) -> Callable[P, None]:
-        """Return what the estimator may call without its time being the estimator's."""
+        """Return a callback whose time is not counted as the estimator's."""
 
         def call(*args: P.args, **kwargs: P.kwargs) -> None:
             start_s = time.thread_time()
@@ -209,37 +189,37 @@ class _Run:
 
     def _on_update(self, update: Update) -> None:
         self._updates.append(update)
-        self._note_observation()
-        self._compare(update)
+        self._count_observation()
+        self._compare_with_truth(update)
 
     def _on_jump(self) -> None:
         self._next_nees_ns = 0
         if self._settings.on_time_jump == 'reset':
-            self._start()
+            self._clear_figures()
 
-    def _note_observation(self) -> None:
-        """Count an observation, if points of it were used."""
+    def _count_observation(self) -> None:
         used = used_points(self._estimator.counts)
         self._observations += used > self._used_points
         self._used_points = used
 
-    def _compare(self, update: Update) -> None:
+    def _compare_with_truth(self, update: Update) -> None:
         if self._pose_truth is None or self._landmark_tracks is None:
             return
         true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
-        if covered[0]:
-            ids = self._estimator.landmark_ids
-            has_errors = len(ids) > 0 and not self._in_fixed_map
-            is_due = has_errors and update.stamp_ns >= self._next_nees_ns
-            if is_due:
-                self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
-            self._configuration.add(
-                update.stamp_ns,
-                update.pose,
-                ids,
-                self._estimator.world_points,
-                true_poses[0],
-                self._landmark_tracks.at(update.stamp_ns),
-                self._estimator.configuration_covariance if is_due else None,
-                update.ids[~update.rejected],
-            )
+        if not covered[0]:
+            return
+        ids = self._estimator.landmark_ids
+        has_errors = len(ids) > 0 and not self._in_fixed_map
+        is_nees_due = has_errors and update.stamp_ns >= self._next_nees_ns
+        if is_nees_due:
+            self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
+        self._configuration.add(
+            update.stamp_ns,
+            update.pose,
+            ids,
+            self._estimator.world_points,
+            true_poses[0],
+            self._landmark_tracks.at(update.stamp_ns),
+            self._estimator.configuration_covariance if is_nees_due else None,
+            update.ids[~update.rejected],
+        )

@@ -12,22 +12,22 @@ from slam_observer_ros.geometry import paths, se3, so3
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 
 SAMPLE_PERIOD_NS = 50_000_000
-"""Least time between two poses of a sampled trajectory: 20 Hz at most."""
+"""Least time between two poses of a sampled trajectory."""
 
 
-class Samples:
-    """Poses with their stamps, none less than a period after the one before."""
+class PoseSamples:
+    """Poses (4, 4) with their stamps, none less than a period after the one before."""
 
     def __init__(self) -> None:
         self.stamps_ns: list[int] = []
         self._poses: list[FloatArray] = []
 
-    def lack(self, stamp_ns: int) -> bool:
+    def is_due(self, stamp_ns: int) -> bool:
         """Return whether a pose of that stamp is to be added."""
         return not self.stamps_ns or not 0 <= stamp_ns - self.stamps_ns[-1] < SAMPLE_PERIOD_NS
 
     def add(self, stamp_ns: int, pose: FloatArray) -> None:
-        """Append a pose (4, 4)."""
+        """Append a pose."""
         self.stamps_ns.append(stamp_ns)
         self._poses.append(pose)
 
@@ -38,35 +38,25 @@ class Samples:
 
 
 class TrajectorySampler:
-    """Collects the poses that an estimator passes through.
-
-    Parameters
-    ----------
-    estimator : Estimator
-        What is watched.
-    with_covariances : bool
-        Whether to collect their covariances, too, which take longer to compute.
-
-    """
+    """Collects the poses that an estimator passes through, and if asked their covariances."""
 
     def __init__(self, estimator: Estimator, with_covariances: bool) -> None:
         self._estimator = estimator
         self._with_covariances = with_covariances
-        self._samples = Samples()
+        self._samples = PoseSamples()
         self._covariances: list[FloatArray] = []
 
     def sample(self) -> None:
-        """Keep the present pose, unless the one kept last is less than a period older.
-
-        Poses that are not yet in the frame of a map that was loaded are not kept.
-        """
+        """Keep the present pose, if it is due and in the frame of the map that was loaded."""
         stamp_ns = self._estimator.stamp_ns
         if stamp_ns is None or not self._estimator.is_localised:
             return
-        if not self._samples.lack(stamp_ns):
+        if not self._samples.is_due(stamp_ns):
             return
         self._samples.add(stamp_ns, self._estimator.pose)
-        covariance = self._estimator.pose_covariance if self._with_covariances else None
+        if not self._with_covariances:  # they take longer to compute
+            return
+        covariance = self._estimator.pose_covariance
         if covariance is not None:
             self._covariances.append(covariance)
 
@@ -85,14 +75,14 @@ class TrajectorySampler:
 
 
 class DeadReckoning:
-    """Collects the poses that the velocities alone lead through, from the first one on."""
+    """Collects the poses that the velocities alone lead through, from the identity on."""
 
     def __init__(self) -> None:
         self._pose = np.eye(4)
-        self._samples = Samples()
+        self._samples = PoseSamples()
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
-        """Move on from stamp to stamp, nanoseconds."""
+        """Move on from one stamp to another, nanoseconds."""
         held = velocities.held(start_ns, end_ns)
         if not (self._samples.stamps_ns or held.dt_s.any()):
             return
@@ -100,7 +90,7 @@ class DeadReckoning:
         elapsed_s = np.append(0.0, np.cumsum(held.dt_s + held.gap_s))
         stamps_ns = start_ns + np.rint(elapsed_s * NANOSECONDS_PER_SECOND).astype(np.int64)
         for stamp_ns, pose in zip(stamps_ns.tolist(), path, strict=True):
-            if self._samples.lack(stamp_ns):
+            if self._samples.is_due(stamp_ns):
                 self._samples.add(stamp_ns, pose.copy())
         self._pose = se3.pose(so3.normalise(path[-1, :3, :3]), path[-1, :3, 3])
 

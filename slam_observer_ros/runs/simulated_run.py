@@ -14,7 +14,7 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.observer.innovation import lyapunov
-from slam_observer_ros.runs.sampling import SAMPLE_PERIOD_NS
+from slam_observer_ros.runs.sampling import PoseSamples
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import SimulatedEvent, Simulation
 
@@ -29,19 +29,10 @@ ROUNDING_MARGIN = 1e6
 class SimulatedRun:
     """What came of a simulated run.
 
-    Attributes
-    ----------
-    times_s : FloatArray
-        (k,) times of the observations of known landmarks, seconds from the start.
-    lyapunov : FloatArray
-        (k,) L (34) at these times, before the correction.
-    slope_per_s : float or None
-        See :func:`fit_slope`.
-    estimate, truth : Trajectory
-        Poses at the same p stamps.
-    landmark_tracks : FloatArray
-        (p, n, 3) estimated landmarks at these stamps, metres; NaN before the first sighting.
-
+    ``lyapunov`` (k,) is L (34) before each correction; ``times_s`` (k,) are since the start. The
+    ``slope_per_s`` is that of :func:`fit_slope`. The poses ``estimate`` and ``truth`` have the
+    same p stamps, and so have ``landmark_tracks`` (p, n, 3) of the estimate, in its world, metres;
+    they are NaN before the first sighting.
     """
 
     times_s: FloatArray
@@ -60,19 +51,8 @@ class SimulatedRun:
 def run_simulation(
     simulation: Simulation, events: Iterable[SimulatedEvent], settings: Settings
 ) -> SimulatedRun:
-    """Run a simulation's events through an estimator, from where the settings say.
-
-    Parameters
-    ----------
-    simulation : Simulation
-        Where the events come from; it has the truth.
-    events : iterable of VelocityEvent, ObservationEvent or PoseTruth
-        What it delivers, in that order.
-    settings : Settings
-        Settings of the estimator.
-
-    """
-    run = _Run(simulation, settings)
+    """Run events, as a simulation delivers them, through an estimator with these settings."""
+    run = _RunningSimulation(simulation, settings)
     for event in events:
         if not isinstance(event, PoseTruth):
             run.estimator.add(event)
@@ -83,23 +63,9 @@ def run_simulation(
 def fit_slope(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> float | None:
     """Fit the slope of log10 L over time, after the transient and before rounding is felt.
 
-    What counts is the time until L first falls below ``floor``, or all of it; the transient is
-    taken to be over at half of that.
-
-    Parameters
-    ----------
-    times_s : FloatArray
-        (k,) times, seconds.
-    lyapunov : FloatArray
-        (k,) values of L.
-    floor : float
-        L below which rounding is felt.
-
-    Returns
-    -------
-    float or None
-        Decades per second; None if there are fewer than two values to fit.
-
+    L (k,) at ``times_s`` (k,) counts until it first falls below ``floor``, where rounding is felt;
+    the transient is taken to be over at half of that time. Returns decades per second, or None
+    if there are fewer than two values to fit.
     """
     below = np.flatnonzero(lyapunov <= floor)
     end = int(below[0]) if len(below) else len(lyapunov)
@@ -109,39 +75,37 @@ def fit_slope(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> float 
     return float(np.polyfit(times_s[fitted], np.log10(lyapunov[fitted]), 1)[0])
 
 
-class _Run:
+class _RunningSimulation:
     """Keeps L of every update and, at most 20 times a second, the configuration."""
 
     def __init__(self, simulation: Simulation, settings: Settings) -> None:
         self.estimator = Estimator(settings, on_update=self._on_update)
         self._simulation = simulation
         self._lyapunov: dict[int, float] = {}
-        self._poses: dict[int, FloatArray] = {}
-        self._points: list[FloatArray] = []
-        self._sampled_ns = -SAMPLE_PERIOD_NS
+        self._samples = PoseSamples()
+        self._landmark_tracks: list[FloatArray] = []
 
     def _on_update(self, update: Update) -> None:
         if len(update.ids):
             self._lyapunov[update.stamp_ns] = update.lyapunov
-        if update.stamp_ns - self._sampled_ns < SAMPLE_PERIOD_NS:
+        if not self._samples.is_due(update.stamp_ns):
             return
-        self._sampled_ns = update.stamp_ns
+        self._samples.add(update.stamp_ns, update.pose)
         points = np.full((len(self._simulation.landmark_ids), 3), np.nan)
         points[self.estimator.landmark_ids] = self.estimator.world_points
-        self._poses[update.stamp_ns] = update.pose
-        self._points.append(points)
+        self._landmark_tracks.append(points)
 
     def result(self) -> SimulatedRun:
-        stamps_ns = np.array(list(self._poses), dtype=np.int64)
+        estimate = self._samples.trajectory
         times_s = to_s(np.array(list(self._lyapunov)) - self._simulation.start_ns)
         levels = np.array(list(self._lyapunov.values()))
         return SimulatedRun(
             times_s,
             levels,
             fit_slope(times_s, levels, ROUNDING_MARGIN * self._rounding()),
-            Trajectory(stamps_ns, np.array(list(self._poses.values()))),
-            Trajectory(stamps_ns, self._simulation.pose(stamps_ns)),
-            np.array(self._points),
+            estimate,
+            Trajectory(estimate.stamps_ns, self._simulation.pose(estimate.stamps_ns)),
+            np.array(self._landmark_tracks),
         )
 
     def _rounding(self) -> float:

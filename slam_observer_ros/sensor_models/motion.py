@@ -27,13 +27,13 @@ class Motion:
     @cached_property
     def noise(self) -> FloatArray:
         """(p, p) Σ Ad_Â Q Ad_Âᵀ, what the motion adds to the covariance of ε."""
-        return paths.summed_noise(self._Ad, self.covariances)
+        return paths.summed_noise(self._adjoints, self.covariances)
 
     @cached_property
     def sensitivity(self) -> FloatArray:
         """(p, c) F, how ε grows with the errors of the calibration."""
         return self.calibration.sensitivity(
-            self._Ad, self.measured_velocities, self.dt_s, self.at_ends
+            self._adjoints, self.measured_velocities, self.dt_s, self.at_ends
         )
 
     @cached_property
@@ -42,6 +42,6 @@ class Motion:
         return self.calibration.drift_covariance * self.duration_s
 
     @cached_property
-    def _Ad(self) -> FloatArray:
+    def _adjoints(self) -> FloatArray:
         """(k + 1, p, 6) the estimated rows of Ad_Â along the path."""
         return se3.adjoint(self.path)[:, self.calibration.axes.pose]

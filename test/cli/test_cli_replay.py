@@ -1,4 +1,4 @@
-"""``slam-observer replay`` and ``convert``: recordings of every kind, and what they tell."""
+"""``slam-observer replay`` and ``convert``: recordings of every kind, and what they hold."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class TestReport:
         }  # fmt: skip
         assert 'no truth to compare with' in slam_observer('replay', path).output
 
-    def test_with_a_truth_all_that_can_be_known_is_told(self, slam_observer, simulated):
+    def test_with_a_truth_all_that_can_be_known_is_reported(self, slam_observer, simulated):
         report = slam_observer.succeed('replay', simulated, '--smooth', '--json').json
         unknown = {key for key, value in report.items() if value is None}
         assert unknown == {'localised_after_s', 'imu_topic', 'unaligned_rmse_m'}
@@ -148,13 +148,13 @@ class TestReport:
         report = slam_observer('replay', path, '--json').json
         assert report['configuration_rmse_m'] < 0.02
 
-    def test_the_share_of_the_trajectory_that_the_truth_covers_is_told(
+    def test_the_share_of_the_trajectory_that_the_truth_covers_is_reported(
         self, slam_observer, tmp_path
     ):
         half = recordings.true_poses()[:50]
         path = write_events(tmp_path / 'half.mcap', recordings.events(), half)
-        told = slam_observer('replay', path).output
-        assert re.search(r'truth +│ covers (49|50)\.\d % of the trajectory', told)
+        output = slam_observer('replay', path).output
+        assert re.search(r'truth +│ covers (49|50)\.\d % of the trajectory', output)
 
     def test_truth_at_another_time_is_no_truth(self, slam_observer, tmp_path):
         early = [
@@ -199,7 +199,7 @@ class TestReport:
         for text in ('/twist', '/landmarks', '502 over 5.0 s', '(ATE)', 'not aligned'):
             assert text in output
 
-    def test_the_velocitys_calibration_is_told_with_its_uncertainty(
+    def test_the_velocitys_calibration_is_reported_with_its_uncertainty(
         self, slam_observer, simulated
     ):
         options = ('--set', 'velocity_delay_error=0.1', '--set', 'angular_bias_error=[0, 0, 0.1]')
@@ -209,7 +209,7 @@ class TestReport:
         bias, delay = calibration['angular_bias_z'], calibration['velocity_delay']
         assert abs(bias['value']) < 3.0 * bias['deviation'] < 0.3
         assert bias['unit'] == 'rad/s'
-        assert delay['deviation'] == pytest.approx(0.1)  # a circle at constant speed does not tell
+        assert delay['deviation'] == pytest.approx(0.1)  # a circle at constant speed does not show
         output = slam_observer.succeed('replay', simulated, *options).output
         assert 'velocity_delay' in output
         assert '±' in output
@@ -232,7 +232,7 @@ class TestReport:
         assert 'sensor_msgs/msg/PointCloud2' in values
         assert '…' not in values
 
-    def test_without_an_unknown_calibration_none_is_told(self, slam_observer, simulated):
+    def test_without_an_unknown_calibration_none_is_reported(self, slam_observer, simulated):
         assert slam_observer.succeed('replay', simulated, '--json').json['calibration'] == {}
 
 
@@ -276,7 +276,7 @@ class TestPoints:
         output = slam_observer('replay', path, *options).output
         row = r'slips +│ \d+ × the robot was not where odometry had it'
         if not has_ids:
-            row = r'strange places +│ \d+ × nothing seen was where the map has it'
+            row = r'unexpected places +│ \d+ × nothing seen was where the map has it'
         assert re.search(row, output)
 
     def test_gains_that_use_no_point_without_id_say_so(self, slam_observer, tmp_path):
@@ -317,9 +317,9 @@ def test_landmarks_without_ids_are_named(slam_observer, tmp_path, message, note)
         writer.write_velocity(VelocityEvent(ros.STAMP_NS, np.zeros(6)))
         writer.write('/landmarks', message.__msgtype__, ros.serialise(message), ros.STAMP_NS)
     cells = [line.split('│') for line in slam_observer.succeed('replay', path).output.split('\n')]
-    told = ' '.join(' '.join(cell[2] for cell in cells if len(cell) > 2).split())
-    assert note in told.partition('events')[0] + ' '
-    assert ('without ids' in told) == ('without ids' in note)
+    cells_text = ' '.join(' '.join(cell[2] for cell in cells if len(cell) > 2).split())
+    assert note in cells_text.partition('events')[0] + ' '
+    assert ('without ids' in cells_text) == ('without ids' in note)
 
 
 def test_in_the_plane_the_height_of_landmarks_is_no_error(slam_observer, tmp_path):
@@ -347,7 +347,7 @@ class TestOutputs:
             'map.png', 'errors.png', 'residuals.png'
         }  # fmt: skip
 
-    def test_map_tells_what_the_gains_know_of_its_accuracy(
+    def test_map_states_what_the_gains_know_of_its_accuracy(
         self, slam_observer, simulated, tmp_path
     ):
         for gains in ('constant', 'riccati'):
@@ -469,7 +469,7 @@ class TestOutputs:
         assert (tmp_path / 'map.png').exists()
 
     @pytest.mark.parametrize('option', ['--tum', '--map', '--plot'])
-    def test_where_nothing_may_be_written_is_told_before_the_work(
+    def test_where_nothing_may_be_written_is_reported_before_the_work(
         self, slam_observer, simulated, tmp_path, option, monkeypatch
     ):
         monkeypatch.setattr(os, 'access', lambda *_: False)  # root may write anywhere
@@ -506,7 +506,7 @@ class TestSmoothing:
         error = slam_observer.fail('replay', simulated, '--smooth', '--gains', 'constant')
         assert 'riccati' in error
 
-    def test_history_that_is_cut_short_is_told(self, slam_observer, simulated):
+    def test_history_that_is_cut_short_is_reported(self, slam_observer, simulated):
         ended = slam_observer(
             'replay', simulated, '--smooth', '--gains', 'riccati', '--set', 'hindsight_turn=0',
             '--set', 'hindsight_interval=10', '--set', 'hindsight_window=20',
@@ -550,7 +550,7 @@ class TestSettings:
         output = slam_observer.succeed('replay', simulated, '--config', config).output
         assert 'constant gains' in output
 
-    def test_what_the_node_does_and_a_replay_only_by_its_options_is_told(
+    def test_what_the_node_does_and_a_replay_only_by_its_options_is_reported(
         self, slam_observer, simulated, tmp_path
     ):
         landmarks = tmp_path / 'map.yaml'
@@ -595,7 +595,7 @@ class TestSettings:
         other = slam_observer.succeed('replay', simulated, '--config', config, '--json').json
         assert one | {'seconds': 0} == other | {'seconds': 0}
 
-    def test_a_list_that_the_node_can_not_read_is_told_once(
+    def test_a_list_that_the_node_can_not_read_is_reported_once(
         self, slam_observer, simulated, tmp_path
     ):
         config = self.config(tmp_path, 'range_noise: 0.1, linear_velocity_noise: [0.1, 0, 0]')
@@ -637,11 +637,11 @@ class TestSettings:
         assert "unknown parameter 'gain_q'; did you mean 'gain_" in error
 
 
-class TestTroubledRecordings:
+class TestRecordingsWithProblems:
     def test_malformed_and_impossible_messages_are_dropped_by_reason(
         self, slam_observer, tmp_path
     ):
-        path = tmp_path / 'troubled.mcap'
+        path = tmp_path / 'problems.mcap'
         good = ros.serialise(ros.twist_stamped([0.1] * 6))
         with RecordingWriter(path) as writer:
             for data in (good, good[:20], ros.serialise(ros.twist_stamped([np.nan] * 6))):
@@ -667,7 +667,7 @@ class TestTroubledRecordings:
         assert ended.errors.startswith('slam-observer: warning: ')
         assert ended.errors.count('\n') == 1
 
-    def test_frames_that_differ_are_told(self, slam_observer, tmp_path):
+    def test_frames_that_differ_are_reported(self, slam_observer, tmp_path):
         path = tmp_path / 'frames.mcap'
         with RecordingWriter(path) as writer:
             for event in recordings.events():
@@ -692,7 +692,7 @@ class TestTroubledRecordings:
                 writer.write_pose(truth)
         return tmp_path / 'unplaced.mcap'
 
-    def test_that_no_observation_was_used_is_told(self, slam_observer, unplaced):
+    def test_that_no_observation_was_used_is_reported(self, slam_observer, unplaced):
         errors = slam_observer('replay', unplaced).errors
         assert 'warning: No observation was used (dropped: 50 no_transform)' in errors
         assert '--set sensor_pose=[X,Y,Z,ROLL,PITCH,YAW]' in errors
@@ -724,7 +724,7 @@ class TestTroubledRecordings:
         assert ended.code == 2
         assert landmarks.read_text() == 'a good map'
 
-    def test_that_no_velocity_was_used_is_told(self, slam_observer, tmp_path):
+    def test_that_no_velocity_was_used_is_reported(self, slam_observer, tmp_path):
         with RecordingWriter(tmp_path / 'run.mcap') as writer:
             for event in recordings.events():
                 if isinstance(event, VelocityEvent):

@@ -197,7 +197,7 @@ def test_the_camera_is_placed_by_tf_static(recordings, estimate):
     assert np.linalg.norm(trajectory.poses[-1][:3, 3] - motion[:3, 3]) < 0.1
 
 
-def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observer):
+def test_tags_that_tf_does_not_have_are_dropped_and_reported(recordings, slam_observer):
     ended = slam_observer('replay', recordings['unplaced'], '--json')
     assert ended.code == 0
     assert ended.json['landmarks'] == 0
@@ -206,23 +206,23 @@ def test_tags_that_tf_does_not_have_are_dropped_and_told(recordings, slam_observ
     assert 'fiducials are where /tf has them, which was not recorded' in ended.errors
 
 
-def test_tags_that_tf_has_by_another_name_are_told(tmp_path, monkeypatch, slam_observer):
+def test_tags_that_tf_has_by_another_name_are_reported(tmp_path, monkeypatch, slam_observer):
     monkeypatch.setitem(MESSAGES, '/tf', MESSAGES['/tags/tf'])
     path = record(tmp_path / 'run', '/detections', '/tf')
-    told = slam_observer('replay', path).errors
-    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in told
-    assert 'dock0' in told
-    assert 'sensor_pose' not in told
+    errors = slam_observer('replay', path).errors
+    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in errors
+    assert 'dock0' in errors
+    assert 'sensor_pose' not in errors
     renamed = slam_observer('replay', path, '--tag-frame-prefix', 'dock', '--json')
     assert renamed.json['dropped'] == {}
 
 
-def test_fiducials_on_tf_by_another_name_are_told(recordings, slam_observer):
+def test_fiducials_on_tf_by_another_name_are_reported(recordings, slam_observer):
     options = ('--landmarks-topic', '/tags/tf')
-    told = slam_observer('replay', recordings['all'], *options).errors
-    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in told
-    assert 'dock0' in told
-    assert 'set tag_frame_prefix' in told
+    errors = slam_observer('replay', recordings['all'], *options).errors
+    assert "no frame on /tf is named 'tag_<id>' or '<family>:<id>' (there are" in errors
+    assert 'dock0' in errors
+    assert 'set tag_frame_prefix' in errors
 
 
 @pytest.mark.parametrize(
@@ -239,7 +239,7 @@ def test_fiducials_on_tf_by_another_name_are_told(recordings, slam_observer):
         ('all', ('--landmark-truth-topic', '/boxes'), 'can not be the true landmark topic'),
     ],
 )  # fmt: skip
-def test_what_can_not_be_replayed_is_told(recordings, slam_observer, name, options, reason):
+def test_what_can_not_be_replayed_is_reported(recordings, slam_observer, name, options, reason):
     error = slam_observer.fail('replay', recordings[name], *options)
     assert re.search(reason, error.rstrip())
 

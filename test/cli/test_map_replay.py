@@ -90,7 +90,7 @@ def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path
     assert (len(after.ids) > len(known.ids)) == (mode == 'off')
 
 
-def test_a_mode_of_localising_without_a_map_is_told_to_have_no_effect(slam_observer, tmp_path):
+def test_a_mode_of_localising_without_a_map_is_said_to_have_no_effect(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     ended = slam_observer('replay', path, '--set', 'localization_mode=fixed', *SETTINGS)
     assert ended.code == 0
@@ -117,7 +117,7 @@ def test_a_map_keeps_the_name_of_its_frame(slam_observer, tmp_path):
     assert [read_map(file).frame_id for file in (first, again)] == ['hall', 'hall']
 
 
-def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
+def test_no_anees_is_reported_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
     slam_observer, tmp_path
 ):
     path, saved = record(tmp_path / 'run.mcap', np.eye(4), seed=1), tmp_path / 'map.yaml'
@@ -132,7 +132,7 @@ def test_no_anees_is_told_in_a_map_whose_frame_does_not_begin_at_the_first_pose(
 
 
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
-def test_no_anees_of_the_configuration_is_told_in_a_map_that_is_exact(
+def test_no_anees_of_the_configuration_is_reported_in_a_map_that_is_exact(
     slam_observer, tmp_path, gains
 ):
     path, saved = tmp_path / 'run.mcap', tmp_path / 'map.yaml'
@@ -146,13 +146,13 @@ def test_no_anees_of_the_configuration_is_told_in_a_map_that_is_exact(
     assert fixed['configuration_rmse_m'] is not None
 
 
-def test_covariances_of_a_smoothed_map_are_those_in_hindsight(slam_observer, tmp_path):
+def test_covariances_of_a_smoothed_map_are_those_of_relinearising(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
-    smoothed, looked_back = tmp_path / 'smoothed.yaml', tmp_path / 'looked_back.yaml'
+    smoothed, relinearised = tmp_path / 'smoothed.yaml', tmp_path / 'relinearised.yaml'
     slam_observer.succeed('replay', path, '--smooth', '--map', smoothed, *SETTINGS)
     at_the_end = ('--set', 'hindsight_interval=80', '--set', 'hindsight_turn=0')
-    slam_observer.succeed('replay', path, '--map', looked_back, *SETTINGS, *at_the_end)
-    online, exact = read_map(smoothed), read_map(looked_back)
+    slam_observer.succeed('replay', path, '--map', relinearised, *SETTINGS, *at_the_end)
+    online, exact = read_map(smoothed), read_map(relinearised)
     np.testing.assert_array_equal(online.ids, exact.ids)
     assert_allclose(
         np.trace(online.covariances, axis1=1, axis2=2),
@@ -168,7 +168,7 @@ def test_a_map_that_cannot_be_read_is_refused_before_anything_is_done(slam_obser
     assert f"can't read map {missing}: No such file or directory" in error
 
 
-class TestPlaceNotKnown:
+class TestPoseInMapNotKnown:
     """In a map of the landmarks, which have other ids some of the time."""
 
     @pytest.fixture
@@ -194,7 +194,7 @@ class TestPlaceNotKnown:
         assert not poses.exists()
         assert not figures.exists()
 
-    def test_a_start_that_is_told_takes_no_ids(self, slam_observer, tmp_path, saved):
+    def test_a_start_that_is_given_takes_no_ids(self, slam_observer, tmp_path, saved):
         start = se3.exp(np.array([0.0, 0.0, 1.0, 1.0, -2.0, 0.0]))
         path = record(tmp_path / 'run.mcap', start, seed=2, has_ids=False)
         poses = tmp_path / 'poses.tum'
@@ -204,15 +204,15 @@ class TestPlaceNotKnown:
         )  # fmt: skip
         assert '--set set_initial_pose=true' in slam_observer.fail(*arguments)
         x, y, z = (start[:3, 3] + [0.2, -0.1, 0.0]).tolist()
-        told = ('--set', f'initial_position=[{x},{y},{z}]', '--set', 'initial_yaw=0.9')
-        arguments += ('--set', 'set_initial_pose=true', *told)
+        given = ('--set', f'initial_position=[{x},{y},{z}]', '--set', 'initial_yaw=0.9')
+        arguments += ('--set', 'set_initial_pose=true', *given)
         assert slam_observer(*arguments, '--json').json['localised_after_s'] == 0.0
         assert 'given at the start' in slam_observer(*arguments).output
         estimate = read_tum(poses)
         true = start @ se3.exp(BODY_VELOCITY * (estimate.stamps_ns * 1e-9)[:, None])
         assert_allclose(estimate.poses[1:], true[1:], atol=0.1)
 
-    def test_a_start_that_is_told_is_of_no_use_without_points(
+    def test_a_start_that_is_given_is_of_no_use_without_points(
         self, slam_observer, tmp_path, saved
     ):
         path = record(tmp_path / 'run.mcap', np.eye(4), seed=2, has_ids=False)
@@ -229,7 +229,7 @@ class TestPlaceNotKnown:
         assert 'points without id' in ended.errors
         assert not again.exists()
 
-    def test_a_place_found_late_is_told_with_its_time(self, slam_observer, tmp_path, saved):
+    def test_a_pose_found_late_is_reported_with_its_time(self, slam_observer, tmp_path, saved):
         late = record(tmp_path / 'late.mcap', np.eye(4), seed=2, first_id=lambda s: 100 * (s < 40))
         poses = tmp_path / 'poses.tum'
         arguments = ('replay', late, '--load-map', saved, '--force', '--tum', poses, *SETTINGS)
@@ -240,7 +240,7 @@ class TestPlaceNotKnown:
             f'found after {report["localised_after_s"]:.1f} s' in slam_observer(*arguments).output
         )
 
-    def test_more_rejections_than_a_sensor_has_outliers_are_told(
+    def test_more_rejections_than_a_sensor_has_outliers_are_reported(
         self, slam_observer, tmp_path, saved
     ):
         growing = record(
@@ -249,7 +249,7 @@ class TestPlaceNotKnown:
         ended = slam_observer('replay', growing, *SETTINGS)
         assert re.search('[0-9]+ % of the points were rejected: look at the signs', ended.errors)
 
-    def test_a_scale_that_nobody_can_mean_is_told(self, slam_observer, tmp_path, saved):
+    def test_a_scale_that_nobody_can_mean_is_reported(self, slam_observer, tmp_path, saved):
         twice = record(tmp_path / 'run.mcap', np.eye(4), seed=2, speed_factor=2.0)
         stated = '--set', 'linear_scale_error=[0.05,0.0,0.0]'
         ended = slam_observer('replay', twice, *SETTINGS, *stated)
@@ -274,7 +274,7 @@ class TestPlaceNotKnown:
         assert 40 <= len(read_tum(poses)) < 50
 
 
-def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
+def test_smoothing_says_what_cut_the_history_short(slam_observer, tmp_path):
     path = record(
         tmp_path / 'run.mcap', np.eye(4), seed=1,
         stamp_ns=lambda s: 10**8 * s + 10**12 * (s >= 40),
@@ -289,37 +289,41 @@ def test_smoothing_tells_what_cut_the_history_short(slam_observer, tmp_path):
 
 
 @pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
-def test_points_of_no_landmark_of_a_map_that_does_not_grow_are_told(slam_observer, tmp_path, mode):
+def test_points_of_no_landmark_of_a_map_that_does_not_grow_are_reported(
+    slam_observer, tmp_path, mode
+):
     """The map is of some twenty landmarks, whose ids are shared; of others they go up from 100."""
     first = record(tmp_path / 'first.mcap', np.eye(4), seed=1)
     second = record(tmp_path / 'second.mcap', np.eye(4), 2, lambda s: 0 if s < 10 else 100)
     saved = tmp_path / 'map.yaml'
     slam_observer.succeed('replay', first, '--map', saved, *SETTINGS)
-    told = slam_observer(
+    errors = slam_observer(
         'replay', second, '--load-map', saved, *SETTINGS,
         '--set', f'localization_mode={mode}', '--set', 'set_initial_pose=true',
     ).errors  # fmt: skip
-    is_told = 'of the points are of no landmark of the map: is it the map of this place' in told
-    assert is_told == (mode != 'off')
-    assert ('did the robot start where it was said to' in told) == is_told
+    is_reported = (
+        'of the points are of no landmark of the map: is it the map of this place' in errors
+    )
+    assert is_reported == (mode != 'off')
+    assert ('did the robot start where it was said to' in errors) == is_reported
 
 
-def test_smoothing_tells_that_landmarks_had_to_make_room(slam_observer, tmp_path):
+def test_smoothing_says_that_landmarks_had_to_make_room(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     limited = ('--smooth', '--set', 'max_landmarks=30', *SETTINGS)
-    told = slam_observer('replay', path, *limited).errors
-    assert 'those since landmarks had to make room (max_landmarks)' in told
+    errors = slam_observer('replay', path, *limited).errors
+    assert 'those since landmarks had to make room (max_landmarks)' in errors
     window = ('--set', 'hindsight_window=10', '--set', 'hindsight_interval=1')
-    told = slam_observer('replay', path, *limited, *window).errors
-    assert 'those since the history was cut (hindsight_window=0 keeps all of it)' in told
+    errors = slam_observer('replay', path, *limited, *window).errors
+    assert 'those since the history was cut (hindsight_window=0 keeps all of it)' in errors
 
 
 def test_nothing_to_smooth_is_an_error_and_writes_nothing(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     window = ('--set', 'hindsight_window=1', '--set', 'hindsight_interval=1')
     outputs = ('--smooth', '--tum', tmp_path / 'smoothed.tum')
-    told = slam_observer.fail('replay', path, *outputs, *window, *SETTINGS)
-    assert 'nothing to smooth: no observation since the history was cut' in told
+    errors = slam_observer.fail('replay', path, *outputs, *window, *SETTINGS)
+    assert 'nothing to smooth: no observation since the history was cut' in errors
     assert not (tmp_path / 'smoothed.tum').exists()
 
 
@@ -335,7 +339,7 @@ def test_a_silence_of_the_sensors_is_no_jump_of_the_clock(slam_observer, tmp_pat
 
 
 @pytest.mark.parametrize('resets', [True, False])
-def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_told(
+def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_reported(
     slam_observer, tmp_path, resets
 ):
     path = record(

@@ -127,7 +127,7 @@ class TestMovingMounts:
         assert report['ate_rmse_m'] < 1e-3
         assert report['configuration_rmse_m'] < 1e-3
 
-    def test_what_no_transform_places_is_dropped_and_told_once(self, slam_observer, panning):
+    def test_what_no_transform_places_is_dropped_and_reported_once(self, slam_observer, panning):
         ended = slam_observer('replay', panning, '--json', '--set', 'transform_timeout=0')
         assert ended.code == 0
         assert ended.json['dropped'] == {'no_transform': STEPS}
@@ -144,7 +144,9 @@ class TestMovingMounts:
         assert ended.json['dropped'] == {'no_transform': 1}
         assert "'camera' and 'base_link' are not connected" in ended.errors
 
-    def test_landmarks_told_in_the_map_are_dropped_and_told_once(self, slam_observer, tmp_path):
+    def test_landmarks_stated_in_the_map_are_dropped_and_reported_once(
+        self, slam_observer, tmp_path
+    ):
         path = tmp_path / 'loop.mcap'
         with RecordingWriter(path) as writer:
             drive = Drive(writer)
@@ -281,14 +283,14 @@ class TestVelocities:
 
     def test_an_odometry_that_is_reset_on_the_way(self, slam_observer, tmp_path):
         path = tmp_path / 'reset.mcap'
-        restart_ns = ros.STAMP_NS + STEPS // 2 * STEP_NS
+        reset_ns = ros.STAMP_NS + STEPS // 2 * STEP_NS
         with RecordingWriter(path) as writer:
             drive = Drive(writer)
             drive.landmarks(ros.STAMP_NS)
             for stamp_ns in stamps_ns():
                 pose = true_pose(stamp_ns)
-                if stamp_ns >= restart_ns:
-                    pose = se3.inverse(true_pose(restart_ns)) @ pose
+                if stamp_ns >= reset_ns:
+                    pose = se3.inverse(true_pose(reset_ns)) @ pose
                 message = ros.odometry(
                     np.zeros(6), np.zeros((6, 6)), 2.0 * pose[:3, 3],
                     so3.to_quaternion(pose[:3, :3]), stamp_ns=stamp_ns,
@@ -361,8 +363,8 @@ class TestVelocities:
                 imu = ros.imu(V[:3], np.zeros((3, 3)) if measures else unknown, frame_id, stamp_ns)
                 drive.write('/imu', imu, stamp_ns)
         ended = slam_observer('replay', path, '--json', '--imu', '/imu')
-        told = f'No angular velocity of /imu was used (dropped: {STEPS} {reason})'
-        assert ended.errors.count(told) == 1
+        warning = f'No angular velocity of /imu was used (dropped: {STEPS} {reason})'
+        assert ended.errors.count(warning) == 1
         assert 'that of /twist was taken' in ended.errors
 
     def test_an_imu_that_is_not_there(self, slam_observer, panning, wheels_and_gyroscope):
@@ -432,13 +434,13 @@ class TestZeroStamps:
 
 
 class TestTiming:
-    """What falls silent, and what has another clock, is told."""
+    """What falls silent, and what has another clock, is reported."""
 
     IMU = ('--imu', '/imu/data')
 
     @pytest.fixture
     def warnings_of(self, slam_observer, tmp_path):
-        """Replays a drive whose topics end or are stamped as told; returns the warnings."""
+        """Replays a drive whose topics end or are stamped as said; returns the warnings."""
 
         def replay(*options, ends=(), ahead_s=(), duration_s=12, slow_down=1.0):
             path = tmp_path / 'timing.mcap'
@@ -481,13 +483,13 @@ class TestTiming:
         assert 'No angular velocity on /imu/data for 5.0 s of 12.0 s' in warnings
         assert 'that of /odom was taken' in warnings
 
-    @pytest.mark.parametrize(('end_s', 'is_told'), [(6.0, True), (9.0, False)])
-    def test_landmarks_that_come_no_more_for_the_last_third(self, warnings_of, end_s, is_told):
+    @pytest.mark.parametrize(('end_s', 'is_reported'), [(6.0, True), (9.0, False)])
+    def test_landmarks_that_come_no_more_for_the_last_third(self, warnings_of, end_s, is_reported):
         warnings = warnings_of(ends=[('/tags', end_s)])
-        assert ('No landmarks on /tags for the last 6.0 s of 12.0 s' in warnings) == is_told
+        assert ('No landmarks on /tags for the last 6.0 s of 12.0 s' in warnings) == is_reported
 
     @pytest.mark.parametrize(
-        ('topic', 'ahead_s', 'told'),
+        ('topic', 'ahead_s', 'expected'),
         [
             ('/tags', 2.0, 'Stamps of /tags are 2.0 s ahead of those of /odom'),
             ('/tags', -2.0, 'Stamps of /tags are 2.0 s behind those of /odom'),
@@ -495,10 +497,10 @@ class TestTiming:
             ('/imu/data', -2.0, 'Stamps of /imu/data are 2.0 s behind those of /odom'),
         ],
     )
-    def test_another_clock(self, warnings_of, topic, ahead_s, told):
+    def test_another_clock(self, warnings_of, topic, ahead_s, expected):
         warnings = warnings_of(*self.IMU, ahead_s=[(topic, ahead_s)])
         assert warnings.count('Stamps of') == 1
-        assert told in warnings
+        assert expected in warnings
         assert 'correct_clock_offset' in warnings
 
     def test_one_clock_that_is_slower_than_the_recorders_is_no_other(self, warnings_of):
@@ -506,7 +508,7 @@ class TestTiming:
 
 
 @pytest.mark.parametrize('has_pose', [True, False])
-def test_truth_of_a_type_that_is_not_read_is_told(slam_observer, tmp_path, has_pose):
+def test_truth_of_a_type_that_is_not_read_is_reported(slam_observer, tmp_path, has_pose):
     path = tmp_path / 'path.mcap'
     with RecordingWriter(path) as writer:
         for stamp_ns in stamps_ns():
@@ -541,8 +543,8 @@ def test_true_poses_of_another_frame_are_moved_to_the_base(slam_observer, tmp_pa
             odometry = ros.odometry(V, np.eye(6), seen[:3, 3], turn, frames, stamp_ns)
             drive.write('/ground_truth/odom', odometry, stamp_ns)
     done = slam_observer('replay', path, '--json')
-    told = "The true poses are of 'marker', and the estimated ones of 'base_link'"
-    assert (told in done.errors) != is_placed
+    warning = "The true poses are of 'marker', and the estimated ones of 'base_link'"
+    assert (warning in done.errors) != is_placed
     assert (done.json['ate_rmse_m'] < 1e-3) == is_placed
 
 

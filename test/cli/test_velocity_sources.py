@@ -245,7 +245,7 @@ def test_another_clock_is_found_and_corrected_once():
     assert clock.correction_ns == 0
 
 
-def test_when_this_machines_clock_has_jumped_the_offset_is_found_anew():
+def test_when_this_machines_clock_has_jumped_the_offset_is_found_again():
     clock = ClockOffset(SECOND)
     for index in range(SAMPLES):
         clock.add(1000 * SECOND + index, 10 * SECOND + index)

@@ -62,7 +62,7 @@ def test_riccati_covariances_are_honest(two_d_mode, degrees_of_freedom):
 
 
 @modes
-def test_a_filter_that_is_told_half_of_the_noise_is_found_out(two_d_mode, degrees_of_freedom):
+def test_a_filter_that_is_given_half_of_the_noise_is_found_out(two_d_mode, degrees_of_freedom):
     settings = Settings(two_d_mode=two_d_mode, reorder_window=0.0)
     runs = [errors_and_covariances(settings, seed, 10.0, noise=2.0) for seed in range(15)]
     errors, covariances, _ = map(np.array, zip(*runs, strict=True))

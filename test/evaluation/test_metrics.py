@@ -72,7 +72,7 @@ def test_without_alignment_an_estimate_is_compared_where_it_says_it_is(
     assert found_m == pytest.approx(np.sqrt(np.mean(lengths_m**2)))
 
 
-def test_rms_errors_are_told_of_errors_that_change() -> None:
+def test_rms_errors_are_those_of_errors_that_change() -> None:
     _, truth = random_pair(np.random.default_rng(0))
     yaw = np.where(np.arange(len(truth)) % 2, 0.2, 0.0)
     turn = se3.exp(yaw[:, None] * np.array([0.0, 0, 1, 0, 0, 0]))
@@ -241,7 +241,7 @@ def test_of_very_many_landmarks_some_are_normalised_together() -> None:
 
 
 @pytest.mark.parametrize(('inflation', 'inside'), [(1.0, True), (0.7, False), (1.4, False)])
-def test_the_band_tells_honest_covariances_from_others(inflation: float, inside: bool) -> None:
+def test_the_band_separates_honest_covariances_from_others(inflation: float, inside: bool) -> None:
     rng = np.random.default_rng(5)
     covariance = random_covariance(rng, 6)
     errors = rng.multivariate_normal(np.zeros(6), covariance, size=200)
@@ -282,7 +282,9 @@ def test_where_the_truth_has_a_gap_errors_are_compared_with_their_own_covariance
     )
 
 
-def test_the_anees_is_not_told_where_the_first_heading_is_uncertain_and_the_way_is_long() -> None:
+def test_the_anees_is_not_reported_where_the_first_heading_is_uncertain_and_the_way_is_long() -> (
+    None
+):
     """The heading itself may be little of what is uncertain later; 100 m further on it is not."""
     poses = np.tile(np.eye(4), (len(STAMPS_NS), 1, 1))
     covariances = np.tile(np.eye(6), (len(STAMPS_NS), 1, 1))
@@ -295,11 +297,11 @@ def test_the_anees_is_not_told_where_the_first_heading_is_uncertain_and_the_way_
         consistency.anchored_average_nees(far, covariances, far)
 
 
-def test_the_anees_is_honest_or_not_told_where_the_truth_begins_late() -> None:
+def test_the_anees_is_honest_or_not_reported_where_the_truth_begins_late() -> None:
     """What counts is not how late, but how uncertain the pose is by then."""
     rng = np.random.default_rng(0)
     steps = np.diag([0.02, 0.02, 0.02, 0.1, 0.1, 0.1])
-    told = []
+    values = []
     for _ in range(100):
         random = rng.normal(size=(len(STAMPS_NS), 6)) @ steps
         random[:5] = 0.0  # it stands still
@@ -311,12 +313,12 @@ def test_the_anees_is_honest_or_not_told_where_the_truth_begins_late() -> None:
         estimate = Trajectory(STAMPS_NS, moved)
         for start in (0, 4):
             late = Trajectory(STAMPS_NS[start:], rest[start:])
-            told.append(consistency.anchored_average_nees(estimate, covariances, late))
+            values.append(consistency.anchored_average_nees(estimate, covariances, late))
         for start in (7, 30):
             late = Trajectory(STAMPS_NS[start:], truth.poses[start:])
             with pytest.raises(EvaluationError, match=r'begins .* s after the estimate'):
                 consistency.anchored_average_nees(estimate, covariances, late)
-    assert 0.7 < np.mean(told) < 1.3
+    assert 0.7 < np.mean(values) < 1.3
 
 
 @pytest.mark.parametrize('count', [0, 1, 2])

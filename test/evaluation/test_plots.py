@@ -199,22 +199,22 @@ def test_legend_of_a_map_names_what_there_is(
     assert legend_of(saved[1]) == [*path, 'estimated landmarks']
 
 
-@pytest.mark.parametrize('in_hindsight', [False, True])
-def test_a_title_tells_what_is_in_hindsight(
+@pytest.mark.parametrize('is_smoothed', [False, True])
+def test_a_title_says_what_is_smoothed(
     tmp_path: Path,
     saved: list[Figure],
     estimate: Trajectory,
     truth: Trajectory,
-    in_hindsight: bool,
+    is_smoothed: bool,
 ) -> None:
     errors = trajectory_errors(estimate, truth)
     plot: Any = map_plot.plot_map
-    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, in_hindsight=in_hindsight)
-    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, truth, in_hindsight=in_hindsight)
-    replay_plots.plot_errors(tmp_path / 'a.png', errors, in_hindsight=in_hindsight)
+    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, is_smoothed=is_smoothed)
+    plot(tmp_path / 'a.png', estimate, IDS, LANDMARKS, truth, is_smoothed=is_smoothed)
+    replay_plots.plot_errors(tmp_path / 'a.png', errors, is_smoothed=is_smoothed)
     titles = [figure.texts[0].get_text() for figure in saved[:2]]
     titles.append(saved[2].axes[0].get_title('left'))
-    assert [('in hindsight' in title) for title in titles] == [in_hindsight] * 3
+    assert [('smoothed' in title.lower()) for title in titles] == [is_smoothed] * 3
     assert [('after rigid alignment' in title) for title in titles] == [False, True, True]
 
 

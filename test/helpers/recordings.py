@@ -49,13 +49,8 @@ def write_mcap(path: Path) -> Path:
     """Write the run as the package does."""
     with RecordingWriter(path) as writer:
         writer.write_landmarks(ros.STAMP_NS, LANDMARKS)
-        for event in events():
-            if isinstance(event, VelocityEvent):
-                writer.write_velocity(event)
-            else:
-                writer.write_observation(event)
-        for truth in true_poses():
-            writer.write_pose(truth)
+        for item in (*events(), *true_poses()):
+            writer.write_event(item)
     return path
 
 
@@ -92,7 +87,7 @@ def write_rosbag2(
 
 
 def write_rosbag1(path: Path) -> Path:
-    """Write the run as a ROS 1 .bag, which begins with a message of a type that ROS 2 lacks."""
+    """Write the run as a ROS 1 .bag, which begins with a message of a type that ROS 2 has not."""
     typestore = get_typestore(Stores.ROS1_NOETIC)
     with rosbag1.Writer(path) as bag:
         log_type = 'rosgraph_msgs/msg/Log'

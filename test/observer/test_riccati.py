@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from slam_observer_ros.observer.riccati.full_map import FullMapGains
 from strategies import generators, poses
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer.observer import Correction, Observer
-from slam_observer_ros.observer.riccati.full_map import FullMapGains
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother
 

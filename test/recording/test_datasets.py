@@ -191,7 +191,7 @@ class TestStarryNight:
         with pytest.raises(DataSetError, match='or damaged'):
             load_starry_night(file)
         scipy.io.savemat(file, {'t': np.zeros((1, 2))})
-        with pytest.raises(DataSetError, match='it lacks v_vk_vk_i'):
+        with pytest.raises(DataSetError, match='it has no v_vk_vk_i'):
             load_starry_night(file)
         write_starry_night(file, r_i_vk_i=np.zeros((3, 5)))
         with pytest.raises(DataSetError, match=r'r_i_vk_i has shape \(3, 5\), not \(3, 2\)'):

@@ -21,7 +21,7 @@ from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.recording.recorded_truth import frames_beside, LandmarkTracks
+from slam_observer_ros.recording.recorded_truth import LandmarkTracks, other_frames
 from slam_observer_ros.recording.sources import BagSource, SplitSource
 from slam_observer_ros.recording.topics import TopicNames
 from slam_observer_ros.recording.writer import RecordingWriter
@@ -297,7 +297,7 @@ def test_a_split_recording_lasts_from_the_start_of_the_first_file_to_the_end_of_
 def test_true_poses_are_of_another_frame_only_where_the_robots_has_a_name(base_frame, expected):
     frames = ('', 'wheels', '/base_link')
     poses = [PoseMessage(0, 'map', frame, np.zeros(3), np.eye(4)[3]) for frame in frames]
-    assert frames_beside(base_frame, poses) == expected
+    assert other_frames(base_frame, poses) == expected
 
 
 @pytest.mark.parametrize('count', [500, 501])
@@ -520,7 +520,7 @@ class TestTopics:
         assert self.find(tmp_path, messages)['landmarks'] == '/beacons'
 
     @pytest.mark.parametrize('command', [TWIST, None])
-    def test_an_odometry_that_is_told_in_the_map_is_taken_only_where_nothing_else_is(
+    def test_an_odometry_that_is_stated_in_the_map_is_taken_only_where_nothing_else_is(
         self, tmp_path, command
     ):
         estimate = ros.odometry([1.0] * 6, np.eye(6), frames=('map', 'base_link'))
@@ -599,19 +599,19 @@ def test_last_position_of_a_true_landmark_counts(tmp_path):
     assert landmarks.world_points[:, 0].tolist() == [1.0, 2.0]
 
 
-def landmark_messages(*told):
+def landmark_messages(*stated):
     """Messages of (second, ids, x of all of them)."""
     return [
         Measurement(
             'world',
             ObservationEvent(s * 1_000_000_000, np.array(ids), np.full((len(ids), 3), float(x))),
         )
-        for s, ids, x in told
+        for s, ids, x in stated
     ]
 
 
 @pytest.mark.parametrize(
-    ('told', 'expected'),
+    ('stated', 'expected'),
     [
         ([(0, [7], 0), (1, [7], 0), (2, [7, 8], 1), (3, [7, 8], 2)],
          {0.0: (0, 1), 1.5: (0.5, 1), 2.5: (1.5, 1.5), 3.0: (2, 2), 9.0: (2, 2)}),
@@ -622,18 +622,18 @@ def landmark_messages(*told):
         ([(0, [7], 0), (0, [7], 3)], {-1.0: (3,), 0.0: (3,), 1.0: (3,)}),
         ([(0, [-1], 0), (5, [7], 3)], {0.0: (3,)}),
     ],
-    ids=['moves', 'at rest, then put', 'one each message', 'unsorted', 'told anew', 'unknown'],
+    ids=['moves', 'at rest, then put', 'one each message', 'unsorted', 'stated again', 'unknown'],
 )  # fmt: skip
-def test_true_landmarks_are_where_they_are_at_the_time(told, expected):
-    tracks = LandmarkTracks.from_messages(landmark_messages(*told))
+def test_true_landmarks_are_where_they_are_at_the_time(stated, expected):
+    tracks = LandmarkTracks.from_messages(landmark_messages(*stated))
     for time_s, x in expected.items():
         landmarks = tracks.at(int(time_s * 1e9))
         assert_allclose(landmarks.world_points[:, 0], x)
 
 
-def test_nothing_told_of_true_landmarks_is_no_truth():
-    for told in ((), ((0, [-1], 0),)):
-        assert LandmarkTracks.from_messages(landmark_messages(*told)) is None
+def test_nothing_known_of_true_landmarks_is_no_truth():
+    for stated in ((), ((0, [-1], 0),)):
+        assert LandmarkTracks.from_messages(landmark_messages(*stated)) is None
 
 
 def test_bag_of_several_files_is_read_whole(tmp_path):

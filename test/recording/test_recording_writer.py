@@ -88,7 +88,7 @@ def test_file_appears_only_when_it_is_whole(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ['run.mcap']
 
 
-def test_existing_file_is_overwritten_only_when_told(tmp_path):
+def test_existing_file_is_overwritten_only_when_allowed(tmp_path):
     path = recordings.write_mcap(tmp_path / 'run.mcap')
     before = path.read_bytes()
     with pytest.raises(RecordingError, match='not overwritten'):
@@ -122,7 +122,7 @@ def test_file_that_appears_while_writing_is_not_overwritten(tmp_path):
     assert path.read_text() == 'precious'
 
 
-def test_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+def test_full_disk_is_reported_with_the_name_of_the_file(tmp_path):
     random = np.random.default_rng(0)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
 

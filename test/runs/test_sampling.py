@@ -100,11 +100,11 @@ def test_covariances_are_collected_only_to_compare_errors_with():
 
     result = replay(events_of(400, 7), Settings(), truth)
     assert result.pose_covariances.shape == (len(result.trajectory.poses), 6, 6)
-    for lacking in (nothing, None):
-        assert replay(events_of(400, 7), Settings(), lacking).pose_covariances is None
+    for missing in (nothing, None):
+        assert replay(events_of(400, 7), Settings(), missing).pose_covariances is None
 
 
-def test_what_was_seen_before_a_jump_is_not_smoothed_and_hindsight_says_why():
+def test_what_was_seen_before_a_jump_is_not_smoothed_and_the_reason_is_given():
     before, after = events_of(100, 5), events_of(60, 5)
     later = [replace(event, stamp_ns=event.stamp_ns + 1000 * SECOND) for event in before]
     settings = Settings(on_time_jump='hold', reorder_window=0.5)

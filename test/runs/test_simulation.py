@@ -208,7 +208,7 @@ def test_rates_and_start_set_the_stamps() -> None:
 
 
 @pytest.mark.parametrize(('step_s', 'count'), [(2.01, 2), (0.67, 4)])
-def test_what_is_observed_at_the_very_end_is_told(step_s: float, count: int) -> None:
+def test_what_is_observed_at_the_very_end_is_reported(step_s: float, count: int) -> None:
     scenario = Scenario(observation_rate=1.0 / step_s, duration=2.01)  # 2.01e9 ns is no integer
     assert len(_observations(scenario)) == count
 

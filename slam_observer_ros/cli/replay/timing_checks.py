@@ -25,17 +25,9 @@ logger = logging.getLogger(__name__)
 
 
 def warn_of_timing(recording: Recording, selected: SelectedTopics, timeout_s: float) -> None:
-    """Say which inputs were silent for long, or have the stamps of another clock.
+    """Say which inputs of a recording, read to its end, were silent or are of another clock.
 
-    Parameters
-    ----------
-    recording : Recording
-        Read to its end.
-    selected : SelectedTopics
-        The inputs.
-    timeout_s : float
-        How long a velocity holds, seconds.
-
+    ``timeout_s`` is how long a velocity holds, seconds.
     """
     names = [topic.name for topic in selected.inputs]
     inputs = {name: recording.arrivals[name] for name in names if recording.arrivals[name]}
@@ -46,24 +38,26 @@ def warn_of_timing(recording: Recording, selected: SelectedTopics, timeout_s: fl
     velocity, landmarks = selected.velocity.name, selected.landmarks.name
     if velocity in inputs:
         silence_s = inputs[velocity].silence_s(start_s, end_s, timeout_s)
-        fate = 'the pose was held, but for what landmarks say'
-        _warn_of_silence('velocity', velocity, silence_s, end_s - start_s, fate)
+        consequence = 'the pose was held, but for what landmarks say'
+        _warn_of_silence('velocity', velocity, silence_s, end_s - start_s, consequence)
     if selected.imu is not None and selected.imu.name in inputs:
         silence_s = inputs[selected.imu.name].silence_s(start_s, end_s, timeout_s)
-        fate = f'that of {velocity} was taken'
-        _warn_of_silence('angular velocity', selected.imu.name, silence_s, end_s - start_s, fate)
+        consequence = f'that of {velocity} was taken'
+        _warn_of_silence(
+            'angular velocity', selected.imu.name, silence_s, end_s - start_s, consequence
+        )
     if landmarks in inputs:
         _warn_of_landmarks_end(landmarks, inputs[landmarks], start_s, end_s)
     _warn_of_clocks(inputs)
 
 
 def _warn_of_silence(
-    what: str, topic_name: str, silence_s: float, duration_s: float, fate: str
+    what: str, topic_name: str, silence_s: float, duration_s: float, consequence: str
 ) -> None:
     if silence_s > MAX_SILENCE * duration_s:
         logger.warning(
             'No %s on %s for %.1f s of %.1f s (velocity_timeout): %s.',
-            what, topic_name, silence_s, duration_s, fate,
+            what, topic_name, silence_s, duration_s, consequence,
         )  # fmt: skip
 
 

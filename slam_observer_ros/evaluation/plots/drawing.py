@@ -1,8 +1,6 @@
-"""How all figures are drawn: their style, and what of it they share.
+"""How all figures are drawn: without pyplot, so that nobody's settings change.
 
-Figures are drawn without pyplot, so importing these modules or calling them changes neither
-matplotlib's backend nor its settings. Colours are those of Okabe and Ito, told apart by
-colour-blind readers.
+Colours are those of Okabe and Ito, which colour-blind readers can distinguish.
 """
 
 from __future__ import annotations
@@ -90,14 +88,7 @@ def legend_below(figure: Figure, named: Axes, columns: int) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as a PNG file; return its path.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written.
-
-    """
+    """Write a PNG file and return its path; raise an EvaluationError if that fails."""
     try:
         figure.savefig(path, format='png')
     except OSError as error:

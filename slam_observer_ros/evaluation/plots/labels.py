@@ -33,19 +33,9 @@ def label_points(
 ) -> None:
     """Write each name beside its point, if there it hits no marker and no name written before.
 
-    Of all sides that is tried first which leads away from what else is drawn near it.
-
-    Parameters
-    ----------
-    axes : Axes
-        Of a figure whose layout is done.
-    names : sequence of str
-        n names, the most important ones first.
-    points : FloatArray
-        (n, 2) what they name.
-    markers : FloatArray
-        (m, 2) what is not to be hit, the points among it.
-
+    Of all sides that is tried first which leads away from what else is drawn near it. The layout
+    of the figure must be done. The names are those of ``points`` (n, 2), the most important ones
+    first; ``markers`` (m, 2) must not be hit, and have the points among them.
     """
     px = axes.figure.dpi / 72.0
     obstacles = axes.transData.transform(markers)
@@ -54,17 +44,19 @@ def label_points(
         label = _label(axes, name, point)
         half = np.array(label.get_window_extent().size) / 2.0 + _HALO_PT * px
         start = axes.transData.transform(point)
-        places = start + _offsets(half, _away(start, obstacles, _NEAR_PT * px), px)
-        free = np.all(np.abs(places - axes.bbox.min) >= half, axis=1)
-        free &= np.all(np.abs(axes.bbox.max - places) >= half, axis=1)
-        free &= ~_hit(places, half, middles, halves)
-        free &= ~_touch(places, half, obstacles, _MARKER_PT * px)
+        candidates = start + _ways_to_middle(
+            half, _way_from_others(start, obstacles, _NEAR_PT * px), px
+        )
+        free = np.all(np.abs(candidates - axes.bbox.min) >= half, axis=1)
+        free &= np.all(np.abs(axes.bbox.max - candidates) >= half, axis=1)
+        free &= ~_hits_label(candidates, half, middles, halves)
+        free &= ~_touches_marker(candidates, half, obstacles, _MARKER_PT * px)
         if not free.any():
             label.remove()
             continue
-        place = places[np.argmax(free)]
-        label.xyann = tuple((place - start) / px)
-        middles, halves = np.vstack([middles, place]), np.vstack([halves, half])
+        middle = candidates[np.argmax(free)]
+        label.xyann = tuple((middle - start) / px)
+        middles, halves = np.vstack([middles, middle]), np.vstack([halves, half])
 
 
 def _label(axes: Axes, name: str, point: FloatArray) -> Annotation:
@@ -82,30 +74,30 @@ def _label(axes: Axes, name: str, point: FloatArray) -> Annotation:
     )
 
 
-def _offsets(half: FloatArray, away: FloatArray, px: float) -> FloatArray:
+def _ways_to_middle(half: FloatArray, away: FloatArray, px: float) -> FloatArray:
     """Return the ways (16, 2) from a marker to the middle of its label, the best one first."""
     directions = _DIRECTIONS[np.argsort(-_DIRECTIONS @ away, kind='stable')]
     to_middle = np.clip(np.sqrt(2.0) * directions, -1.0, 1.0) * half
     return np.asarray((_MARKER_PT + _GAP_PT) * px * directions + to_middle)
 
 
-def _away(point: FloatArray, markers: FloatArray, near: float) -> FloatArray:
+def _way_from_others(point: FloatArray, markers: FloatArray, near: float) -> FloatArray:
     """Return the way (2,) that leads away from markers (m, 2), the nearest above all."""
     apart = point - markers
     return np.asarray((apart / (np.sum(apart**2, axis=1, keepdims=True) + near**2)).sum(axis=0))
 
 
-def _hit(
-    places: FloatArray, half: FloatArray, middles: FloatArray, halves: FloatArray
+def _hits_label(
+    candidates: FloatArray, half: FloatArray, middles: FloatArray, halves: FloatArray
 ) -> BoolArray:
-    """Return at which places (k,) a label would hit one of those that were written."""
-    apart = np.abs(places[:, None] - middles)
+    """Return at which candidates (k, 2) a label would hit one of those that were written."""
+    apart = np.abs(candidates[:, None] - middles)
     return np.asarray(np.any(np.all(apart < half + halves, axis=-1), axis=-1))
 
 
-def _touch(
-    places: FloatArray, half: FloatArray, obstacles: FloatArray, radius: float
+def _touches_marker(
+    candidates: FloatArray, half: FloatArray, obstacles: FloatArray, radius: float
 ) -> BoolArray:
-    """Return at which places (k,) a label would touch a marker."""
-    apart = np.maximum(np.abs(places[:, None] - obstacles) - half, 0.0)
+    """Return at which candidates (k, 2) a label would touch a marker."""
+    apart = np.maximum(np.abs(candidates[:, None] - obstacles) - half, 0.0)
     return np.asarray(np.any(np.linalg.norm(apart, axis=-1) < radius, axis=-1))

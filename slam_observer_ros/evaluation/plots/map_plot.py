@@ -1,4 +1,4 @@
-"""Figure of a replay, as a PNG file: its path and its map."""
+"""Figure of a replay: its path and its map."""
 
 from __future__ import annotations
 
@@ -54,39 +54,24 @@ def plot_map(
     truth: Trajectory | None = None,
     landmark_truth: LandmarkTruth | None = None,
     *,
-    in_hindsight: bool = False,
+    is_smoothed: bool = False,
 ) -> Path:
     """Draw a replay's path and map over the truth, from above and, unless flat, from the side.
 
     With a true path the estimate is moved by the alignment of :func:`trajectory_errors`. A line
     leads from each landmark to the true one of the same id. Ids are written where there is room.
+    Raises an EvaluationError also if the truth covers too few poses.
 
     Parameters
     ----------
-    path : Path
-        PNG file to write.
-    estimate : Trajectory
-        Estimated poses.
-    ids : IntArray
-        (n,) landmarks in the final map.
-    world_points : FloatArray
-        (n, 3) their estimated positions, metres.
-    truth : Trajectory, optional
-        True poses.
-    landmark_truth : LandmarkTruth, optional
-        True landmarks in the world of ``truth``; drawn only together with it.
-    in_hindsight : bool
-        Whether poses and map are smoothed, which the title says.
-
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written, or the truth covers no pose of the estimate.
+    path, estimate
+        Where to draw which poses.
+    ids, world_points : (n,), (n, 3)
+        The final map, metres.
+    truth, landmark_truth
+        In one world; true landmarks are drawn only together with true poses.
+    is_smoothed
+        What the title says of all this.
 
     """
     if truth is not None:
@@ -98,9 +83,9 @@ def plot_map(
         landmark_truth = None
     layers = _map_layers(estimate, ids, world_points, truth, landmark_truth)
     figure, panels = _draw(layers, is_flat((estimate if truth is None else truth).positions))
-    title = 'Trajectory and map in hindsight' if in_hindsight else 'Trajectory and map'
+    title = 'Smoothed trajectory and map' if is_smoothed else 'Trajectory and map'
     if truth is not None:
-        title += ', after rigid alignment' if in_hindsight else ' after rigid alignment'
+        title += ' after rigid alignment'
     figure.suptitle(title, fontsize=11, fontweight='bold')
     named = ~is_automatic(ids)
     if 0 < np.sum(named) <= _MAX_LABELS:
@@ -135,10 +120,7 @@ def _side_view(spans_m: FloatArray) -> tuple[int, int]:
 
 
 def _panels(views: list[tuple[int, int]], spans_m: FloatArray) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each view, all at one scale.
-
-    One below the other if they share the axis across; else side by side.
-    """
+    """Return panels at one scale: one below the other if they share the axis across."""
     widths_m, heights_m = (spans_m[list(axis)] for axis in zip(*views, strict=True))
     side_by_side = len({across for across, _ in views}) > 1
     if side_by_side:

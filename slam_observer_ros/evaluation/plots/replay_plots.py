@@ -1,4 +1,4 @@
-"""Figures of a replay, as PNG files: its errors, its residuals."""
+"""Figures of a replay: its errors, its residuals."""
 
 from __future__ import annotations
 
@@ -49,38 +49,13 @@ def plot_errors(
     configuration: ConfigurationError | None = None,
     *,
     in_known_map: bool = False,
-    in_hindsight: bool = False,
+    is_smoothed: bool = False,
 ) -> Path:
     """Draw position and heading errors over time, with the band that three sigma allow.
 
-    The errors are those after the alignment; the covariances are relative to the first pose, or
-    in the frame of a map that was loaded.
-
-    Parameters
-    ----------
-    path : Path
-        PNG file to write.
-    errors : TrajectoryErrors
-        Errors of k poses after the alignment.
-    covariances : FloatArray, optional
-        (k, 6, 6) pose covariances in the estimate's world axes: rotation vector, position.
-    configuration : ConfigurationError, optional
-        Gauge-free error, drawn in a panel of its own.
-    in_known_map : bool
-        Whether the covariances are those in the frame of a map that was loaded.
-    in_hindsight : bool
-        Whether the poses are smoothed, which the title says.
-
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written.
-
+    The errors are those of k poses after the alignment. The pose covariances (k, 6, 6) are in the
+    estimate's world axes, rotation vector before position, and relative to the first pose, or
+    ``in_known_map`` those in its frame. The gauge-free ``configuration`` has a panel of its own.
     """
     panels = {'x [m]': (3, 1.0), 'y [m]': (4, 1.0), 'z [m]': (5, 1.0)}
     if is_flat(errors.truth.positions):
@@ -101,8 +76,8 @@ def plot_errors(
         _draw_configuration(stack[-1], start_ns, configuration)
     if limits is not None:
         stack[0].legend(**LEGEND_ABOVE)
-    hindsight = ' in hindsight,' if in_hindsight else ''
-    stack[0].set_title(f'Errors{hindsight} after rigid alignment')
+    whose = ' of the smoothed trajectory' if is_smoothed else ''
+    stack[0].set_title(f'Errors{whose} after rigid alignment')
     stack[-1].set_xlabel('time [s]')
     figure.align_ylabels(stack)
     return save(figure, path)
@@ -141,10 +116,10 @@ def _deviations(covariances: FloatArray, alignment: FloatArray) -> FloatArray:
 
 def _draw_band(axes: Axes, times_s: FloatArray, limit: FloatArray, in_known_map: bool) -> None:
     """Draw a band behind errors; a wide one runs off the panel, so that they stay visible."""
-    frame = 'in the frame of the map' if in_known_map else 'relative to the first pose'
+    relation = 'in the frame of the map' if in_known_map else 'relative to the first pose'
     shown = axes.get_ylim()[1]
     shown = max(shown, min(1.1 * float(limit.max()), _MAX_BAND * shown))
-    label = f'±3σ {frame}, not aligned'
+    label = f'±3σ {relation}, not aligned'
     axes.fill_between(
         times_s, -limit, limit, color=BLUE, alpha=0.16, linewidth=0.0, label=label, zorder=0.5
     )
@@ -162,31 +137,8 @@ def plot_residuals(
 ) -> Path:
     """Draw the residuals' lengths over time, and how many events were dropped and why.
 
-    Parameters
-    ----------
-    path : Path
-        PNG file to write.
-    stamps_ns : IntArray
-        (m,) stamp of each residual, nanoseconds.
-    residuals : FloatArray
-        (m, 3) residuals r_i of the landmarks seen, metres.
-    rejected : BoolArray
-        (m,) which of them were too large to be used.
-    dropped : mapping of str to int
-        Dropped events by reason.
-    events : int
-        All events, dropped ones included.
-
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written.
-
+    ``residuals`` (m, 3) are r_i of the landmarks seen, metres; ``rejected`` (m,) are those too
+    large to be used. ``dropped`` counts by reason; ``events`` are all, dropped ones included.
     """
     lengths_m = np.linalg.norm(residuals, axis=-1)
     are_there = bool(lengths_m.any())

@@ -1,4 +1,4 @@
-"""Figures of a simulation, as PNG files: those of the paper."""
+"""Figures of a simulation: those of the paper."""
 
 from __future__ import annotations
 
@@ -38,29 +38,10 @@ def plot_lyapunov(
     log10_lyapunov: FloatArray,
     slope_per_s: float | None = None,
 ) -> Path:
-    """Draw the Lyapunov function (34) over time, as the paper's Fig. 3.
+    """Draw the Lyapunov function (34) over times (k,), as the paper's Fig. 3.
 
-    Parameters
-    ----------
-    path : Path
-        PNG file to write.
-    times_s : FloatArray
-        (k,) times, seconds.
-    log10_lyapunov : FloatArray
-        (k,) decimal logarithm of L; where L is zero, -inf, nothing is drawn.
-    slope_per_s : float, optional
-        Fitted slope after the transient, drawn beside the curve.
-
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written.
-
+    Where ``log10_lyapunov`` (k,) is -inf nothing is drawn. The slope, decades per second, is that
+    fitted after the transient.
     """
     finite = np.isfinite(log10_lyapunov)
     times_s, log10_lyapunov = times_s[finite], log10_lyapunov[finite]
@@ -109,22 +90,13 @@ def plot_configuration(
     true_landmarks : FloatArray
         (n, 3) true landmarks, metres.
 
-    Returns
-    -------
-    Path
-        ``path``.
-
-    Raises
-    ------
-    EvaluationError
-        The file can't be written.
-
     """
-    settled = slice(len(truth) // 2, None)
+    # The rigid correction
+    second_half = slice(len(truth) // 2, None)
     known = np.isfinite(landmark_tracks[-1]).all(axis=-1)
     correction = rigid_alignment(
-        np.concatenate([estimate.positions[settled], landmark_tracks[-1, known]]),
-        np.concatenate([truth.positions[settled], true_landmarks[known]]),
+        np.concatenate([estimate.positions[second_half], landmark_tracks[-1, known]]),
+        np.concatenate([truth.positions[second_half], true_landmarks[known]]),
     )
     estimate = estimate.moved(correction)
     tracks = se3.transform(correction, landmark_tracks[:, known])

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
+from slam_observer_ros.common.tables import table_of
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.plots.simulation_plots import plot_configuration, plot_lyapunov
@@ -44,7 +44,7 @@ def report(listener: DemoListener, folder: Path, console: Console) -> bool:
         'estimates heard': str(count),
         **{path.name: str(path) for path in sorted(folder.iterdir())},
     }
-    _print(console, rows)
+    console.print(table_of('Demo', rows))
     verdict = 'converged' if has_converged else 'did NOT converge'
     console.print(f'The observer {verdict}.', style='green' if has_converged else 'red')
     return has_converged
@@ -77,12 +77,3 @@ def _accuracy(listener: DemoListener) -> dict[str, str]:
         'ATE, whole run': f'{trajectory_errors(estimate, truth).ate_rmse_m:.4f} m',
         'ATE, second half': f'{trajectory_errors(second_half, truth).ate_rmse_m:.1e} m',
     }
-
-
-def _print(console: Console, rows: dict[str, str]) -> None:
-    table = Table(title='Demo', title_justify='left', show_header=False)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow='fold')
-    for name, value in rows.items():
-        table.add_row(name, value)
-    console.print(table)

@@ -10,9 +10,8 @@ from rclpy.node import Node
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
 from slam_observer_ros.geometry.matrices import limited
-from slam_observer_ros.estimator.estimator import GIVEN_POSE_STD
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_pose_with_covariance_stamped,
     PoseMessage,

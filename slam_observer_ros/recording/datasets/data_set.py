@@ -16,25 +16,11 @@ from slam_observer_ros.recording.writer import RecordingWriter
 
 @dataclass(frozen=True, slots=True)
 class DataSet:
-    """One run of one robot.
+    """One run of one robot, in its body frame.
 
-    Attributes
-    ----------
-    velocity_stamps_ns : IntArray
-        (k,) nanoseconds.
-    body_velocities : FloatArray
-        (k, 6) angular then linear, rad/s and m/s, body frame.
-    observations : list of ObservationEvent
-        Landmarks seen, in the body frame, in stamp order; none is empty.
-    truth_stamps_ns : IntArray
-        (p,) nanoseconds.
-    true_poses : FloatArray
-        (p, 4, 4) body to world.
-    landmarks : LandmarkTruth
-        True positions of all landmarks.
-    left_out : Counter
-        Measurements that are no landmark observations, by reason.
-
+    ``body_velocities`` (k, 6) are angular then linear, rad/s and m/s; ``true_poses`` (p, 4, 4)
+    body to world. The observations are in stamp order and none is empty; ``left_out`` counts
+    measurements that are no landmark observations, by reason.
     """
 
     velocity_stamps_ns: IntArray
@@ -47,22 +33,7 @@ class DataSet:
 
 
 def write_data_set(data_set: DataSet, out: Path | str, overwrite: bool = False) -> None:
-    """Write a data set as a recording: velocities, observations and truth in stamp order.
-
-    Parameters
-    ----------
-    data_set : DataSet
-    out : Path or str
-        The .mcap file to be made.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    RecordingError
-        If the file exists or can't be written.
-
-    """
+    """Write velocities, observations and truth in stamp order, with a :class:`RecordingWriter`."""
     # At equal stamps the velocity comes first, then what is seen, then the truth.
     velocities = [
         VelocityEvent(stamp_ns, body_velocity)

@@ -35,19 +35,8 @@ def load_mrclam(folder: Path | str, robot: int) -> DataSet:
 
     Velocities are the commands that the robot was given: forward speed and yaw rate. Landmark ids
     are subject numbers; sightings of other robots and misread barcodes are left out and counted.
-
-    Parameters
-    ----------
-    folder : Path or str
-        For example ``MRCLAM_Dataset6``.
-    robot : int
-        1 to 5.
-
-    Raises
-    ------
-    DataSetError
-        If a file is missing or malformed, or there is no such robot; it lists those there are.
-
+    Raises a DataSetError if a file is missing or malformed; if there is no such robot it lists
+    those there are.
     """
     folder = Path(folder)
     _require_robot(folder, robot)
@@ -113,7 +102,8 @@ def _planar_poses(x_y_heading: FloatArray) -> FloatArray:
 
 
 def _observations(folder: Path, robot: int) -> tuple[list[ObservationEvent], Counter[str]]:
-    """Gather the rows of each stamp into one observation."""
+    """Return observations, and how many measurements are none, by reason."""
+    # Which landmark each barcode is
     measurements = _table(folder / f'Robot{robot}_Measurement.dat', columns=4)
     barcodes = _table(folder / 'Barcodes.dat', columns=2).astype(np.int64)
     subject_of = dict(zip(barcodes[:, 1].tolist(), barcodes[:, 0].tolist(), strict=True))
@@ -129,6 +119,8 @@ def _observations(folder: Path, robot: int) -> tuple[list[ObservationEvent], Cou
             MISREAD: int(np.sum(misread)),
         }
     )
+
+    # The rows of each stamp are one observation
     measurements, subjects = measurements[is_landmark], subjects[is_landmark]
     stamps_ns, starts = np.unique(_stamps_ns(measurements), return_index=True)
     ranges, bearings = measurements[:, 2], measurements[:, 3]

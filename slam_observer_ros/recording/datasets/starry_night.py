@@ -34,24 +34,13 @@ _SHAPES = {
     'rho_v_c_v': (3, 1),
     **dict.fromkeys(('fu', 'fv', 'cu', 'cv', 'b'), (1, 1)),
 }
-"""Shape of each variable; -1 is the number of frames."""
+"""Shape of each variable; -1 is the number of images."""
 
 
 def load_starry_night(file: Path | str) -> DataSet:
-    """Read ``dataset3.mat``.
+    """Read ``dataset3.mat``; raise a DataSetError if it is missing, damaged or another file.
 
     Landmark ids are the indices of the LEDs; the body frame is the data set's vehicle frame.
-
-    Parameters
-    ----------
-    file : Path or str
-        The .mat file.
-
-    Raises
-    ------
-    DataSetError
-        If it is missing, isn't a .mat file, or lacks a variable.
-
     """
     variables = _read(Path(file))
     stamps_ns = EPOCH_NS + np.rint(variables['t'][0] * NANOSECONDS_PER_SECOND).astype(np.int64)
@@ -70,21 +59,11 @@ def load_starry_night(file: Path | str) -> DataSet:
 
 
 def triangulate(pixels: FloatArray, variables: dict[str, FloatArray]) -> FloatArray:
-    """Find points from where a stereo camera sees them.
+    """Return points (..., 3) in the vehicle frame, metres, from where a stereo camera sees them.
 
-    Parameters
-    ----------
-    pixels : FloatArray
-        (4, ...) columns and rows in the left and the right image: u_l, v_l, u_r, v_r.
-    variables : dict
-        Intrinsics ``fu fv cu cv``, baseline ``b`` in metres, and the camera's mounting:
-        ``C_c_v`` takes vehicle axes to camera axes, ``rho_v_c_v`` is its place in the vehicle.
-
-    Returns
-    -------
-    FloatArray
-        (..., 3) points in the vehicle frame, metres.
-
+    The pixels (4, ...) are columns and rows in the left and the right image: u_l, v_l, u_r, v_r.
+    The variables are intrinsics ``fu fv cu cv``, baseline ``b`` in metres, and the camera's
+    mounting: ``C_c_v`` takes vehicle axes to camera axes, ``rho_v_c_v`` is its position.
     """
     fu, fv, cu, cv, baseline = (variables[name].item() for name in ('fu', 'fv', 'cu', 'cv', 'b'))
     left_column, left_row, right_column, right_row = pixels
@@ -112,10 +91,10 @@ def _read(file: Path) -> dict[str, FloatArray]:
         raise DataSetError(f'{file}: not a MATLAB file, or damaged: {error}') from error
     missing = [name for name in _SHAPES if name not in variables]
     if missing:
-        raise DataSetError(f'{file}: not Starry Night: it lacks {" ".join(missing)}')
-    frames = variables['t'].size
+        raise DataSetError(f'{file}: not Starry Night: it has no {" ".join(missing)}')
+    images = variables['t'].size
     for name, shape in _SHAPES.items():
-        expected = tuple(frames if size == -1 else size for size in shape)
+        expected = tuple(images if size == -1 else size for size in shape)
         if variables[name].shape != expected:
             raise DataSetError(f'{file}: {name} has shape {variables[name].shape}, not {expected}')
     return variables
@@ -125,8 +104,8 @@ def _observations(stamps_ns: IntArray, variables: dict[str, FloatArray]) -> list
     pixels = variables['y_k_j']
     seen = pixels.min(axis=0) >= 0.0  # -1 where a landmark isn't seen.
     observations = []
-    for frame in np.flatnonzero(seen.any(axis=1)).tolist():
-        ids = np.flatnonzero(seen[frame])
-        points = triangulate(pixels[:, frame, ids], variables)
-        observations.append(ObservationEvent(int(stamps_ns[frame]), ids, points))
+    for image in np.flatnonzero(seen.any(axis=1)).tolist():
+        ids = np.flatnonzero(seen[image])
+        points = triangulate(pixels[:, image, ids], variables)
+        observations.append(ObservationEvent(int(stamps_ns[image]), ids, points))
     return observations

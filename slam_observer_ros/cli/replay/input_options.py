@@ -85,13 +85,7 @@ def topic_names(args: argparse.Namespace) -> TopicNames:
 def read_inputs(args: argparse.Namespace) -> InputSettings:
     """Build settings from ``--config``, ``--set`` and the options themselves; later ones win.
 
-    The base frame is empty if the user names none.
-
-    Raises
-    ------
-    SlamObserverError
-        If a file or a value is wrong.
-
+    The base frame is empty if the user names none. A SlamObserverError says what is wrong.
     """
     values: dict[str, object] = {'base_frame': ''}
     given = read_config(args) | read_assignments(args)
@@ -140,7 +134,7 @@ def with_base_frame(
     if velocity_frame not in world:
         base_frame = velocity_frame
     elif base_frame not in (*world, default):
-        if recording.contents.transform_places(default, selected):
+        if recording.contents.has_transform_of(default, selected):
             base_frame = default
         else:
             logger.warning(

@@ -1,4 +1,4 @@
-"""What ``slam-observer replay`` tells of its outcome."""
+"""What ``slam-observer replay`` prints: a table, or one JSON object."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from dataclasses import asdict
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.replay.replay_checks import list_dropped
-from slam_observer_ros.cli.replay.replay_outcome import ReplayOutcome
+from slam_observer_ros.cli.replay.outcome import list_dropped, ReplayOutcome
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.runs.replay import Replay
 
 NEARLY_ALL = 0.99
-"""Share of the trajectory that the truth covers, up to which it is told."""
+"""Share of the trajectory that the truth covers, up to which it is printed."""
 
-LANDMARK_FATES = ('moved', 'forgotten', 'unsupported')
-"""What befalls landmarks that are in the map."""
+LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported')
+"""What may happen to landmarks of the map; counted under these names."""
 
 ACCURACY_ROWS = {
     'ate_rmse_m': ('position error (ATE), RMS', 'm after alignment'),
@@ -84,8 +83,8 @@ def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str,
         'events': f'{outcome.events} over {outcome.duration_s:.1f} s',
         'estimator': f'{estimator.settings.gains} gains, '
         f'{outcome.result.seconds:.2f} s of CPU time',
-        'landmarks': _told_landmarks(len(estimator.landmark_ids), estimator.counts),
-        'observed points': _told_points(estimator.counts),
+        'landmarks': _landmarks_text(len(estimator.landmark_ids), estimator.counts),
+        'observed points': _points_text(estimator.counts),
         'dropped': list_dropped(outcome.dropped),
     }
     if slips := estimator.counts['slip']:
@@ -93,40 +92,40 @@ def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str,
     if unexpected := estimator.counts['unexpected_place']:
         rows['unexpected places'] = f'{unexpected} × nothing seen was where the map has it'
     if outcome.localised_after_s is not None:
-        rows['place in the map'] = _told_place(outcome.result, outcome.localised_after_s)
+        rows['pose in the map'] = _localisation_text(outcome.result, outcome.localised_after_s)
     rows |= {part.name: str(part) for part in estimator.calibration}
     rows |= _accuracy_rows(outcome)
     rows |= {name: str(path) for name, path in written.items()}
     print_table(str(recording), rows)
 
 
-def _told_place(result: Replay, localised_after_s: float) -> str:
-    told = f'found after {localised_after_s:.1f} s, where the trajectory begins'
+def _localisation_text(result: Replay, localised_after_s: float) -> str:
+    found = f'found after {localised_after_s:.1f} s, where the trajectory begins'
     if result.estimator.settings.set_initial_pose:
-        told = 'given at the start'
+        found = 'given at the start'
     lost = result.estimator.counts['lost']
-    return f'{told}; lost {lost} × and searched anew' if lost else told
+    return f'{found}; lost {lost} × and searched again' if lost else found
 
 
-def _told_landmarks(landmarks: int, counts: Counter[str]) -> str:
-    befell = {fate: counts[f'{fate}_landmark'] for fate in LANDMARK_FATES}
-    told = [f'{count} {fate}' for fate, count in befell.items() if count]
-    return ', '.join([str(landmarks), *told])
+def _landmarks_text(landmarks: int, counts: Counter[str]) -> str:
+    changed = {change: counts[f'{change}_landmark'] for change in LANDMARK_CHANGES}
+    changes = [f'{count} {change}' for change, count in changed.items() if count]
+    return ', '.join([str(landmarks), *changes])
 
 
-def _told_points(counts: Counter[str]) -> str:
-    """Tell how many points were used, and what befell the others."""
-    told = [f'{used_points(counts)} used']
-    told += [
-        f'{counts[name]} {fate} ({100.0 * point_share(counts, name):.1f} %)'
-        for name, fate in UNUSED_POINTS.items()
+def _points_text(counts: Counter[str]) -> str:
+    """Say how many points were used, and why the others were not."""
+    parts = [f'{used_points(counts)} used']
+    parts += [
+        f'{counts[name]} {reason} ({100.0 * point_share(counts, name):.1f} %)'
+        for name, reason in UNUSED_POINTS.items()
         if counts[name]
     ]
-    return ', '.join(told)
+    return ', '.join(parts)
 
 
 def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
-    """Tell of how much of the trajectory the figures are, if not of nearly all."""
+    """Say of how much of the trajectory the figures are, if not of nearly all."""
     share = outcome.truth_covered
     if share is None or share > NEARLY_ALL:
         return {}

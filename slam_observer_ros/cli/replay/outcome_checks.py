@@ -1,16 +1,15 @@
-"""What a replay must have, and what it gives reason to warn of, before its outcome is told."""
+"""What a replay must have, and what it gives reason to warn of, before it is reported."""
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Mapping
 import logging
 from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.cli.replay.replay_outcome import unused_messages
+from slam_observer_ros.cli.replay.outcome import list_dropped, unused_messages
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
@@ -22,9 +21,9 @@ from slam_observer_ros.runs.replay import Replay
 from slam_observer_ros.settings.input_settings import InputSettings
 
 MAX_UNMAPPED = 0.5
-"""Share of the points beyond which they are more than what a map lacks."""
+"""Share of the points beyond which they are more than what a map has not got yet."""
 
-PLACES = (
+PLACE_THE_SENSOR = (
     '--set sensor_pose=[X,Y,Z,ROLL,PITCH,YAW] places a sensor that is not on /tf, '
     '--base-frame names another frame of the robot'
 )
@@ -33,15 +32,15 @@ PLACES = (
 logger = logging.getLogger(__name__)
 
 
-def tell_restart(result: Replay) -> None:
-    """Warn if only a part of the recording is told of, because the clock jumped."""
-    if not result.restarts:
+def warn_of_resets(result: Replay) -> None:
+    """Warn if only a part of the recording is reported, because the clock jumped."""
+    if not result.resets:
         return
     logger.warning(
         'Trajectory, map, errors and figures are only of the %.1f s after the last jump of the '
         'clock (%d in all).',
         result.seconds_until(result.estimator.stamp_ns or 0),
-        result.restarts,
+        result.resets,
     )
 
 
@@ -54,30 +53,39 @@ def check_used(
 ) -> None:
     """Warn if no velocity was used, none of the Imu, or no observation.
 
-    Raises
-    ------
-    UsageError
-        If no observation was used though ``--smooth``, ``--map`` or ``--load-map`` needs some.
-
+    Raises a UsageError if ``--smooth``, ``--map`` or ``--load-map`` needs some of the last.
     """
     dropped = result.estimator.dropped + unused_messages(recording, selected)
     _warn_of_unused_velocities(selected, result, dropped)
     counts = result.estimator.counts
-    # In a map that was loaded there may be none because the place was not found: told elsewhere.
+    # In a loaded map there may be none as its pose was not found, which check_localised reports.
     if result.observations or (counts['observed_point'] and not result.estimator.is_localised):
         return
-    unused = Counter({'without a point that is used': counts['observation']})
-    unused += Counter({f'points {fate}': counts[name] for name, fate in UNUSED_POINTS.items()})
-    why = f'observation was used (dropped: {list_dropped(unused + dropped)})'
-    hint = ''
-    if recording.dropped[NO_TRANSFORM] or not unused + dropped:
-        hint = recording.contents.missing_tags(selected, inputs.tag_frame_prefix)
-    if recording.dropped[NO_TRANSFORM]:
-        hint = hint or PLACES
-    why += f'; {hint}' if hint else ''
+    dropped = _unused_points(counts) + dropped
+    why = f'observation was used (dropped: {list_dropped(dropped)})'
+    if hint := _hint_where_none_was_used(recording, selected, inputs, dropped):
+        why += f'; {hint}'
     if args.smooth or args.map is not None or args.load_map is not None:
         raise UsageError(f'no {why}; --smooth, --map and --load-map need some')
     logger.warning('No %s; the trajectory is that of the velocities alone.', why)
+
+
+def _unused_points(counts: Counter[str]) -> Counter[str]:
+    """Return how many observations had no point that is used, and why the points were not."""
+    return Counter({'without a point that is used': counts['observation']}) + Counter(
+        {f'points {why}': counts[name] for name, why in UNUSED_POINTS.items()}
+    )
+
+
+def _hint_where_none_was_used(
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings, dropped: Counter[str]
+) -> str:
+    """Return what may be wrong where no observation was used; empty if nothing is known."""
+    is_unplaced = recording.dropped[NO_TRANSFORM] > 0
+    if dropped and not is_unplaced:
+        return ''
+    missing_tags = recording.contents.missing_tags(selected, inputs.tag_frame_prefix)
+    return missing_tags or (PLACE_THE_SENSOR if is_unplaced else '')
 
 
 def _warn_of_unused_velocities(
@@ -97,30 +105,18 @@ def _warn_of_unused_velocities(
         )
 
 
-def list_dropped(dropped: Mapping[str, int]) -> str:
-    """Return how many events were dropped, by reason, as text."""
-    return ', '.join(f'{count} {reason}' for reason, count in dropped.items()) or 'none'
-
-
-def check_place(args: argparse.Namespace, result: Replay, known: LandmarkMap) -> None:
+def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap) -> None:
     """Refuse an outcome that is not in the frame of the map that was loaded.
 
-    Where the place was found and lost again the trajectory is still of use, but not the map.
-
-    Raises
-    ------
-    UsageError
-        If the place was never found, or is not known at the end and the map is asked for.
-
+    Where the pose in it was found and lost again the trajectory is still of use, but not the map:
+    a UsageError says if the pose was never found, or not at the end and the map is asked for.
     """
     if result.estimator.is_localised:
         return
     if not len(result.trajectory):
         raise UsageError(_never_found(args.load_map, result, known))
     end_s = result.seconds_until(result.trajectory.stamps_ns[-1])
-    lost = (
-        f'the place in the map {args.load_map} was lost after {end_s:.1f} s, and not found again'
-    )
+    lost = f'the pose in the map {args.load_map} was lost after {end_s:.1f} s, and not found again'
     if args.map is not None or args.smooth:
         raise UsageError(f'{lost}; --map and --smooth need it at the end')
     logger.warning('%s; the trajectory ends there.', lost[0].upper() + lost[1:])
@@ -130,7 +126,7 @@ def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
     named = known.ids[~is_automatic(known.ids)]
     least = 'two' if result.estimator.settings.two_d_mode else 'three'
     return (
-        f'the place in the map {path} was not found: that takes {least} of its landmarks or more, '
+        f'the pose in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
         f'{np.isin(named, result.estimator.landmark_ids).sum()} of its {len(known.ids)} were '
         f'seen{_advice(result)}'
@@ -138,14 +134,14 @@ def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
 
 
 def _advice(result: Replay) -> str:
-    """Return what to do if the landmarks seen did not tell the place."""
+    """Return what to do if the landmarks seen did not determine the pose."""
     counts, settings = result.estimator.counts, result.estimator.settings
     if counts['unknown_id'] and settings.gains != 'riccati':
         return f'; {counts["unknown_id"]} points without id take --gains riccati'
     if 2 * counts['repeated_id'] > counts['observed_point']:
         return f'; {counts["repeated_id"]} points were {UNUSED_POINTS["repeated_id"]}'
     if settings.set_initial_pose:
-        return '; they contradict the pose that was told'
+        return '; they contradict the pose that was given'
     return (
         '. Where the start is known: --set set_initial_pose=true '
         '--set initial_position=[X,Y,Z] --set initial_yaw=YAW'

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import logging
 
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
+from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.topics import SelectedTopics
-from slam_observer_ros.runs.accuracy import Accuracy, measure, measure_smoothed
+from slam_observer_ros.runs.accuracy import Accuracy, measure, measure_smoothed, trajectory_of
 from slam_observer_ros.runs.replay import Replay
 
 MALFORMED = 'malformed'
@@ -23,27 +25,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ReplayOutcome:
-    """A replay and all that is told about it.
+    """A replay, and all that is reported of it.
 
-    Attributes
-    ----------
-    selected : SelectedTopics
-        Which topics were used.
-    result : Replay
-        What the estimator made of the recording.
-    truth : Truth
-        What the recording holds of it.
-    accuracy : Accuracy
-        The one compared with the other.
-    duration_s : float
-        Time that the recording spans, seconds.
-    unused : Counter
-        Messages that did not become events, by reason.
-    missing_ids : str
-        What :meth:`.Contents.missing_ids` says of the landmarks.
-    smoothed, smoothed_errors, smoothed_landmark_rmse_m
-        Trajectory and map in hindsight and how far they are off; None if not asked for.
-
+    ``unused`` counts the messages that did not become events, by reason; ``missing_ids`` is what
+    :meth:`.Contents.missing_ids` says of the landmarks. What is smoothed is None if not asked for.
     """
 
     selected: SelectedTopics
@@ -68,6 +53,16 @@ class ReplayOutcome:
         return dict(self.result.estimator.dropped + self.unused)
 
     @property
+    def trajectory(self) -> Trajectory:
+        """The smoothed trajectory, if that was asked for; else the online one."""
+        return self.result.trajectory if self.smoothed is None else trajectory_of(self.smoothed)
+
+    @property
+    def trajectory_errors(self) -> TrajectoryErrors | None:
+        """Errors of :attr:`trajectory`; None without truth."""
+        return self.accuracy.pose_errors if self.smoothed is None else self.smoothed_errors
+
+    @property
     def truth_covered(self) -> float | None:
         """Share of the trajectory that the truth covers; None without true poses."""
         errors = self.accuracy.pose_errors
@@ -75,7 +70,7 @@ class ReplayOutcome:
 
     @property
     def localised_after_s(self) -> float | None:
-        """Time until the place in a loaded map was found, seconds; None without such a map."""
+        """Time until the pose in a loaded map was found, seconds; None without such a map."""
         if not (self.result.in_known_map and len(self.result.trajectory)):
             return None
         return self.result.seconds_until(self.result.trajectory.stamps_ns[0])
@@ -91,6 +86,11 @@ def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[s
     """Count the messages that did not become events, by reason."""
     malformed = sum(recording.malformed[topic.name] for topic in selected.inputs)
     return recording.dropped + Counter({MALFORMED: malformed})
+
+
+def list_dropped(dropped: Mapping[str, int]) -> str:
+    """Return how many events were dropped, by reason, as text."""
+    return ', '.join(f'{count} {reason}' for reason, count in dropped.items()) or 'none'
 
 
 def outcome_of(
@@ -109,14 +109,7 @@ def outcome_of(
 
 
 def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
-    """Add what the whole recording tells in hindsight.
-
-    Raises
-    ------
-    UsageError
-        If the history holds no observation.
-
-    """
+    """Add trajectory and map smoothed; raise a UsageError if there is no observation to smooth."""
     smoothed = outcome.result.estimator.smooth()
     if not len(smoothed.stamps_ns):
         raise UsageError(f'nothing to smooth: no observation since {smoothed.since}')

@@ -1,0 +1,151 @@
+"""``slam-observer replay``: a recording through the estimator."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+
+from slam_observer_ros.cli.console import print_json, show_progress
+from slam_observer_ros.cli.options import add_settings_options, read_settings
+from slam_observer_ros.cli.outputs import add_force_option, add_result_options
+from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
+from slam_observer_ros.cli.replay.input_options import (
+    add_input_options,
+    check_frames,
+    INPUT_NAMES,
+    INSTEAD,
+    read_inputs,
+    topic_names,
+    warn_of_unused,
+    with_base_frame,
+)
+from slam_observer_ros.cli.replay.outcome import outcome_of, ReplayOutcome, with_smoothed
+from slam_observer_ros.cli.replay.outcome_checks import (
+    check_localised,
+    check_used,
+    warn_of_input,
+    warn_of_resets,
+)
+from slam_observer_ros.cli.replay.summary import as_json, print_summary
+from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
+from slam_observer_ros.common.errors import OutputError, UsageError
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.replay import replay
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import InputSettings
+
+logger = logging.getLogger(__name__)
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the command line."""
+    parser = commands.add_parser(
+        'replay',
+        help='run a recording through the observer',
+        description='Run a recording through the observer, as the node would have, and compare '
+        'the outcome with the truth if the recording holds it.',
+    )
+    parser.add_argument(
+        'recording',
+        type=Path,
+        metavar='RECORDING',
+        help='.mcap, .db3 or ROS 1 .bag file, or rosbag2 directory',
+    )
+    add_input_options(parser)
+    parser.add_argument(
+        '--load-map',
+        type=Path,
+        metavar='FILE',
+        help='known landmarks, as --map writes them: the estimate is then in their frame, and has '
+        'no ANEES of the pose (nor of the configuration, if they are fixed)',
+    )
+    parser.add_argument(
+        '--smooth',
+        action='store_true',
+        help='estimate trajectory and map from all observations together, too; --tum and --map '
+        'then write these',
+    )
+    outputs = parser.add_argument_group('outputs')
+    outputs.add_argument(
+        '--tum',
+        type=Path,
+        metavar='FILE',
+        help='trajectory, as evo reads it, at most 20 poses a second',
+    )
+    outputs.add_argument('--map', type=Path, metavar='FILE', help='landmarks, as YAML')
+    add_result_options(outputs, FIGURES)
+    add_force_option(parser)
+    add_settings_options(parser, InputSettings)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Replay a recording, and write what was asked for."""
+    defaults = {'hindsight_window': 0} if args.smooth else {}
+    settings = read_settings(args, INPUT_NAMES, INSTEAD, **defaults)
+    inputs = read_inputs(args)
+    if args.smooth and settings.gains != 'riccati':
+        raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
+    check_files(args)
+    warn_of_unused(args, settings)
+    landmark_map = None if args.load_map is None else read_map(args.load_map)
+    outcome = _replay(args, settings, inputs, landmark_map)
+    _write_and_print(args, outcome, _frame_of_outputs(inputs, landmark_map))
+
+
+def _replay(
+    args: argparse.Namespace,
+    settings: Settings,
+    inputs: InputSettings,
+    landmark_map: LandmarkMap | None,
+) -> ReplayOutcome:
+    """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
+    with Recording(args.recording) as recording:
+        if recording.warning:
+            logger.warning('%s', recording.warning)
+        selected = recording.find_topics(topic_names(args), inputs)
+        inputs = with_base_frame(inputs, recording, selected)
+        check_frames(inputs)
+        truth = recording.truth(selected, inputs.base_frame)
+        truth = truth.flattened() if settings.two_d_mode else truth
+        events = show_progress(
+            recording.events(selected, inputs, settings.velocity_timeout),
+            'replaying',
+            recording.event_count(selected),
+        )
+        result = replay(events, settings, truth, landmark_map)
+        warn_of_resets(result)
+        check_used(args, recording, selected, inputs, result)
+        if landmark_map is not None:
+            check_localised(args, result, landmark_map)
+        outcome = outcome_of(recording, selected, result, truth)
+        warn_of_input(recording, selected, result)
+        warn_of_timing(recording, selected, settings.velocity_timeout)
+    return with_smoothed(outcome) if args.smooth else outcome
+
+
+def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
+    """Return the frame of what is written: that of the map that was loaded, if one was."""
+    if landmark_map is None or landmark_map.frame_id == inputs.map_frame:
+        return inputs.map_frame
+    logger.warning(
+        "The map is in frame '%s', and so is what is written; the node takes it with "
+        'map_frame: %s only.',
+        landmark_map.frame_id,
+        landmark_map.frame_id,
+    )
+    return landmark_map.frame_id
+
+
+def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
+    """Write and print all that can be, and only then say what could not be written."""
+    written, errors = write_files(args, outcome, map_frame)
+    if args.json:
+        print_json(as_json(outcome))
+    else:
+        print_summary(args.recording, outcome, written)
+    if errors:
+        raise OutputError('; '.join(errors))

@@ -1,0 +1,17 @@
+"""Tables of names and values for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rich.table import Table
+
+
+def table_of(title: str, rows: Mapping[str, str]) -> Table:
+    """Return a table of names and values; a narrow terminal folds it and shortens nothing."""
+    table = Table(title=title, title_justify='left', show_header=False)
+    for _ in ('name', 'value'):
+        table.add_column(overflow='fold')
+    for name, value in rows.items():
+        table.add_row(name, value)
+    return table
