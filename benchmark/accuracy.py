@@ -17,7 +17,8 @@ from pathlib import Path
 import sys
 from typing import TypeVar
 
-from jobs import ALL, Job, run_job, run_seed, SeedJob
+import features
+from jobs import ALL, FeatureJob, Job, run_feature, run_job, run_seed, SeedJob
 import monte_carlo
 import numpy as np
 import report
@@ -53,8 +54,9 @@ def main() -> None:
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
         until_s = args.skip + QUICK_S if args.quick else math.inf
         tables = run_jobs(pool, list(list_jobs(chosen, args.skip, until_s)))
+        worth = run_features(pool, chosen_cases(args.only), args.skip, until_s)
         consistency = run_monte_carlo(pool, loops, seeds)
-    results = report.Results(tables, consistency, len(seeds))
+    results = report.Results(tables, worth, consistency, len(seeds))
     sys.stdout.write(report.tables(results))
     if args.json:
         args.json.write_text(json.dumps(report.to_json(results), indent=1) + '\n')
@@ -69,7 +71,7 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--json', type=Path, metavar='FILE', help='write all numbers to FILE')
     parser.add_argument(
-        '--only', default='', metavar='NAME', help='only data sets whose name contains NAME'
+        '--only', default='', metavar='NAME', help='only what has NAME in its name'
     )
     parser.add_argument(
         '--quick', action='store_true', help='only the first minute and few Monte Carlo runs'
@@ -90,14 +92,20 @@ def parse_arguments() -> argparse.Namespace:
     args = parser.parse_args()
     if args.write_docs and (args.only or args.quick or args.skip):
         parser.error('--write-docs takes the whole benchmark, without --only, --quick or --skip')
-    if not chosen_worlds(args.only):
-        parser.error(f"--only '{args.only}' fits no data set: {', '.join(worlds.names())}")
+    if not chosen_worlds(args.only) + chosen_cases(args.only):
+        known = ', '.join(worlds.names() + features.names())
+        parser.error(f"--only '{args.only}' fits none of: {known}")
     return args
 
 
 def chosen_worlds(part: str) -> list[str]:
     """Return the names of the data sets that contain ``part``."""
     return [name for name in worlds.names() if part.lower() in name.lower()]
+
+
+def chosen_cases(part: str) -> list[str]:
+    """Return the names of the features on data that contain ``part``."""
+    return [name for name in features.names() if part.lower() in name.lower()]
 
 
 def list_jobs(names: list[str], from_s: float, to_s: float) -> Iterator[Job]:
@@ -123,6 +131,20 @@ def run_jobs(pool: ProcessPoolExecutor, jobs: list[Job]) -> report.Tables:
         job = futures[future]
         tables[job.variant][job.world].update(future.result())
     return tables
+
+
+def run_features(
+    pool: ProcessPoolExecutor, cases: list[str], from_s: float, to_s: float
+) -> report.Worth:
+    """Return case → scores with the feature and without it, of each draw."""
+    jobs = [
+        FeatureJob(case, draw, from_s, to_s) for case in cases for draw in range(features.DRAWS)
+    ]
+    futures = {pool.submit(run_feature, job): job for job in jobs}
+    worth: report.Worth = {case: [] for case in cases}
+    for future in show_progress('features', futures):
+        worth[futures[future].case].append(future.result())
+    return worth
 
 
 def run_monte_carlo(

@@ -10,6 +10,7 @@ from operator import attrgetter
 
 import estimators
 from estimators import Run
+import features
 from gtsam_baselines import IndeterminateError
 import monte_carlo
 import outliers
@@ -66,6 +67,16 @@ class SeedJob:
     seed: int
 
 
+@dataclass(frozen=True, slots=True)
+class FeatureJob:
+    """A draw of a case of :mod:`features`, the part of it between two times, seconds."""
+
+    case: str
+    draw: int
+    from_s: float
+    to_s: float
+
+
 def run_job(job: Job) -> dict[str, Scores]:
     """Return the scores by column."""
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
@@ -88,6 +99,12 @@ def run_seed(job: SeedJob) -> FloatArray:
     """Return what :func:`monte_carlo.run_once` does."""
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
     return monte_carlo.run_once(job.loop, job.estimator, job.seed)
+
+
+def run_feature(job: FeatureJob) -> tuple[Scores, Scores]:
+    """Return the scores with the feature and without it."""
+    logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
+    return features.with_and_without(job.case, job.draw, job.from_s, job.to_s)
 
 
 def _columns(job: Job) -> tuple[str, ...]:

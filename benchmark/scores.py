@@ -12,7 +12,6 @@ from worlds import World
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.metrics import landmark_errors, trajectory_errors
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent
 
 
@@ -54,10 +53,10 @@ def score(run: Run, world: World, has_ids: bool = True) -> Scores:
     )
     errors = trajectory_errors(trajectory, world.truth)
     return Scores(
-        _configuration_rmse_m(compared, world.truth, world.landmarks),
+        _configuration_rmse_m(compared, world),
         errors.ate_rmse_m,
         errors.heading_rmse_rad,
-        landmark_errors(final.ids, final.world_points, world.landmarks).rmse_m
+        landmark_errors(final.ids, final.world_points, world.landmarks_at(final.stamp_ns)).rmse_m
         if has_ids
         else float('nan'),
         run.cpu_s,
@@ -93,12 +92,10 @@ def _compared(run: Run, world: World) -> list[Snapshot]:
     return snapshots
 
 
-def _configuration_rmse_m(
-    snapshots: list[Snapshot], truth: Trajectory, landmarks: LandmarkTruth
-) -> float:
+def _configuration_rmse_m(snapshots: list[Snapshot], world: World) -> float:
     """Return the RMS of the configuration error over the observations that the truth covers."""
     stamps_ns = np.array([snapshot.stamp_ns for snapshot in snapshots])
-    true_poses, covered = interpolate(truth, stamps_ns)
+    true_poses, covered = interpolate(world.truth, stamps_ns)
     error = ConfigurationError()
     for i in np.flatnonzero(covered):
         estimate = snapshots[i]
@@ -108,6 +105,6 @@ def _configuration_rmse_m(
             estimate.ids,
             estimate.world_points,
             true_poses[i],
-            landmarks,
+            world.landmarks_at(estimate.stamp_ns),
         )
     return float('nan') if error.rmse_m is None else error.rmse_m

@@ -35,6 +35,7 @@ VELOCITY_RATE_HZ = 20
 SPEED = 0.5
 MAX_SEEN = 5
 DETECTED_SHARE = 0.7
+LANDMARK_SPEED = (0.05, 0.3)
 
 CIRCLE = Scenario(
     duration=120.0,
@@ -60,7 +61,9 @@ class World:
     truth : Trajectory
         True poses.
     landmarks : LandmarkTruth
-        True landmarks.
+        True landmarks, at stamp 0 if they move.
+    landmark_velocities : FloatArray or None
+        (n, 3) their true velocities, world, m/s; None where all are at rest.
 
     """
 
@@ -68,6 +71,22 @@ class World:
     events: list[Event]
     truth: Trajectory
     landmarks: LandmarkTruth
+    landmark_velocities: FloatArray | None = None
+
+    def landmarks_at(self, stamp_ns: int) -> LandmarkTruth:
+        """Return where the landmarks truly are at a stamp."""
+        if self.landmark_velocities is None:
+            return self.landmarks
+        moved_m = stamp_ns * 1e-9 * self.landmark_velocities
+        return LandmarkTruth(self.landmarks.ids, self.landmarks.world_points + moved_m)
+
+    def known_at_rest(self) -> World:
+        """Return the same with the truth of those landmarks alone that are at rest."""
+        if self.landmark_velocities is None:
+            return self
+        rests = ~self.landmark_velocities.any(axis=1)
+        landmarks = LandmarkTruth(self.landmarks.ids[rests], self.landmarks.world_points[rests])
+        return replace(self, landmarks=landmarks, landmark_velocities=None)
 
     def part(self, from_s: float, to_s: float) -> World:
         """Return what is between two times since the start of the run."""
@@ -92,6 +111,9 @@ class Loop:
         How far the sensor sees. It looks at the nearest five, and misses three in ten of them.
     observation_rate_hz : int
         A divisor of the velocities' rate, 20 Hz.
+    moving_share : float
+        Share of the landmarks that move, each straight on at 0.05 to 0.3 m/s: carts pushed on or
+        slow robots. Each is beside the course when the robot first comes by.
 
     """
 
@@ -101,6 +123,7 @@ class Loop:
     landmarks: int
     max_range_m: float
     observation_rate_hz: int
+    moving_share: float = 0.0
 
 
 STEREO_LOOP = Loop('stereo_inertial', 300.0, 390.0, 100, 6.0, 5)
@@ -190,16 +213,20 @@ def drive(loop: Loop, settings: Settings, seed: int) -> World:
     poses = se3.inverse(course[0]) @ course
     stamps_ns = np.rint(t_s * 1e9).astype(np.int64)
     points = se3.transform(se3.inverse(course[0]), _roadside(loop, settings.two_d_mode, rng))
+    walks = _walks(loop, settings.two_d_mode, seed) @ course[0][:3, :3]
+    points -= loop.lap_s * np.linspace(0.0, 1.0, loop.landmarks)[:, None] * walks
     landmarks = LandmarkTruth(np.arange(loop.landmarks), points)
-    velocities = _measured_velocities(poses, settings, rng)
     events: list[Event] = []
+    world = World(settings, events, Trajectory(stamps_ns, poses), landmarks, walks)
+    velocities = _measured_velocities(poses, settings, rng)
     for k, stamp_ns in enumerate(stamps_ns.tolist()):
         events.append(VelocityEvent(stamp_ns, velocities[min(k, len(velocities) - 1)]))
         if k % (VELOCITY_RATE_HZ // loop.observation_rate_hz) == 0:
-            seen = _look(stamp_ns, poses[k], landmarks, loop.max_range_m, rng)
+            there = world.landmarks_at(stamp_ns)
+            seen = _look(stamp_ns, poses[k], there, loop.max_range_m, rng)
             if len(seen.ids):
                 events.append(_measured(seen, settings, rng))
-    return World(settings, events, Trajectory(stamps_ns, poses), landmarks)
+    return world
 
 
 def _drive_shipped(loop: Loop) -> World:
@@ -247,6 +274,17 @@ def _roadside(loop: Loop, planar: bool, rng: np.random.Generator) -> FloatArray:
     offsets = rng.uniform(-3.0, 3.0, (loop.landmarks, 3))
     points: FloatArray = _ring(loop, phi / loop.landmarks, planar) + offsets
     return points * np.array([1.0, 1.0, 0.0]) if planar else points
+
+
+def _walks(loop: Loop, planar: bool, seed: int) -> FloatArray:
+    """Return the landmarks' velocities (n, 3), of most of them zero."""
+    rng = np.random.default_rng([seed, loop.landmarks])  # the landmarks' places stay what they are
+    directions = rng.standard_normal((loop.landmarks, 3)) * np.array([1.0, 1.0, not planar])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    speeds = rng.uniform(*LANDMARK_SPEED, loop.landmarks)
+    moving = rng.permutation(loop.landmarks) < round(loop.moving_share * loop.landmarks)
+    walks: FloatArray = (speeds * moving)[:, None] * directions
+    return walks
 
 
 def _measured_velocities(
