@@ -29,8 +29,8 @@ from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
-from slam_observer_ros.observer.filter import Residuals
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.state import State
 
 MAX_CANDIDATES = 10

@@ -16,10 +16,9 @@ from slam_observer_ros.association.joint_compatibility import (
 )
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry.matrices import mahalanobis, with_blocks
-from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import gated
-from slam_observer_ros.state.map_management import rejected_before
-from slam_observer_ros.state.matching import MatchedObservation
+from slam_observer_ros.state.matching import MatchedObservation, rejected_before
 from slam_observer_ros.state.state import State
 
 SLIP_COST = 20.0

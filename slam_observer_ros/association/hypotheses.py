@@ -156,10 +156,11 @@ class Hypotheses:
         uses = Counter(number for number, taken in possible if taken.slipped is None)
         children: list[_Child] = []
         for number, taken in possible:
-            hypothesis = taken.slipped
-            if hypothesis is None:
+            hypothesis = self._all[number]
+            if taken.slipped is not None:
+                hypothesis = hypothesis.with_state(taken.slipped)
+            else:
                 uses[number] -= 1
-                hypothesis = self._all[number]
                 if uses[number]:
                     hypothesis = deepcopy(hypothesis)
             child = self._child(hypothesis, taken, event)
@@ -180,7 +181,7 @@ class Hypotheses:
             disbelieve(state, taken.disbelieved)
         hypothesis.cost = taken.cost
         if (event.ids == UNKNOWN_ID).any():
-            hypothesis.cost += hypothesis.visibility.note(taken.event, self._some_have_ids)
+            hypothesis.cost += hypothesis.visibility.note(state, taken.event, self._some_have_ids)
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
         return _Child(hypothesis, taken.event, outcome)
 
@@ -196,8 +197,8 @@ class Hypotheses:
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
-            cost = hypothesis.cost
-            for taken in interpretations(hypothesis, event, matched, new_ids, worst - cost):
+            state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
+            for taken in interpretations(state, index, event, matched, new_ids, worst - cost):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + PRUNING_COST)
         possible.sort(key=lambda pair: pair[1].cost)

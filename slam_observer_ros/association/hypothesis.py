@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 from slam_observer_ros.association.landmark_index import LandmarkIndex
@@ -34,4 +35,8 @@ class Hypothesis:
     @classmethod
     def of(cls, state: State) -> Hypothesis:
         """Return the only hypothesis there is."""
-        return cls(state, Visibility(state))
+        return cls(state, Visibility(state.axes.point))
+
+    def with_state(self, state: State) -> Hypothesis:
+        """Return another hypothesis, which has had the same in view."""
+        return Hypothesis(state, deepcopy(self.visibility), deepcopy(self.index), self.cost)

@@ -25,16 +25,15 @@ from slam_observer_ros.association.costs import (
     rejection_cost,
     SLIP_COST,
 )
-from slam_observer_ros.association.hypothesis import Hypothesis
+from slam_observer_ros.association.landmark_index import LandmarkIndex
 from slam_observer_ros.association.slip import slip
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import mahalanobis
-from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import are_far, far_from_the_others
-from slam_observer_ros.state.matching import match, MatchedObservation
+from slam_observer_ros.state.matching import is_contradiction, match, MatchedObservation
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import is_contradiction
 
 
 def _none() -> IntArray:
@@ -51,8 +50,8 @@ class Interpretation:
         The observation with all ids filled in, without points that are taken for outliers.
     cost : float
         −2 ln of its likelihood, up to what all interpretations of the observation share.
-    slipped : Hypothesis or None
-        The hypothesis if the robot may have moved in any way since the last observation.
+    slipped : State or None
+        The state if the robot may have moved in any way since the last observation.
     disbelieved : ObservationEvent or None
         Of the points that were left out though the gate lets them pass, those of landmarks that
         were seen so seldom that these may be the outliers; None or empty if there are none.
@@ -63,14 +62,15 @@ class Interpretation:
 
     event: ObservationEvent
     cost: float
-    slipped: Hypothesis | None = None
+    slipped: State | None = None
     disbelieved: ObservationEvent | None = None
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
 
 
 def interpretations(
-    hypothesis: Hypothesis,
+    state: State,
+    index: LandmarkIndex,
     event: ObservationEvent,
     matched: MatchedObservation,
     new_ids: IntArray,
@@ -82,8 +82,8 @@ def interpretations(
 
     Parameters
     ----------
-    hypothesis : Hypothesis
-        That of the observation's instant.
+    state, index : State, LandmarkIndex
+        That of the observation's instant, and the index of its landmarks.
     event : ObservationEvent
         The observation, of m points.
     matched : MatchedObservation
@@ -94,7 +94,6 @@ def interpretations(
         Cost beyond which interpretations need not be returned.
 
     """
-    state = hypothesis.state
     if not state.filter.has_joint_covariance:
         return [Interpretation(event, 0.0)]
     residuals, m = matched.residuals, len(event.ids)
@@ -105,9 +104,9 @@ def interpretations(
     is_suspect = _suspects(state, residuals, sensor_distances)
     suspects = state.landmarks.ids[residuals.rows[is_suspect]]
     if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
-        return _by_assignments(hypothesis, event, new_ids, suspects, budget)
+        return _by_assignments(state, index, event, new_ids, suspects, budget)
     if is_contradicted:
-        trusting, *slipped = _rejected_or_slipped(hypothesis, matched, event, rejected)
+        trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
     else:
         trusting, slipped = Interpretation(event, pairing_cost(state, m, residuals)), []
     doubted = [*suspects[:, None], suspects] if len(suspects) > 1 else [*suspects[:, None]]
@@ -161,7 +160,7 @@ def may_relabel(state: State, matched: MatchedObservation) -> bool:
 
 
 def _rejected_or_slipped(
-    hypothesis: Hypothesis,
+    state: State,
     matched: MatchedObservation,
     event: ObservationEvent,
     rejected: BoolArray,
@@ -171,10 +170,10 @@ def _rejected_or_slipped(
     If a single motion would have put all where they are seen, that is as unlikely of a garbled
     message as of a robot that has made this motion.
     """
-    state, residuals, m = hypothesis.state, matched.residuals, len(event.ids)
+    residuals, m = matched.residuals, len(event.ids)
     cost, is_news = rejection_cost(state, matched, rejected)
     as_told = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
-    after_slip = _after_slip(hypothesis, matched, event) if is_news else None
+    after_slip = _after_slip(state, matched, event) if is_news else None
     if after_slip is None:
         return [Interpretation(event, as_told + cost)]
     if state.was_contradicted:
@@ -186,18 +185,18 @@ def _rejected_or_slipped(
 
 
 def _after_slip(
-    hypothesis: Hypothesis, matched: MatchedObservation, event: ObservationEvent
+    state: State, matched: MatchedObservation, event: ObservationEvent
 ) -> Interpretation | None:
     """Take the robot for slipped; return None if that does not explain all of it."""
-    settings = hypothesis.state.settings
+    settings = state.settings
     if not (settings.unknown_linear_motion or settings.unknown_angular_motion):
         return None
-    slipped = deepcopy(hypothesis)
-    cost = slip(slipped.state, matched)
-    residuals = match(slipped.state, event).residuals
-    if _are_rejected(slipped.state, residuals).any():
+    slipped = deepcopy(state)
+    cost = slip(slipped, matched)
+    residuals = match(slipped, event).residuals
+    if _are_rejected(slipped, residuals).any():
         return None
-    cost += SLIP_COST + pairing_cost(slipped.state, len(event.ids), residuals)
+    cost += SLIP_COST + pairing_cost(slipped, len(event.ids), residuals)
     return Interpretation(event, cost, slipped)
 
 
@@ -224,7 +223,8 @@ def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) 
 
 
 def _by_assignments(
-    hypothesis: Hypothesis,
+    state: State,
+    index: LandmarkIndex,
     event: ObservationEvent,
     new_ids: IntArray,
     suspects: IntArray,
@@ -235,8 +235,7 @@ def _by_assignments(
     An id is believed here, too, until something contradicts it: an interpretation without a
     suspect costs no less than one with all of them.
     """
-    state = hypothesis.state
-    found = find_assignments(state, hypothesis.index, event, budget)
+    found = find_assignments(state, index, event, budget)
     outliers = [np.isin(event.ids, suspects) & (assignment.rows < 0) for assignment in found]
     pairs = list(zip(found, outliers, strict=True))
     trusting = min((assignment.cost for assignment, out in pairs if not out.any()), default=0.0)

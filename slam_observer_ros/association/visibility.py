@@ -9,7 +9,7 @@ import numpy as np
 from slam_observer_ros.association.field_of_view import FieldOfView
 from slam_observer_ros.common.types import BoolArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent
-from slam_observer_ros.state.map_management import forget
+from slam_observer_ros.state.landmark_table import LandmarkTable
 from slam_observer_ros.state.state import State
 
 IMPROBABLE = 20.0
@@ -29,20 +29,19 @@ class Visibility:
 
     Parameters
     ----------
-    state : State
-        The state.
+    k : int
+        Leading coordinates that matter: 2 in the plane, 3 in space.
 
     """
 
-    def __init__(self, state: State) -> None:
-        self._state, self._landmarks = state, state.landmarks
-        self._field_of_view = FieldOfView(state.axes.point)
+    def __init__(self, k: int) -> None:
+        self._field_of_view = FieldOfView(k)
         # −ln of the probability that none is seen for so long of the landmarks known before: those
         # without an id that were numbered up to here.
         self._evidence = 0.0
         self._newest_number = 0
 
-    def note(self, event: ObservationEvent, some_have_ids: bool) -> float:
+    def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
         """Count which landmarks were in view of an observation, already used, and which were seen.
 
         Some of its points came without an id. If others come with one (``some_have_ids``), these
@@ -54,21 +53,21 @@ class Visibility:
         Return −2 ln of the probability that confirmed landmarks in view were not seen, those that
         were not.
         """
-        state, landmarks = self._state, self._landmarks
+        landmarks = state.landmarks
         is_numbered, everything = is_automatic(landmarks.ids), np.arange(len(landmarks))
         seen = landmarks.last_seen_ns == event.stamp_ns
         in_view = seen | self._field_of_view.contains(state.observer.body_points(everything))
-        is_unexpected = not some_have_ids and self._add_evidence(event, in_view, seen)
-        state.counts['unexpected_place'] += is_unexpected
+        if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
+            state.counts['unexpected_place'] += 1
         rows = np.flatnonzero(is_numbered & in_view)
-        cost = self._cost(rows[~seen[rows] & ~landmarks.tentative[rows]])
+        cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
         landmarks.note_in_view(rows, seen[rows])
         self._field_of_view.include(event.points)
         unsupported = landmarks.unsupported(state.settings.min_support)
-        forget(state, unsupported, 'unsupported_landmark')
+        state.forget(unsupported, 'unsupported_landmark')
         return cost
 
-    def _cost(self, unseen: IntArray) -> float:
+    def _cost(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
         """Return what it costs that confirmed landmarks (u,) in view were not seen once more.
 
         The rate at which one in view is seen differs from one to the other and from one position
@@ -78,26 +77,31 @@ class Visibility:
         """
         if not self._field_of_view.is_known:
             return 0.0
-        p, missed = self._seen_share, self._landmarks.missed[unseen]
+        p, missed = _seen_share(landmarks), landmarks.missed[unseen]
         return 2.0 * float(np.sum(np.log1p(p / (1.0 + missed * p))))
 
-    @property
-    def _seen_share(self) -> float:
-        """How often a landmark in view is seen, as far as it is known."""
-        return min(max(self._landmarks.seen_share, MIN_SHARE), MOST_SHARE)
-
-    def _add_evidence(self, event: ObservationEvent, in_view: BoolArray, seen: BoolArray) -> bool:
+    def _add_evidence(
+        self,
+        landmarks: LandmarkTable,
+        event: ObservationEvent,
+        in_view: BoolArray,
+        seen: BoolArray,
+    ) -> bool:
         """Count those in view and not seen (n,); return whether they are too many, too long."""
-        landmarks = self._landmarks
         numbers = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
         old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)
         if (old & seen).any():
             self._evidence = 0.0
         elif len(event.points) and self._field_of_view.is_known:
-            evidence = -math.log1p(-self._seen_share) * int(np.sum(old))
+            evidence = -math.log1p(-_seen_share(landmarks)) * int(np.sum(old))
             self._evidence += min(evidence, MAX_EVIDENCE)
         is_unexpected = self._evidence > IMPROBABLE
         if is_unexpected or self._evidence == 0.0:
             self._evidence = 0.0
             self._newest_number = int(np.max(numbers, initial=0))
         return is_unexpected
+
+
+def _seen_share(landmarks: LandmarkTable) -> float:
+    """Return how often a landmark in view is seen, as far as it is known."""
+    return min(max(landmarks.seen_share, MIN_SHARE), MOST_SHARE)

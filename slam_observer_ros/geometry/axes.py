@@ -8,13 +8,13 @@ from slam_observer_ros.common.types import FloatArray, Immutable
 from slam_observer_ros.geometry import so3
 
 
-class Axes(Immutable):
+class EstimatedAxes(Immutable):
     """Coordinates of the pose error and of each landmark error that are estimated.
 
     Attributes
     ----------
     pose, p : slice, int
-        Axes of the pose error ε = (Ω, v), and how many these are.
+        EstimatedAxes of the pose error ε = (Ω, v), and how many these are.
     point : int
         Leading axes of a point, 2 or 3.
 
@@ -59,10 +59,10 @@ class Axes(Immutable):
         return full
 
 
-SPATIAL = Axes(slice(0, 6), 3)
-PLANAR = Axes(slice(2, 5), 2)
+SPATIAL = EstimatedAxes(slice(0, 6), 3)
+PLANAR = EstimatedAxes(slice(2, 5), 2)
 
 
-def axes_of(two_d_mode: bool) -> Axes:
+def axes_of(two_d_mode: bool) -> EstimatedAxes:
     """Return the axes that are estimated with the setting ``two_d_mode``."""
     return PLANAR if two_d_mode else SPATIAL

@@ -6,7 +6,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import transpose
 
 
 def path(start: FloatArray, twists: FloatArray) -> FloatArray:
@@ -38,7 +37,7 @@ def summed_noise(Ad: FloatArray, covariances: FloatArray) -> FloatArray:
 
     From rows of Ad_A (k + 1, p, 6) at its poses, and Q (k, 6, 6) of its motions, body frame.
     """
-    noise: FloatArray = (Ad @ at_poses(covariances) @ transpose(Ad)).sum(axis=0)
+    noise: FloatArray = (Ad @ at_poses(covariances) @ Ad.swapaxes(-1, -2)).sum(axis=0)
     return noise
 
 
@@ -48,6 +47,6 @@ def interpolate(start: FloatArray, end: FloatArray, share: FloatArray | float) -
     Positions are in a line, rotations about one axis.
     """
     R, share = start[..., :3, :3], np.asarray(share)[..., None]
-    turn = so3.log(transpose(R) @ end[..., :3, :3])
+    turn = so3.log(R.swapaxes(-1, -2) @ end[..., :3, :3])
     shift = end[..., :3, 3] - start[..., :3, 3]
     return se3.pose(R @ so3.exp(share * turn), start[..., :3, 3] + share * shift)

@@ -9,7 +9,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.matrices import transpose
 
 _HAT = np.array(
     [
@@ -42,7 +41,7 @@ def from_rpy(values: tuple[float, ...]) -> FloatArray:
 
 def inverse(T: FloatArray) -> FloatArray:
     """Return T⁻¹ = [[Rᵀ, −Rᵀ x], [0, 1]]."""
-    R_transposed = transpose(T[..., :3, :3])
+    R_transposed = T[..., :3, :3].swapaxes(-1, -2)
     return pose(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
 
 
@@ -56,7 +55,8 @@ def transform(T: FloatArray, points: FloatArray) -> FloatArray:
 
 def rotate(T: FloatArray, directions: FloatArray) -> FloatArray:
     """Turn directions (…, n, 3): R v, the product T v⃗ with a zero in the fourth entry (6)."""
-    return directions @ transpose(T[..., :3, :3])
+    rotated: FloatArray = directions @ T[..., :3, :3].swapaxes(-1, -2)
+    return rotated
 
 
 def hat(xi: FloatArray) -> FloatArray:
@@ -78,7 +78,7 @@ def flatten(T: FloatArray) -> FloatArray:
 def project(M: FloatArray) -> FloatArray:
     """Project (…, 4, 4) orthogonally onto se(3): [[(M₁ − M₁ᵀ) / 2, m₂], [0, 0]] (10)."""
     V = np.zeros_like(M)
-    V[..., :3, :3] = 0.5 * (M[..., :3, :3] - transpose(M[..., :3, :3]))
+    V[..., :3, :3] = 0.5 * (M[..., :3, :3] - M[..., :3, :3].swapaxes(-1, -2))
     V[..., :3, 3] = M[..., :3, 3]
     return V
 

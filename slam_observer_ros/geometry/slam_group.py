@@ -14,7 +14,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import transpose
 
 _IDENTITY = np.eye(3)
 
@@ -82,7 +81,7 @@ def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
     phi, v = Delta[..., :3], Delta[..., 3:, None]
     J = so3.left_jacobian(phi)
     R = _IDENTITY + so3.hat(phi) @ J  # exp φ, as J is the integral of exp(s φ)
-    return SlamElement(se3.pose(R, (J @ v)[..., 0]), d @ transpose(J))
+    return SlamElement(se3.pose(R, (J @ v)[..., 0]), d @ J.swapaxes(-1, -2))
 
 
 def alpha(S: FloatArray, Xi: TotalState) -> TotalState:
@@ -124,7 +123,7 @@ def psi(X: SlamElement, u: SlamVelocity) -> SlamVelocity:
     """
     A_inverse = se3.inverse(X.A)
     V = (se3.adjoint(A_inverse) @ u.V[..., :, None])[..., 0]
-    turned = X.a @ transpose(so3.hat(u.V[..., :3]))
+    turned = X.a @ so3.hat(u.V[..., :3]).swapaxes(-1, -2)
     return SlamVelocity(V, se3.rotate(A_inverse, u.v + turned))
 
 

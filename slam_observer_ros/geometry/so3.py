@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry.matrices import transpose
 
 _HAT = np.array(
     [
@@ -101,7 +100,7 @@ def to_quaternion(R: FloatArray) -> FloatArray:
     4 q qᵀ = [[R + Rᵀ + (1 − tr R) I, (R − Rᵀ)^∨], [·, 1 + tr R]]. Each row is a multiple of q, and
     the one with the largest diagonal entry (at least 1) is well conditioned at any angle.
     """
-    R_transposed = transpose(R)
+    R_transposed = R.swapaxes(-1, -2)
     trace = np.trace(R, axis1=-2, axis2=-1)[..., None]
     products = np.empty((*R.shape[:-2], 4, 4))
     products[..., :3, :3] = R + R_transposed + (1.0 - trace[..., None]) * _IDENTITY
@@ -120,4 +119,5 @@ def normalise(R: FloatArray) -> FloatArray:
     One Newton step towards the polar factor: an orthogonality error ε becomes about ε². For
     matrices that come from repeated products, not for arbitrary ones.
     """
-    return 0.5 * R @ (3.0 * _IDENTITY - transpose(R) @ R)
+    normalised: FloatArray = 0.5 * R @ (3.0 * _IDENTITY - R.swapaxes(-1, -2) @ R)
+    return normalised

@@ -8,7 +8,7 @@ from scipy import special
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.alignment import rigid_alignment
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.gauge import anchor, JITTER_M2
 
@@ -27,7 +27,7 @@ def find_transform(
     source_covariance: FloatArray,
     target: FloatArray,
     target_covariances: FloatArray,
-    axes: Axes,
+    axes: EstimatedAxes,
 ) -> tuple[FloatArray, BoolArray] | None:
     """Find how the frames of two maps lie to each other, even if some landmarks are wrong.
 
@@ -43,7 +43,7 @@ def find_transform(
         (m, 3) the same landmarks in the other frame, metres.
     target_covariances : FloatArray
         (m, 3, 3) covariance of each of them in that frame, m².
-    axes : Axes
+    axes : EstimatedAxes
         Whether they lie in space (k = 3) or in a plane (k = 2).
 
     Returns
@@ -90,7 +90,7 @@ def _aligned(
     return rigid_alignment(source, target, 1.0 / variances)
 
 
-def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: Axes) -> float:
+def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:
     """Return the standard deviation of the robot's attitude in a map, about the worst axis.
 
     Parameters are those of :func:`slam_observer_ros.observer.gauge.anchor`, for the pose and the

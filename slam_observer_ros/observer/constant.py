@@ -20,12 +20,12 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.axes import Axes, SPATIAL
-from slam_observer_ros.observer.filter import Filter, Residuals
+from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.innovation import lyapunov
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.live_settings import LiveSettings
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 """Diagonal M of Δ = −M g that the projection (10) implies: it halves the skew part."""
@@ -51,8 +51,8 @@ class ConstantFilter(Filter):
         'observation_error_time',
     )
 
-    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
-        super().__init__(live, reference_pose)
+    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
+        super().__init__(settings, reference_pose)
         self.calibration = Calibration(Settings(), self.axes)  # leaves the velocity as it is
         self._is_fixed = False
 
@@ -82,7 +82,7 @@ class ConstantFilter(Filter):
 
 
 def centroid_step(
-    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: Axes = SPATIAL
+    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: EstimatedAxes = SPATIAL
 ) -> FloatArray:
     """Return the pose's step D (4, 4), turning about the gain-weighted centroid of the e_i.
 
@@ -94,7 +94,7 @@ def centroid_step(
 
 
 def paper_step(
-    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: Axes = SPATIAL
+    k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: EstimatedAxes = SPATIAL
 ) -> FloatArray:
     """Return the pose's step D (4, 4) that tends to exp(Δ dt), Δ as in (30), for dt → 0."""
     return _step_about(np.zeros(3), PAPER_METRIC, k, e, r, dt_s, axes)
@@ -128,7 +128,7 @@ def _step_about(
     e: FloatArray,
     r: FloatArray,
     dt_s: float,
-    axes: Axes,
+    axes: EstimatedAxes,
 ) -> FloatArray:
     """Return the exponential step D (4, 4) about ``centre`` with the diagonal ``metric``."""
     J = axes.output_matrix(e - centre)

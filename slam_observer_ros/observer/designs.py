@@ -9,9 +9,9 @@ from slam_observer_ros.observer.constant import ConstantFilter
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.observer.scheduled.scheduled import ScheduledFilter
-from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.estimator_settings import Settings
 
-DESIGNS: dict[str, Callable[[LiveSettings, FloatArray], Filter]] = {
+DESIGNS: dict[str, Callable[[Settings, FloatArray], Filter]] = {
     'constant': ConstantFilter,
     'scheduled': ScheduledFilter,
     'riccati': RiccatiFilter,
@@ -19,6 +19,6 @@ DESIGNS: dict[str, Callable[[LiveSettings, FloatArray], Filter]] = {
 """The values of the parameter ``gains``, and what makes the filter at a reference pose."""
 
 
-def make_filter(live: LiveSettings, reference_pose: FloatArray) -> Filter:
+def make_filter(settings: Settings, reference_pose: FloatArray) -> Filter:
     """Return the filter that the setting ``gains`` names, at P° = ``reference_pose`` (4, 4)."""
-    return DESIGNS[live.now.gains](live, reference_pose)
+    return DESIGNS[settings.gains](settings, reference_pose)

@@ -7,78 +7,22 @@ knows none.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar, TYPE_CHECKING
+from typing import ClassVar
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import Axes, axes_of
+from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.live_settings import LiveSettings
-
-if TYPE_CHECKING:
-    from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 """Settings without effect on other filters; ``gain_k`` is in the Lyapunov value of all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Residuals:
-    """What an observation of m known landmarks says against the state.
-
-    Attributes
-    ----------
-    rows : IntArray
-        (m,) which landmarks are seen.
-    e : FloatArray
-        (m, 3) errors (29), metres, reference frame.
-    r : FloatArray
-        (m, 3) residuals e_i − y_i°, metres.
-    a : FloatArray
-        (m, 3) â_i, metres.
-    covariances : FloatArray
-        (m, 3, 3) covariances of the points seen, rotated into the reference frame, m².
-    dt_s : FloatArray
-        (m,) seconds since each of them was seen before, in this run; else infinite.
-
-    """
-
-    rows: IntArray
-    e: FloatArray
-    r: FloatArray
-    a: FloatArray
-    covariances: FloatArray
-    dt_s: FloatArray
-
-    @property
-    def landmarks(self) -> FloatArray:
-        """(m, 3) estimated landmarks y_i° + â_i, metres, reference frame."""
-        return self.e - self.r + self.a
-
-    def on(self, axes: Axes) -> tuple[FloatArray, FloatArray]:
-        """Return r (m, k), metres, and the covariances (m, k, k), m², on estimated axes."""
-        k = axes.point
-        return self.r[:, :k], self.covariances[:, :k, :k]
-
-    def select(self, mask: BoolArray) -> Residuals:
-        """Return the part of it that ``mask`` (m,) picks."""
-        if mask.all():
-            return self
-        return replace(
-            self,
-            rows=self.rows[mask],
-            e=self.e[mask],
-            r=self.r[mask],
-            a=self.a[mask],
-            covariances=self.covariances[mask],
-            dt_s=self.dt_s[mask],
-        )
 
 
 class Filter:
@@ -86,7 +30,7 @@ class Filter:
 
     Parameters
     ----------
-    live : LiveSettings
+    settings : Settings
         The settings in force.
     reference_pose : FloatArray
         (4, 4) P°, body to world.
@@ -97,7 +41,7 @@ class Filter:
         X̂ and its reference ξ°.
     calibration : Calibration
         Scale, bias and delay of the velocity, as far as they are known.
-    axes : Axes
+    axes : EstimatedAxes
         What of the pose and of points is estimated.
     joint : JointCovariance or None
         The covariance of the errors of pose and landmarks together, where it is kept.
@@ -109,20 +53,16 @@ class Filter:
     joint: JointCovariance | None = None
     ignores: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
-        self._live = live
-        self.axes = axes_of(live.now.two_d_mode)
+    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
+        self._settings = settings
+        self.axes = axes_of(settings.two_d_mode)
         self.observer = Observer(reference_pose)
-        self.calibration = Calibration(live.now, self.axes)
+        self.calibration = Calibration(settings, self.axes)
 
     @property
     def has_joint_covariance(self) -> bool:
         """Whether observations can be judged by it, as association and relinearising do."""
         return self.joint is not None
-
-    @property
-    def _settings(self) -> Settings:
-        return self._live.now
 
     # The step (27)-(31)
 

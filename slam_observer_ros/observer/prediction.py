@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import symmetric
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
 
-def initial_covariance(axes: Axes, calibration: Calibration) -> FloatArray:
+def initial_covariance(axes: EstimatedAxes, calibration: Calibration) -> FloatArray:
     """Return (p + c, p + c): the pose is the reference, so known; the calibration is not."""
     return np.diag(np.append(np.zeros(axes.p), calibration.initial_variances))
 

@@ -12,7 +12,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.geometry import paths
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 NAMES = (
@@ -43,7 +43,7 @@ class Calibration:
     ``delay_error_ns`` is the standard deviation of τ at the start, 0 where it is not estimated.
     """
 
-    def __init__(self, settings: Settings, axes: Axes) -> None:
+    def __init__(self, settings: Settings, axes: EstimatedAxes) -> None:
         self.axes = axes
         scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
         bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])

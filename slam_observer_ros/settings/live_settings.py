@@ -1,20 +1,21 @@
-"""The settings in force: one object, read where they are used, as some change while running."""
+"""The settings in force: one object, read where it is used, as some change while running."""
 
 from __future__ import annotations
 
-from slam_observer_ros.common.types import Immutable
+from dataclasses import fields
+
 from slam_observer_ros.settings.estimator_settings import Settings
 
 
-class LiveSettings(Immutable):
-    """Holds the settings; copies of what reads them share it.
+class LiveSettings(Settings):
+    """A copy of settings that follows changes; all that hold it see them, and copies share it."""
 
-    Attributes
-    ----------
-    now : Settings
-        The settings in force.
+    @classmethod
+    def of(cls, settings: Settings) -> LiveSettings:
+        """Return such a copy."""
+        return cls(**{field.name: getattr(settings, field.name) for field in fields(settings)})
 
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self.now = settings
+    def follow(self, settings: Settings) -> None:
+        """Take over the values of other settings."""
+        for field in fields(self):
+            object.__setattr__(self, field.name, getattr(settings, field.name))

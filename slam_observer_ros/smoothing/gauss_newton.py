@@ -19,7 +19,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
@@ -144,7 +144,7 @@ class Smoother:
 
     Parameters
     ----------
-    axes : Axes
+    axes : EstimatedAxes
         Which axes are estimated: d of the pose, k of a point.
     prior : Prior
         What was known before the first keyframe.
@@ -155,7 +155,9 @@ class Smoother:
 
     """
 
-    def __init__(self, axes: Axes, prior: Prior, keyframes: Keyframes, settings: Settings) -> None:
+    def __init__(
+        self, axes: EstimatedAxes, prior: Prior, keyframes: Keyframes, settings: Settings
+    ) -> None:
         self._axes = axes
         self._prior = prior
         self._keyframes = keyframes

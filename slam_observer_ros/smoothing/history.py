@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
@@ -65,7 +65,7 @@ class History:
 
     Parameters
     ----------
-    axes : Axes
+    axes : EstimatedAxes
         Which axes are estimated.
     noise : ObservationNoise
         Noise of the observations.
@@ -89,7 +89,9 @@ class History:
 
     """
 
-    def __init__(self, axes: Axes, noise: ObservationNoise, prior: Prior, since: str) -> None:
+    def __init__(
+        self, axes: EstimatedAxes, noise: ObservationNoise, prior: Prior, since: str
+    ) -> None:
         self._axes, self._observation_noise = axes, noise
         self.prior = self.summary = prior
         self.summarised = 0

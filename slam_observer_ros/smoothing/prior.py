@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 
 ANYWHERE_M = 1e3
 """Standard deviation of a landmark of which nothing is known, metres."""
@@ -44,7 +44,7 @@ class Prior:
     covariance: FloatArray
     is_relative: bool = False
 
-    def relative(self, axes: Axes) -> Prior:
+    def relative(self, axes: EstimatedAxes) -> Prior:
         """Return the same knowledge, but of where the landmarks lie as seen from the pose.
 
         dy_i is Rᵀ dp_i − C_i η, with C_i the output matrix at y_i and R the pose's rotation.
@@ -57,7 +57,7 @@ class Prior:
             rows[first:] = _turned(rows[first:], R.T) - C @ rows[:d]
         return replace(self, covariance=covariance, is_relative=True)
 
-    def least_nonlinear(self, axes: Axes) -> tuple[Prior, float]:
+    def least_nonlinear(self, axes: EstimatedAxes) -> tuple[Prior, float]:
         """Return the prior in the coordinates, world's or body's, that heading changes least.
 
         A map that the robot has made may yet turn as a whole, and the pose with it, by more than
@@ -81,7 +81,7 @@ class Prior:
         relative = self.relative(axes)
         return relative, math.sqrt(relative._turned_together(axes))
 
-    def _turned_together(self, axes: Axes) -> float:
+    def _turned_together(self, axes: EstimatedAxes) -> float:
         """Return the variance of the pose's angle as far as landmarks are turned with it, rad²."""
         turns, first = self._turns(axes), self._first_point(axes)
         shared, own = self.covariance[turns, first:], self.covariance[first:, first:]
@@ -89,7 +89,7 @@ class Prior:
         regular = own + least * np.eye(len(own))
         return max(float(np.trace(shared @ np.linalg.solve(regular, shared.T))), 0.0)
 
-    def without(self, axes: Axes, rows: IntArray) -> Prior:
+    def without(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior without the landmarks at ``rows``; those behind move up."""
         known, columns = self._known(axes, rows)
         return replace(
@@ -98,7 +98,7 @@ class Prior:
             covariance=np.delete(np.delete(self.covariance, columns, 0), columns, 1),
         )
 
-    def with_unknown(self, axes: Axes, rows: IntArray) -> Prior:
+    def with_unknown(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior with landmarks at ``rows`` that may be anywhere."""
         _, columns = self._known(axes, rows)
         covariance = self.covariance.copy()
@@ -108,7 +108,7 @@ class Prior:
 
     def normal_equations(
         self,
-        axes: Axes,
+        axes: EstimatedAxes,
         information: FloatArray,
         pose: FloatArray,
         calibration: FloatArray,
@@ -118,7 +118,7 @@ class Prior:
 
         Parameters
         ----------
-        axes : Axes
+        axes : EstimatedAxes
             Which axes are estimated: d of the pose, k of a point.
         information : FloatArray
             W, the inverse of the covariance.
@@ -150,15 +150,15 @@ class Prior:
         """Return points (n, 3) in the frame in which they are known: a pose's or the world."""
         return se3.transform(se3.inverse(pose), points) if self.is_relative else points
 
-    def _turns(self, axes: Axes) -> slice:
+    def _turns(self, axes: EstimatedAxes) -> slice:
         """Return the columns of the pose's angles, which come before its shifts."""
         return slice(axes.p - axes.point)
 
-    def _first_point(self, axes: Axes) -> int:
+    def _first_point(self, axes: EstimatedAxes) -> int:
         """Return the first column of the landmarks."""
         return len(self.covariance) - axes.point * len(self.points)
 
-    def _known(self, axes: Axes, rows: IntArray) -> tuple[IntArray, IntArray]:
+    def _known(self, axes: EstimatedAxes, rows: IntArray) -> tuple[IntArray, IntArray]:
         """Return those of landmarks (m,) that were known, and their columns."""
         known, k = rows[rows < len(self.points)], axes.point
         return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()

@@ -20,12 +20,12 @@ import numpy as np
 from slam_observer_ros.common.errors import ParameterError, SmoothingError
 from slam_observer_ros.common.types import FloatArray, Immutable, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
-from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Solution, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.prior import Prior
@@ -64,7 +64,7 @@ class Relinearisation:
     ----------
     filter_, joint : Filter, JointCovariance
         The filter, at its start, and its covariance; relinearising changes what they know.
-    live : LiveSettings
+    settings : Settings
         ``hindsight_*``, ``huber_threshold``, ``rejection_distance``, noise of observations.
 
     Attributes
@@ -74,9 +74,9 @@ class Relinearisation:
 
     """
 
-    def __init__(self, filter_: Filter, joint: JointCovariance, live: LiveSettings) -> None:
-        self._filter, self._joint, self._live = filter_, joint, live
-        self._observation_noise = ObservationNoise(live.now)
+    def __init__(self, filter_: Filter, joint: JointCovariance, settings: Settings) -> None:
+        self._filter, self._joint, self._settings = filter_, joint, settings
+        self._observation_noise = ObservationNoise(settings)
         self._warning = _Warning()
         self._seen = self._observations = 0
         self._turn_squared = self._largest_turn = 0.0
@@ -85,7 +85,7 @@ class Relinearisation:
     @property
     def is_active(self) -> bool:
         """Whether there is a history, of what the smoother takes for constant."""
-        return self._live.now.hindsight_interval > 0 and not self._filter.calibration.drifts
+        return self._settings.hindsight_interval > 0 and not self._filter.calibration.drifts
 
     def reset(self, since: str) -> None:
         """Forget all but what is known now; ``since`` is why, in words."""
@@ -148,7 +148,7 @@ class Relinearisation:
         self._check_smoothable()
         history = self.history
         try:
-            smoother = Smoother(self._axes, history.prior, history.keyframes(), self._live.now)
+            smoother = Smoother(self._axes, history.prior, history.keyframes(), self._settings)
             start = self._solution_from(0)
             return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE).end
         except np.linalg.LinAlgError as error:
@@ -158,7 +158,7 @@ class Relinearisation:
             ) from error
 
     def _check_smoothable(self) -> None:
-        if self._live.now.hindsight_interval == 0:
+        if self._settings.hindsight_interval == 0:
             raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
         if self._filter.calibration.drifts:
             raise ParameterError(
@@ -168,7 +168,7 @@ class Relinearisation:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
 
     @property
-    def _axes(self) -> Axes:
+    def _axes(self) -> EstimatedAxes:
         return self._filter.axes
 
     def _start(self, prior: Prior, since: str) -> None:
@@ -183,7 +183,7 @@ class Relinearisation:
     @property
     def _window_is_full(self) -> bool:
         """Whether the history has as many keyframes as it may have."""
-        return 0 < self._live.now.hindsight_window <= len(self.history.stamps_ns)
+        return 0 < self._settings.hindsight_window <= len(self.history.stamps_ns)
 
     @property
     def _is_due(self) -> bool:
@@ -193,7 +193,7 @@ class Relinearisation:
         """
         if self._is_owed:
             return True
-        settings = self._live.now
+        settings = self._settings
         least = max(settings.hindsight_interval, min(SHARE_OF_HISTORY * self._seen, MAX_INTERVAL))
         if 0.0 < settings.hindsight_turn < self._largest_turn:
             least *= EARLY_SHARE
@@ -218,7 +218,7 @@ class Relinearisation:
         history, first = self.history, self.history.summarised
         try:
             smoother = Smoother(
-                self._axes, history.summary, history.latest_keyframes(), self._live.now
+                self._axes, history.summary, history.latest_keyframes(), self._settings
             )
             step = smoother.smooth(self._solution_from(first), ITERATIONS, TOLERANCE)
             covariance = step.marginal()
@@ -257,7 +257,7 @@ class Relinearisation:
         return Prior(observer.A, self._filter.calibration.values, points, P)
 
 
-def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: Axes) -> FloatArray:
+def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:
     """Return the covariance of Ad_A ε and all else, given that of ε and all else."""
     p = axes.p
     Ad = se3.adjoint(A)[axes.pose, axes.pose]

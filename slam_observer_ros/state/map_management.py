@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.state.matching import (
     mapped,
@@ -33,7 +33,7 @@ def add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEvent
     if len(matched.known.ids) == len(rows):
         return event, rows
     is_new = rows < 0
-    forget(state, _rows_to_forget(state, matched), 'forgotten_landmark')
+    state.forget(_rows_to_forget(state, matched), 'forgotten_landmark')
     _initialise(state, event.select(is_new), matched.covariances[is_new])
     return mapped(state, event)
 
@@ -76,18 +76,6 @@ def note_velocities(state: State, event: ObservationEvent, rows: IntArray) -> No
     state.observer.set_landmark_velocities(rows[used], velocities[used])
 
 
-def rejected_before(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
-    """Return which known landmarks (m,) in it were rejected before where they are seen now.
-
-    And how far all of them (m, 3) are from where they were rejected last, metres, reference
-    frame.
-    """
-    rows = matched.residuals.rows
-    points, tolerances_m = positions(state, matched.known)
-    again = state.landmarks.are_rejected_again(rows, points, tolerances_m)
-    return again, points - state.landmarks.rejected_last[rows]
-
-
 def disbelieve(state: State, event: ObservationEvent) -> None:
     """Count points as rejected although the gate lets them pass.
 
@@ -98,13 +86,6 @@ def disbelieve(state: State, event: ObservationEvent) -> None:
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     if in_doubt.any():
         state.remove(rows[in_doubt])
-
-
-def forget(state: State, rows: IntArray, why: str) -> None:
-    """Forget the landmarks at ``rows``; ``why`` is the name of the count that they go to."""
-    if len(rows):
-        state.remove(rows)
-        state.counts[why] += len(rows)
 
 
 def _rows_to_forget(state: State, matched: MatchedObservation) -> IntArray:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.state import State
@@ -103,6 +103,23 @@ def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> 
     measured_m = np.maximum(np.linalg.norm(measured, axis=1), RESOLUTION_M)
     shares = np.linalg.norm(expected, axis=1) / measured_m
     return state.observation_noise.covariances(event, shares[:, None] * measured)
+
+
+def rejected_before(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
+    """Return which known landmarks (m,) in it were rejected before where they are seen now.
+
+    And how far all of them (m, 3) are from where they were rejected last, metres, reference
+    frame.
+    """
+    rows = matched.residuals.rows
+    points, tolerances_m = positions(state, matched.known)
+    again = state.landmarks.are_rejected_again(rows, points, tolerances_m)
+    return again, points - state.landmarks.rejected_last[rows]
+
+
+def is_contradiction(rejected: BoolArray) -> bool:
+    """Return whether most of the known landmarks (m,) seen are rejected: the pose may be wrong."""
+    return bool(2 * np.count_nonzero(rejected) > len(rejected))
 
 
 def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:

@@ -10,16 +10,13 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.axes import Axes
 from slam_observer_ros.observer.designs import make_filter
-from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.sensor_models.integration import integrate
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.smoothing.relinearisation import Relinearisation
 from slam_observer_ros.state import covariances
 from slam_observer_ros.state.landmark_table import LandmarkTable
@@ -30,15 +27,19 @@ class State:
 
     Parameters
     ----------
-    live : LiveSettings
+    settings : Settings
         The settings in force.
     initial_pose : FloatArray
         (4, 4) pose at the start, body to world; also the reference P°.
 
     Attributes
     ----------
+    settings : Settings
+        The settings in force.
     filter : Filter
         X̂, and what is known of its errors.
+    observer, axes : Observer, EstimatedAxes
+        The filter's.
     landmarks : LandmarkTable
         Ids and counts of the n known landmarks.
     relinearisation : Relinearisation or None
@@ -56,36 +57,22 @@ class State:
 
     """
 
-    def __init__(self, live: LiveSettings, initial_pose: FloatArray) -> None:
-        self._live = live
+    def __init__(self, settings: Settings, initial_pose: FloatArray) -> None:
+        self.settings = settings
         self.is_mapping = True
-        self.filter = make_filter(live, initial_pose)
+        self.filter = make_filter(settings, initial_pose)
+        self.observer, self.axes = self.filter.observer, self.filter.axes
         self.landmarks = LandmarkTable()
         self.relinearisation: Relinearisation | None = None
         if self.filter.joint is not None and not self.landmark_velocity_error:
-            self.relinearisation = Relinearisation(self.filter, self.filter.joint, live)
+            self.relinearisation = Relinearisation(self.filter, self.filter.joint, settings)
         self.counts: Counter[str] = Counter()
         self.rejected_in_a_row = 0
         self.was_contradicted = False
-        self.motion_noise = MotionNoise(live.now)
-        self.observation_noise = ObservationNoise(live.now)
+        self.motion_noise = MotionNoise(settings)
+        self.observation_noise = ObservationNoise(settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
-
-    @property
-    def settings(self) -> Settings:
-        """The settings in force."""
-        return self._live.now
-
-    @property
-    def observer(self) -> Observer:
-        """X̂ and its reference ξ°."""
-        return self.filter.observer
-
-    @property
-    def axes(self) -> Axes:
-        """What of the pose and of points is estimated."""
-        return self.filter.axes
 
     @property
     def is_fixed(self) -> bool:
@@ -202,6 +189,12 @@ class State:
             self.relinearisation.remove(rows)
         self.filter.remove(rows)
         self.landmarks.remove(rows)
+
+    def forget(self, rows: IntArray, why: str) -> None:
+        """Remove landmarks, if there are any at ``rows``; ``why`` is the count they go to."""
+        if len(rows):
+            self.remove(rows)
+            self.counts[why] += len(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Take all landmarks for exact and at rest; see :meth:`.Filter.fix_landmarks`."""

@@ -8,14 +8,19 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.observer.filter import Residuals
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.map_management import (
     add_new,
     make_room,
     note_velocities,
     relocate_moved,
 )
-from slam_observer_ros.state.matching import keyframe_of, MatchedObservation, positions
+from slam_observer_ros.state.matching import (
+    is_contradiction,
+    keyframe_of,
+    MatchedObservation,
+    positions,
+)
 from slam_observer_ros.state.state import State
 
 
@@ -40,11 +45,6 @@ class Outcome:
     residuals: FloatArray
     rejected: BoolArray
     moved_ids: IntArray
-
-
-def is_contradiction(rejected: BoolArray) -> bool:
-    """Return whether most of the known landmarks (m,) seen are rejected: the pose may be wrong."""
-    return bool(2 * np.count_nonzero(rejected) > len(rejected))
 
 
 def step(state: State, matched: MatchedObservation) -> Outcome:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.geometry import paths, se3
-from slam_observer_ros.observer.filter import Residuals
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
 

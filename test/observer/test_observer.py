@@ -17,8 +17,8 @@ from slam_observer_ros.observer.constant import (
     paper_step,
     safe_step,
 )
-from slam_observer_ros.observer.filter import Residuals
 from slam_observer_ros.observer.observer import lyapunov, Observer
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PAPER_LANDMARKS = np.array([[4.0, 0, 0], [-4, 0, 0], [0, 4, 0], [0, -4, 0]])

@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import block_diagonal, kalman_update, transpose
-from slam_observer_ros.observer.filter import Residuals
 from slam_observer_ros.observer.prediction import initial_covariance, predict
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
@@ -32,7 +32,7 @@ class JointCovariance:
 
     """
 
-    def __init__(self, axes: Axes, calibration: Calibration) -> None:
+    def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         self._axes, self._p = axes, axes.p
         self.P = initial_covariance(axes, calibration)
         self.first = len(self.P)
@@ -210,7 +210,9 @@ class ExactMapCovariance(JointCovariance):
 
     """
 
-    def __init__(self, axes: Axes, joint: JointCovariance, covariances: FloatArray) -> None:
+    def __init__(
+        self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray
+    ) -> None:
         self._axes, self._p, self.first = axes, axes.p, joint.first
         self.P = joint.P[: self.first, : self.first].copy()
         self._covariances = covariances

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -26,7 +26,9 @@ class MovingLandmarksCovariance(JointCovariance):
 
     """
 
-    def __init__(self, axes: Axes, calibration: Calibration, velocity_error: float) -> None:
+    def __init__(
+        self, axes: EstimatedAxes, calibration: Calibration, velocity_error: float
+    ) -> None:
         super().__init__(axes, calibration)
         self._velocity_error = velocity_error
         self._stride = 2 * axes.point

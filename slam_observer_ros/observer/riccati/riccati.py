@@ -15,15 +15,16 @@ from __future__ import annotations
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, Residuals
+from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.prediction import predict
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
 from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
 from slam_observer_ros.observer.robust import observation_weights
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
-from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.estimator_settings import Settings
 
 
 class RiccatiFilter(Filter):
@@ -39,9 +40,9 @@ class RiccatiFilter(Filter):
     joint: JointCovariance
     ignores = OF_CONSTANT_GAINS
 
-    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
-        super().__init__(live, reference_pose)
-        error = live.now.landmark_velocity_error
+    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
+        super().__init__(settings, reference_pose)
+        error = settings.landmark_velocity_error
         self.joint = (
             MovingLandmarksCovariance(self.axes, self.calibration, error)
             if error > 0.0

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import kalman_update, symmetric, transpose
 from slam_observer_ros.observer.prediction import initial_covariance, predict
 from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
@@ -39,7 +39,7 @@ class Core:
 
     Parameters
     ----------
-    axes : Axes
+    axes : EstimatedAxes
         Which p axes of the pose and k of a point are estimated.
     calibration : Calibration
         The velocity's.
@@ -55,7 +55,7 @@ class Core:
 
     """
 
-    def __init__(self, axes: Axes, calibration: Calibration) -> None:
+    def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         start = initial_covariance(axes, calibration)
         self._axes, self._calibration = axes, calibration
         self._p = axes.p

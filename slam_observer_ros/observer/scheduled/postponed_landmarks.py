@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import Axes
+from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 
 CORE = 0
@@ -37,14 +37,14 @@ class PostponedLandmarks:
 
     Parameters
     ----------
-    axes : Axes
+    axes : EstimatedAxes
         Which p axes of the pose and k of a point are estimated. ε is the beginning of z.
     core_size : int
         q, entries of z.
 
     """
 
-    def __init__(self, axes: Axes, core_size: int) -> None:
+    def __init__(self, axes: EstimatedAxes, core_size: int) -> None:
         self._axes = axes
         self._F: FloatArray = np.empty((0, axes.point, core_size))
         self._N: FloatArray = np.empty((0, axes.point, axes.point))

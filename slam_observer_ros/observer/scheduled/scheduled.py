@@ -50,13 +50,14 @@ from slam_observer_ros.geometry.matrices import (
     symmetric,
     transpose,
 )
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, Residuals
+from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
+from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled.core import Core, regression
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
-from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.estimator_settings import Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +91,8 @@ class ScheduledFilter(Filter):
 
     ignores = (*OF_CONSTANT_GAINS, 'landmark_velocity_error')
 
-    def __init__(self, live: LiveSettings, reference_pose: FloatArray) -> None:
-        super().__init__(live, reference_pose)
+    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
+        super().__init__(settings, reference_pose)
         self._core = Core(self.axes, self.calibration)
         self._postponed = self._core.postponed
 

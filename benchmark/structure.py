@@ -1,0 +1,173 @@
+"""The package's structure in numbers: ``python benchmark/structure.py``; a test keeps them."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+import logging
+from pathlib import Path
+import sys
+from types import FrameType
+
+import tomllib
+import worlds
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.settings.estimator_settings import Settings
+
+PACKAGE = worlds.CHECKOUT / 'slam_observer_ros'
+TRACED_AFTER = 200
+"""Observations of the simulated wheeled loop before the one that is traced."""
+
+
+@dataclass(frozen=True, slots=True)
+class TracedStep:
+    """What runs while the estimator uses one observation with ids, Riccati gains.
+
+    Attributes
+    ----------
+    modules : list of str
+        Modules of the package, in the order in which they are entered first.
+    functions, changes, depth : int
+        How many functions are called, how often a call leads to another module, and how deep the
+        stack of calls within the package is.
+
+    """
+
+    modules: list[str]
+    functions: int
+    changes: int
+    depth: int
+
+
+def main() -> None:
+    """Print all numbers."""
+    logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
+    chain, step = longest_chain(), traced_step()
+    docstrings, lines = docstring_lines()
+    rows = {
+        'loose modules at the top': len(loose_modules()),
+        'layers': layers(),
+        'longest import chain': f'{len(chain)}: {" > ".join(chain)}',
+        'traced step, modules': f'{len(step.modules)}: {", ".join(step.modules)}',
+        'traced step, functions called': step.functions,
+        'traced step, changes of module': step.changes,
+        'traced step, depth': step.depth,
+        'lines': lines,
+        'share of docstrings': f'{docstrings / lines:.1%}',
+    }
+    for name, value in rows.items():
+        sys.stdout.write(f'{name}: {value}\n')
+
+
+def modules() -> dict[str, Path]:
+    """Return the package's modules by their dotted names, without the package's own name."""
+    found = {}
+    for path in sorted(PACKAGE.rglob('*.py')):
+        parts = path.relative_to(PACKAGE).with_suffix('').parts
+        found['.'.join(parts[:-1] if parts[-1] == '__init__' else parts)] = path
+    return found
+
+
+def loose_modules() -> list[str]:
+    """Return the modules beside the folders."""
+    return sorted(path.stem for path in PACKAGE.glob('*.py'))
+
+
+def layers() -> int:
+    """Return how many layers import-linter holds apart."""
+    with (worlds.CHECKOUT / 'pyproject.toml').open('rb') as file:
+        contracts = tomllib.load(file)['tool']['importlinter']['contracts']
+    return next(len(contract['layers']) for contract in contracts if 'layers' in contract)
+
+
+def longest_chain() -> list[str]:
+    """Return modules each of which imports the next, as many as there are in a row."""
+    graph, known = imports(), dict[str, list[str]]()
+
+    def chain(module: str, above: frozenset[str]) -> list[str]:
+        if module not in known:
+            below = [chain(other, above | {module}) for other in graph[module] - above - {module}]
+            known[module] = [module, *max(below, key=len, default=[])]
+        return known[module]
+
+    return max((chain(module, frozenset()) for module in graph), key=len)
+
+
+def imports() -> dict[str, set[str]]:
+    """Return which modules of the package each of them imports, by name."""
+    names = modules()
+    return {
+        module: {name for name in _imported(path) if name in names}
+        for module, path in names.items()
+    }
+
+
+def _imported(path: Path) -> Iterator[str]:
+    prefix = f'{PACKAGE.name}.'
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith(prefix):
+            module = (node.module or '').removeprefix(prefix)
+            yield module
+            yield from (f'{module}.{alias.name}' for alias in node.names)
+
+
+def docstring_lines() -> tuple[int, int]:
+    """Return how many lines docstrings have, and how many there are."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = lines = 0
+    for path in modules().values():
+        text = path.read_text(encoding='utf-8')
+        lines += text.count('\n')
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, kinds) and ast.get_docstring(node, clean=False) is not None:
+                docstrings += (node.body[0].end_lineno or 0) - node.body[0].lineno + 1
+    return docstrings, lines
+
+
+def traced_step(settings: Settings | None = None) -> TracedStep:
+    """Return what one step takes in the midst of the simulated wheeled loop."""
+    world = worlds.load('simulated loop, wheeled')
+    estimator = Estimator(replace(settings or world.settings, gains='riccati'))
+    observed = 0
+    for event in world.events:
+        is_observation = isinstance(event, ObservationEvent)
+        if is_observation and observed == TRACED_AFTER:
+            return _traced(estimator, event)
+        observed += is_observation
+        estimator.add(event)
+    raise ValueError('the world has too few observations')
+
+
+def _traced(estimator: Estimator, event: ObservationEvent) -> TracedStep:
+    entered: list[str] = []
+    stack: list[str] = []
+    counts = {'functions': 0, 'changes': 0, 'depth': 0}
+
+    def note(frame: FrameType, kind: str, _argument: object) -> None:
+        path = frame.f_code.co_filename
+        if str(PACKAGE) not in path or frame.f_code.co_name.startswith('<'):
+            return
+        module = path.removeprefix(f'{PACKAGE}/').removesuffix('.py')
+        if kind == 'call':
+            if module not in entered:
+                entered.append(module)
+            counts['functions'] += 1
+            counts['changes'] += bool(stack) and stack[-1] != module
+            stack.append(module)
+            counts['depth'] = max(counts['depth'], len(stack))
+        elif kind == 'return' and stack:
+            stack.pop()
+
+    sys.setprofile(note)
+    try:
+        estimator.add(event)
+    finally:
+        sys.setprofile(None)
+    return TracedStep(entered, counts['functions'], counts['changes'], counts['depth'])
+
+
+if __name__ == '__main__':
+    main()

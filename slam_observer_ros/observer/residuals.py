@@ -1,0 +1,61 @@
+"""What an observation says against the state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.axes import EstimatedAxes
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """What an observation of m known landmarks says against the state.
+
+    Attributes
+    ----------
+    rows : IntArray
+        (m,) which landmarks are seen.
+    e : FloatArray
+        (m, 3) errors (29), metres, reference frame.
+    r : FloatArray
+        (m, 3) residuals e_i − y_i°, metres.
+    a : FloatArray
+        (m, 3) â_i, metres.
+    covariances : FloatArray
+        (m, 3, 3) covariances of the points seen, rotated into the reference frame, m².
+    dt_s : FloatArray
+        (m,) seconds since each of them was seen before, in this run; else infinite.
+
+    """
+
+    rows: IntArray
+    e: FloatArray
+    r: FloatArray
+    a: FloatArray
+    covariances: FloatArray
+    dt_s: FloatArray
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """(m, 3) estimated landmarks y_i° + â_i, metres, reference frame."""
+        return self.e - self.r + self.a
+
+    def on(self, axes: EstimatedAxes) -> tuple[FloatArray, FloatArray]:
+        """Return r (m, k), metres, and the covariances (m, k, k), m², on estimated axes."""
+        k = axes.point
+        return self.r[:, :k], self.covariances[:, :k, :k]
+
+    def select(self, mask: BoolArray) -> Residuals:
+        """Return the part of it that ``mask`` (m,) picks."""
+        if mask.all():
+            return self
+        return replace(
+            self,
+            rows=self.rows[mask],
+            e=self.e[mask],
+            r=self.r[mask],
+            a=self.a[mask],
+            covariances=self.covariances[mask],
+            dt_s=self.dt_s[mask],
+        )
