@@ -10,7 +10,6 @@ from pathlib import Path
 import sys
 from types import FrameType
 
-import tomllib
 import worlds
 
 from slam_observer_ros.estimator.estimator import Estimator
@@ -78,9 +77,8 @@ def loose_modules() -> list[str]:
 
 def layers() -> int:
     """Return how many layers import-linter holds apart."""
-    with (worlds.CHECKOUT / 'pyproject.toml').open('rb') as file:
-        contracts = tomllib.load(file)['tool']['importlinter']['contracts']
-    return next(len(contract['layers']) for contract in contracts if 'layers' in contract)
+    text = (worlds.CHECKOUT / 'pyproject.toml').read_text(encoding='utf-8')
+    return text.partition('layers = [')[2].partition(']')[0].count(',')
 
 
 def longest_chain() -> list[str]:

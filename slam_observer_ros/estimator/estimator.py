@@ -68,6 +68,8 @@ class Estimator:
 
     Attributes
     ----------
+    settings : Settings
+        The settings in force.
     dropped : Counter
         Events refused, by reason.
     jumps : int
@@ -91,7 +93,8 @@ class Estimator:
         on_motion: OnMotion | None = None,
         on_jump: Callable[[], None] | None = None,
     ) -> None:
-        self._settings = settings = LiveSettings.of(checked(settings))
+        self.settings = settings = checked(settings)
+        self._live = LiveSettings.of(settings)
         self._counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.jumps = 0
@@ -101,7 +104,7 @@ class Estimator:
         self._on_motion, self._on_jump = on_motion, on_jump
         self._start_pose: FloatArray | None = None
         self._is_placed = False  # by somebody: the settings don't say any more where it is
-        self._hypotheses = Hypotheses(State(settings, np.eye(4)))
+        self._hypotheses = Hypotheses(State(self._live, np.eye(4)))
         self._localiser = Localiser()
         self.reset(initial_pose)
         self._warn_of_unused()
@@ -221,11 +224,6 @@ class Estimator:
         self._timeline.catch_up()
         self._place(pose, covariance)
 
-    @property
-    def settings(self) -> Settings:
-        """The settings in force."""
-        return self._settings
-
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.
 
@@ -242,7 +240,8 @@ class Estimator:
         ]
         if changed:
             raise ParameterError(f'{", ".join(changed)} can only be set before the start')
-        self._settings.follow(settings)
+        self.settings = settings
+        self._live.follow(settings)
 
     def add(self, event: Event) -> bool:
         """Take an event; return whether it was accepted.
@@ -511,7 +510,7 @@ class Estimator:
         At ``pose`` (4, 4); by default identity, or unknown in a map that was loaded.
         ``covariance`` (6, 6) is that of a pose in a loaded map; default exact.
         """
-        state = State(self._settings, np.eye(4) if pose is None else self._allowed(pose))
+        state = State(self._live, np.eye(4) if pose is None else self._allowed(pose))
         self._hypotheses.reset(state)
         self._localiser.start(state, pose is not None, covariance)
 

@@ -74,7 +74,7 @@ class Filter:
     def residuals(
         self, rows: IntArray, points: FloatArray, covariances: FloatArray, dt_s: FloatArray
     ) -> Residuals:
-        """Return the residuals (29) of landmarks ``rows`` (m,) seen at ``points`` (m, 3).
+        """Return what landmarks ``rows`` (m,) seen at ``points`` (m, 3) say against X̂ (29).
 
         Points and their ``covariances`` (m, 3, 3) are in the body frame, m and m²; ``dt_s`` (m,)
         are the seconds since each was seen before. :meth:`expected_points` has been asked for

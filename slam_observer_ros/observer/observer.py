@@ -67,7 +67,7 @@ class Observer:
         Points y_i (m, 3) are in metres, body frame. The paper prints r_i = e_i − p_i°, which is
         e_i − y_i° for P° = I.
         """
-        e = se3.transform(self.A, points) - self.a[rows]  # (29)  ρ(X̂⁻¹, y)_i = R_Â y_i + x_Â − â_i
+        e = se3.transform(self.A, points) - self.a[rows]  # (29)  ρ(X̂⁻¹, y)_i
         return e, e - self.y_ref[rows]
 
     def propagate(self, path: FloatArray) -> None:

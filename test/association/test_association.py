@@ -1,4 +1,4 @@
-"""Points without an id: which landmark each is, what is new, and where it can't be told yet."""
+"""Points without an id: which landmark each is, what is new, and where that can't be known yet."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from slam_observer_ros.association.joint_compatibility import (
     Pairs,
 )
 from slam_observer_ros.association.landmark_index import LandmarkIndex
-from slam_observer_ros.association.visibility import Surroundings
+from slam_observer_ros.association.visibility import Visibility
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -41,14 +41,15 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
 from slam_observer_ros.state.landmark_table import LandmarkTable, PATIENCE
-from slam_observer_ros.state.state import Slam
+from slam_observer_ros.state.matching import match
+from slam_observer_ros.state.state import State
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'wheeled_bearing_range.yaml'
 PLANAR = Settings(two_d_mode=True, reorder_window=0.0)
@@ -197,7 +198,7 @@ def test_where_all_points_lie_in_one_plane_all_of_space_counts_as_in_view():
     assert field.contains(np.array([[0.0, 0.0, 5.0], [9.0, 0.0, 0.0]])).all()
 
 
-def test_points_with_and_without_id_are_told_apart_in_one_observation():
+def test_points_with_and_without_id_are_distinguished_in_one_observation():
     estimator = Estimator(SPATIAL)
     for step in range(10):
         stand(estimator, 0.1 * step)
@@ -212,7 +213,7 @@ def test_points_with_and_without_id_are_told_apart_in_one_observation():
 def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     """Two posts 3 m apart; after a blind turn of unknown size only one of them is in view.
 
-    The odometry says that it is the first, but it is the second. A third landmark tells.
+    The odometry says that it is the first, but it is the second. A third landmark decides.
     """
     settings = replace(PLANAR, angular_velocity_noise=(0.0, 0.0, 0.1), confirmations=1)
     posts = np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 6.0, 0.0]])
@@ -227,12 +228,12 @@ def test_an_ambiguous_post_is_followed_both_ways_until_another_one_decides():
     seen = se3.transform(se3.inverse(turned), posts)
     for step in range(100, 105):
         observe(estimator, 0.1 * step, seen[1:2])
-    followed = len(estimator._frame.hypotheses)
+    followed = len(estimator._hypotheses)
     error_rad = np.linalg.norm(so3.log(estimator.pose[:3, :3].T @ turned[:3, :3]))
     in_doubt_rad = np.sqrt(estimator.pose_covariance[2, 2])
     assert error_rad < 4.0 * in_doubt_rad
-    observe(estimator, 10.45, np.empty((0, 3)))  # tells nothing, and so decides nothing
-    assert len(estimator._frame.hypotheses) == followed
+    observe(estimator, 10.45, np.empty((0, 3)))  # says nothing, and so decides nothing
+    assert len(estimator._hypotheses) == followed
     for step in range(105, 110):
         observe(estimator, 0.1 * step, seen[1:])
     assert followed > 1
@@ -268,15 +269,15 @@ def test_states_that_took_two_look_alikes_for_each_other_are_one_where_their_map
     stand(estimator, 0.0)
     points = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
     observe(estimator, 0.0, points, [4, 5])
-    slam = estimator._slam
+    state = estimator._hypotheses.best
     event = ObservationEvent(0, np.array([4, 5]), points)
     swapped = replace(event, ids=event.ids[::-1])
-    other, elsewhere = deepcopy(slam), deepcopy(slam)
-    assert are_one(slam, event, other, swapped)
+    other, elsewhere = deepcopy(state), deepcopy(state)
+    assert are_one(state, event, other, swapped)
     other.observer.relocate_landmarks(np.array([1]), points[1:] + 1.0)
-    assert not are_one(slam, event, other, swapped), 'each has a point where the other has none'
+    assert not are_one(state, event, other, swapped), 'each has a point where the other has none'
     elsewhere.observer.A = elsewhere.observer.A @ se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
-    assert not are_one(slam, event, elsewhere, swapped), 'the robot is 1 m off'
+    assert not are_one(state, event, elsewhere, swapped), 'the robot is 1 m off'
 
 
 def test_one_hypothesis_at_most_if_no_more_are_wanted():
@@ -284,7 +285,7 @@ def test_one_hypothesis_at_most_if_no_more_are_wanted():
     estimator = Estimator(replace(PLANAR, max_hypotheses=1))
     for event in world.events:
         estimator.add(event)
-        assert len(estimator._frame.hypotheses) == 1
+        assert len(estimator._hypotheses) == 1
 
 
 @pytest.mark.parametrize('gains', ['constant', 'scheduled'])
@@ -297,7 +298,7 @@ def test_gains_without_a_joint_covariance_leave_points_without_id_out(gains):
 
 
 @pytest.mark.parametrize('gains', ['constant', 'scheduled'])
-def test_points_that_gains_leave_out_tell_nothing_of_the_place(gains):
+def test_points_that_gains_leave_out_say_nothing_of_the_pose(gains):
     known = np.random.default_rng(0).uniform(-5.0, 5.0, (12, 3))
     estimator = Estimator(replace(SPATIAL, gains=gains, localization_mode='uncertain'))
     unseen = np.zeros(len(known), dtype=np.int64)
@@ -454,7 +455,7 @@ def test_a_point_with_a_new_id_takes_no_landmark_from_a_point_without():
 
 @pytest.mark.parametrize('settings', [PLANAR, SPATIAL], ids=['planar', 'spatial'])
 @pytest.mark.parametrize('max_hypotheses', [1, 8])
-def test_a_landmark_first_seen_without_its_id_takes_it_when_it_is_told(settings, max_hypotheses):
+def test_a_landmark_first_seen_without_its_id_takes_it_when_it_is_given(settings, max_hypotheses):
     settings = replace(settings, max_hypotheses=max_hypotheses)
     world = gain_worlds.drive(settings, 40.0, noise=0.5, landmarks=8)
     rng = np.random.default_rng(0)
@@ -484,8 +485,9 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
             observe(estimator, 0.1 * step, [*points, *far], [1, 2, *[UNKNOWN_ID] * len(far)])
         new = np.array([*points, [-2.0, 2.0, 0.0]])
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
-        slam = estimator._slam
-        (only,) = interpretations(slam, event, slam.match(event), np.arange(3), np.inf)
+        state, index = estimator._hypotheses.best, LandmarkIndex()
+        matched = match(state, event)
+        (only,) = interpretations(state, index, event, matched, np.arange(3), np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
@@ -504,7 +506,7 @@ def test_ids_name_the_landmarks_of_a_fixed_map_that_has_none():
 
 
 @pytest.mark.parametrize('seed', range(30))
-def test_many_points_seen_after_a_blind_stretch_are_told_apart_together(seed):
+def test_many_points_seen_after_a_blind_stretch_are_distinguished_together(seed):
     """Each of them alone could be any landmark within metres."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.mgrid[:4, :4], axis=-1).reshape(16, 2)
@@ -593,34 +595,41 @@ def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_be
     assert landmarks.unsupported(3).tolist() == [1]
 
 
-def test_before_it_is_known_where_a_sensor_looks_no_place_is_strange_to_it():
-    observer, landmarks = Observer(np.eye(4)), LandmarkTable()
-    observer.add_reference_landmarks(5.0 * np.eye(3))
+def state_of(landmarks, points):
+    """A state with these landmarks (n, 3), of which the table says what was seen of them."""
+    state = State(PLANAR, np.eye(4))
+    state.filter.add_known(points, np.tile(np.eye(3), (len(points), 1, 1)))
+    state.landmarks = landmarks
+    return state
+
+
+def test_before_it_is_known_where_a_sensor_looks_no_place_is_unexpected():
+    landmarks, visibility = LandmarkTable(), Visibility(2)
     landmarks.add_known(FIRST_AUTOMATIC_ID + np.arange(3), np.full(3, 100))
-    surroundings = Surroundings(observer, landmarks, 2)
+    state = state_of(landmarks, 5.0 * np.eye(3))
     for look in range(200):
         straight_ahead = ObservationEvent(
             look, np.array([UNKNOWN_ID]), np.array([[1.0, 0.0, 0.0]])
         )
-        assert surroundings.note(straight_ahead, some_have_ids=False) == (0.0, False)
+        assert visibility.note(state, straight_ahead, some_have_ids=False) == 0.0
+    assert state.counts['unexpected_place'] == 0
 
 
 @pytest.mark.parametrize('misses', [1, 5, 40])
 def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_soon_no_more(misses):
     """After k looks that miss it 2 ln(1 + k p): for the first one much, by and by little."""
-    observer, landmarks, share = Observer(np.eye(4)), looked_at([], [], 10, 5), 0.5
-    observer.add_reference_landmarks(np.array([[2.0, 0.0, 0.0]]))
-    surroundings = Surroundings(observer, landmarks, 2)
+    landmarks, share, visibility = looked_at([], [], 10, 5), 0.5, Visibility(2)
+    state = state_of(landmarks, np.array([[2.0, 0.0, 0.0]]))
     ahead = 4.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]])
     others = ObservationEvent(10, np.full(2, UNKNOWN_ID), ahead)
     landmarks.note_in_view = lambda rows, seen: None  # so that the share stays
-    costs = [surroundings.note(others, some_have_ids=False)[0]]
+    costs = [visibility.note(state, others, some_have_ids=False)]
     for landmarks.missed[0] in range(misses):
-        costs.append(surroundings.note(others, some_have_ids=False)[0])
+        costs.append(visibility.note(state, others, some_have_ids=False))
     assert costs[0] == 0.0, 'before anything was seen it is not known where the sensor looks'
     assert_allclose(sum(costs), 2.0 * np.log1p(misses * share))
     landmarks.last_seen_ns[0] = others.stamp_ns
-    assert surroundings.note(others, some_have_ids=False)[0] == 0.0
+    assert visibility.note(state, others, some_have_ids=False) == 0.0
 
 
 def test_a_landmark_that_was_given_its_id_needs_no_support_any_more():
@@ -629,7 +638,7 @@ def test_a_landmark_that_was_given_its_id_needs_no_support_any_more():
     assert landmarks.unsupported(5).tolist() == [2]
 
 
-def test_reflectors_that_are_told_one_a_message_are_all_kept():
+def test_reflectors_that_come_one_a_message_are_all_kept():
     random = np.random.default_rng(0)
     points = random.uniform([-8.0, -8.0, 0.0], [8.0, 8.0, 0.0], (24, 3))
     estimator = Estimator(PLANAR)
@@ -640,9 +649,9 @@ def test_reflectors_that_are_told_one_a_message_are_all_kept():
     assert estimator.counts['unsupported_landmark'] == 0
 
 
-def test_a_landmark_that_was_placed_anew_has_its_chance_again():
+def test_a_landmark_that_was_placed_again_has_its_chance_again():
     landmarks = looked_at([4], [39], settled_looks=996, settled_seen=499)
-    landmarks.restart(np.array([1]), 0)
+    landmarks.take_for_new(np.array([1]), 0)
     landmarks.note_in_view(np.array([1]), np.array([False]))
     assert landmarks.unsupported(5).tolist() == []
 
@@ -658,7 +667,7 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
             stand(estimator, time_s)
             seen = points if step < 20 else points[:1]
             observe(estimator, time_s, seen + rng.normal(scale=0.02, size=seen.shape) * [1, 1, 0])
-        assert len(estimator._frame.hypotheses) > 1
+        assert len(estimator._hypotheses) > 1
         first = estimator.pose_covariance if is_asked else None
         for step in range(1, 201):
             stand(estimator, time_s + 0.01 * step, (0, 0, 0.5, 1, 0, 0))
@@ -671,29 +680,30 @@ def test_the_covariance_does_not_depend_on_when_it_was_asked_for_before():
 
 def test_in_doubt_the_covariance_grows_on_the_way_as_it_will_be_once_it_is_moved_on():
     """The further the robot goes, the further apart are states that differ in their heading."""
-    hypotheses = Hypotheses(Slam(PLANAR, np.eye(4)))
-    hypotheses._states, hypotheses._costs = (
-        [hypotheses.best, deepcopy(hypotheses.best)],
-        [0.0, 1.0],
-    )
-    for slam, yaw_rad in zip(hypotheses._states, [0.0, 0.4], strict=True):
-        slam.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
+    hypotheses = Hypotheses(State(PLANAR, np.eye(4)))
+    hypotheses._all.append(replace(deepcopy(hypotheses._all[0]), cost=1.0))
+    for hypothesis, yaw_rad in zip(hypotheses._all, [0.0, 0.4], strict=True):
+        hypothesis.state.set_pose(se3.exp(np.array([0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0])), None)
     velocities, end_ns = VelocityHistory(10**10), 6 * 10**9
     velocities.append(VelocityEvent(0, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
-    told = hypotheses.pose_covariance_after(velocities, 0, end_ns)
-    hypotheses.advance(velocities, 0, end_ns)
-    assert_allclose(told, hypotheses.pose_covariance_after(velocities, end_ns, end_ns), atol=1e-9)
-    assert np.sqrt(told[4, 4]) > 1.0
+    before = hypotheses.pose_covariance_after(velocities, 0, end_ns)
+    hypotheses.propagate(velocities, 0, end_ns)
+    assert_allclose(
+        before, hypotheses.pose_covariance_after(velocities, end_ns, end_ns), atol=1e-9
+    )
+    assert np.sqrt(before[4, 4]) > 1.0
 
 
 def test_settings_and_jumps_of_the_clock_are_of_all_states_that_are_followed():
-    hypotheses = Hypotheses(Slam(Settings(), np.eye(4)))
-    hypotheses._states = [Mock(), Mock()]
-    hypotheses.change_settings(PLANAR)
-    hypotheses.restart_time()
-    for slam in hypotheses._states:
-        slam.change_settings.assert_called_once_with(PLANAR)
-        slam.restart_time.assert_called_once_with()
+    settings = LiveSettings.of(Settings())
+    hypotheses = Hypotheses(State(settings, np.eye(4)))
+    hypotheses._all.append(deepcopy(hypotheses._all[0]))
+    settings.follow(replace(settings, huber_threshold=3.0))
+    assert [hypothesis.state.settings.huber_threshold for hypothesis in hypotheses._all] == [3, 3]
+    hypotheses._all = [Mock(), Mock()]
+    hypotheses.clear_time()
+    for hypothesis in hypotheses._all:
+        hypothesis.state.clear_time.assert_called_once_with()
 
 
 def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
@@ -702,11 +712,11 @@ def test_in_doubt_the_covariance_is_that_of_all_states_by_their_likelihoods():
     poses = se3.exp(rng.normal(scale=[0.3] * 3 + [2.0] * 3, size=(3, 6)))
     roots = 0.1 * rng.normal(size=(3, 6, 6))
     covariances, costs = roots @ roots.swapaxes(1, 2), np.array([0.0, 1.0, 3.0])
-    hypotheses = Hypotheses(Slam(settings, np.eye(4)))
-    hypotheses._states = [deepcopy(hypotheses.best) for _ in poses]
-    hypotheses._costs = costs.tolist()
-    for slam, pose, covariance in zip(hypotheses._states, poses, covariances, strict=True):
-        slam.set_pose(pose, covariance)
+    hypotheses = Hypotheses(State(settings, np.eye(4)))
+    first = hypotheses._all[0]
+    hypotheses._all = [replace(deepcopy(first), cost=cost) for cost in costs.tolist()]
+    for hypothesis, pose, covariance in zip(hypotheses._all, poses, covariances, strict=True):
+        hypothesis.state.set_pose(pose, covariance)
     weights = np.exp(-costs / 2.0) / np.exp(-costs / 2.0).sum()
     turns = so3.log(poses[:, :3, :3] @ poses[0, :3, :3].T)
     d = np.column_stack([turns, poses[:, :3, 3] - poses[0, :3, 3]])

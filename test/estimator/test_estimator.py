@@ -13,6 +13,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 
+from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.common.errors import MapError, ParameterError
 from slam_observer_ros.estimates import used_points
@@ -33,11 +34,13 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import MapFrame
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.state import step as state_step
 from slam_observer_ros.state.late_observation import carried_forward
+from slam_observer_ros.state.matching import match
+from slam_observer_ros.state.state import State
 
 GAINS = ('constant', 'scheduled', 'riccati')
 START_NS = 1_700_000_000_000_000_000
@@ -260,14 +263,16 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(m, a
         angular_velocity_noise=(0.0, 0.0, 0.2),
         linear_velocity_noise=(0.3, 0.0, 0.0),
     )
-    timeline = Timeline(MapFrame(settings), settings)
+    timeline = Timeline(Hypotheses(State(settings, np.eye(4))), settings)
     turning = np.array([0.0, 0.0, 1e-9, 0.0, 0.0, 0.0])
     for step in range(21):
         timeline.append(velocity(0.1 * step, turning))
     timeline.catch_up()
     given_m2 = np.tile(0.01 * np.eye(3), (m, 1, 1)) if are_given else None
     points = np.tile([5.0, 0.0, 0.0], (m, 1))
-    carried = timeline.meet(ObservationEvent(START_NS + 10**9, np.arange(m), points, given_m2))
+    carried = timeline.synchronise(
+        ObservationEvent(START_NS + 10**9, np.arange(m), points, given_m2)
+    )
     expected = 0.01 * np.eye(3) + m * np.diag([0.3, 5.0 * 0.2, 0.0]) ** 2
     np.testing.assert_allclose(carried.covariances[0], expected, rtol=1e-3, atol=1e-6)
 
@@ -282,8 +287,8 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
         linear_velocity_noise=still,
         landmark_velocity_error=0.5 * is_estimated,
     )
-    frame = MapFrame(settings)
-    timeline = Timeline(frame, settings)
+    hypotheses = Hypotheses(State(settings, np.eye(4)))
+    timeline = Timeline(hypotheses, settings)
     turning = np.array([0.0, 0.0, turn_rad / 0.9, 0.0, 0.0, 0.0])
     for step in range(11):
         timeline.append(velocity(0.1 * step, turning))
@@ -291,10 +296,10 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
     seen, speed = np.array([[5.0, 0.0, 0.0]]), np.array([[4.0, 0.0, 0.0]])
     event = ObservationEvent(START_NS + 10**8, np.array([1]), seen, velocities=speed)
     if is_estimated:
-        frame.observe(replace(event, stamp_ns=timeline.state_ns))
-        frame.slam.observer.u[0] = so3.exp(0.1 * turning[:3]) @ speed[0]
+        hypotheses.observe(replace(event, stamp_ns=timeline.state_ns))
+        hypotheses.best.observer.u[0] = so3.exp(0.1 * turning[:3]) @ speed[0]
         event = replace(event, velocities=None)
-    carried = timeline.meet(event)
+    carried = timeline.synchronise(event)
     R = so3.exp(np.array([0.0, 0.0, turn_rad]))
     np.testing.assert_allclose(carried.points, (seen + 0.9 * speed) @ R, atol=1e-9)
     expected = R.T @ ObservationNoise(settings).at(seen) @ R
@@ -357,13 +362,13 @@ def test_empty_observations_make_no_others_late():
 
 
 def test_an_update_is_of_the_state_at_its_stamp_and_stamps_never_go_back():
-    told = []
+    reported = []
     estimator = Estimator(
-        Settings(reorder_window=0.0), on_update=lambda update: told.append(update.stamp_ns)
+        Settings(reorder_window=0.0), on_update=lambda update: reported.append(update.stamp_ns)
     )
     for event in (velocity(0.0), observation(0.1), observation(0.5, []), observation(0.2)):
         estimator.add(event)
-    assert [stamp_ns - START_NS for stamp_ns in told] == [10**8, 10**8, 2 * 10**8]
+    assert [stamp_ns - START_NS for stamp_ns in reported] == [10**8, 10**8, 2 * 10**8]
     assert estimator.stamp_ns == START_NS + 5 * 10**8
 
 
@@ -520,7 +525,7 @@ def test_what_was_counted_is_kept_by_a_reset():
     assert counts['rejected_landmark'] > 0
     estimator.reset()
     assert estimator.counts == counts
-    estimator.restart_time()
+    estimator.handle_clock_jump()
     assert estimator.counts == counts
 
 
@@ -656,8 +661,8 @@ def test_where_many_landmarks_seem_to_move_the_odometry_is_named(caplog):
         times_moved = (step // 8 + 4 - np.arange(5)) // 5  # one after another
         points = LANDMARKS + 3.0 * np.outer(times_moved, [0.0, 0.0, 1.0])
         estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), points))
-    told = [message for message in caplog.messages if 'seem to have moved' in message]
-    assert told[0].startswith('5 landmarks seem to have moved within a minute: odometry may err')
+    reported = [message for message in caplog.messages if 'seem to have moved' in message]
+    assert reported[0].startswith('5 landmarks seem to have moved within a minute: odometry may err')
 
 
 def test_landmarks_that_moved_before_a_jump_of_the_clock_did_not_move_lately(caplog):
@@ -669,14 +674,14 @@ def test_landmarks_that_moved_before_a_jump_of_the_clock_did_not_move_lately(cap
 
 
 @pytest.mark.parametrize('gains', GAINS)
-def test_a_map_too_large_for_riccati_gains_is_told_once(caplog, monkeypatch, gains):
+def test_a_map_too_large_for_riccati_gains_is_reported_once(caplog, monkeypatch, gains):
     monkeypatch.setattr(event_warnings, 'MANY_LANDMARKS', 5)
     run([observation(0.1 * step) for step in range(5)], gains=gains)
-    told = [message for message in caplog.messages if 'The map has 5 landmarks' in message]
-    assert len(told) == (gains == 'riccati')
+    reported = [message for message in caplog.messages if 'The map has 5 landmarks' in message]
+    assert len(reported) == (gains == 'riccati')
 
 
-def test_more_landmarks_at_once_than_may_be_kept_are_told(caplog):
+def test_more_landmarks_at_once_than_may_be_kept_are_reported(caplog):
     run([observation(0.1 * step) for step in range(5)], max_landmarks=3)
     assert '5 points in one message, and max_landmarks is 3' in caplog.text
 
@@ -733,7 +738,7 @@ def test_events_released_in_between_leave_one_stamp_ahead_waiting():
 
 
 def test_a_silence_of_both_sensors_erases_no_map_but_a_jump_of_the_clock_does():
-    """Both have the same stamps; time of reception tells them apart."""
+    """Both have the same stamps; time of reception distinguishes them."""
     before, after = drive(), [observation(60.0 + 0.05 * step) for step in range(20)]
     for receive_s, jumps in ((60.0, 0), (4.0, 1)):
         received = [replace(event, receive_ns=event.stamp_ns) for event in before]
@@ -770,7 +775,7 @@ def test_a_full_map_forgets_the_landmark_seen_least_often_never_one_in_view():
     assert estimator.counts['unmapped_landmark'] == 2
 
 
-def test_landmarks_that_move_again_and_again_are_told_of_ever_more_seldom(caplog):
+def test_landmarks_that_move_again_and_again_are_reported_ever_more_seldom(caplog):
     def moved(index, event):
         shift = true_pose(0.1 * index)[:3, :3].T @ [0.0, 0.0, 20.0 * (index // 10)]
         return replace(event, points=event.points + (event.ids == 2)[:, None] * shift)
@@ -780,8 +785,8 @@ def test_landmarks_that_move_again_and_again_are_told_of_ever_more_seldom(caplog
     events.sort(key=lambda event: event.stamp_ns)
     estimator = run(events, gains='riccati')
     assert 10 <= estimator.counts['moved_landmark'] < 100
-    told = [text for text in caplog.messages if 'moved' in text]
-    assert told == [f'Landmarks [2] have moved ({times} so far).' for times in (1, 10)]
+    reported = [text for text in caplog.messages if 'moved' in text]
+    assert reported == [f'Landmarks [2] have moved ({times} so far).' for times in (1, 10)]
 
 
 @pytest.mark.parametrize('gains', GAINS)
@@ -821,7 +826,7 @@ def test_a_landmark_stops_where_its_sensor_says_nothing_of_a_velocity_any_more(g
     assert estimator.counts['rejected_landmark'] == 0
 
 
-def test_a_landmark_that_comes_back_tells_as_much_as_one_that_was_always_there():
+def test_a_landmark_that_comes_back_says_as_much_as_one_that_was_always_there():
     """The robot knows where it went, but not how it has turned itself meanwhile."""
     settings = Settings(
         confirmations=1,
@@ -962,10 +967,10 @@ def moving_landmark(speeds=None):
 
 def test_a_landmark_that_moves_is_the_less_certain_the_longer_it_was_not_seen():
     estimator = moving_landmark()
-    told = estimator.landmark_covariances
+    reported = estimator.landmark_covariances
     assert estimator.stamp_ns - estimator._timeline.state_ns > 10**9
     estimator.flush()
-    np.testing.assert_allclose(told, estimator.landmark_covariances, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(reported, estimator.landmark_covariances, rtol=1e-9, atol=1e-12)
 
 
 def test_where_velocities_of_landmarks_are_estimated_those_of_messages_are_not_used():
@@ -976,27 +981,27 @@ def test_where_velocities_of_landmarks_are_estimated_those_of_messages_are_not_u
 def test_gains_that_estimate_no_velocities_of_landmarks_take_them_as_messages_say(gains):
     settings = Settings(gains=gains, landmark_velocity_error=0.5, confirmations=1)
     estimator, speeds = Estimator(settings), np.full((5, 3), 0.1)
-    for time_s, told, expected in [(0.0, speeds, speeds), (0.1, None, 0.0 * speeds)]:
+    for time_s, reported, expected in [(0.0, speeds, speeds), (0.1, None, 0.0 * speeds)]:
         estimator.add(velocity(time_s, np.zeros(6)))
         event = ObservationEvent(observation(time_s).stamp_ns, np.arange(5), LANDMARKS)
-        estimator.add(replace(event, velocities=told))
+        estimator.add(replace(event, velocities=reported))
         estimator.release()
         np.testing.assert_allclose(estimator.landmark_velocities, expected, atol=1e-9)
 
 
 def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
     """Scheduled gains put off moving those that were out of view."""
-    frame = MapFrame(Settings(gains='scheduled', confirmations=1))
+    state = State(Settings(gains='scheduled', confirmations=1), np.eye(4))
     event = observation(0.0, [0, 1])
-    frame.observe(event)
-    frame.slam.gains.recall = Mock()
+    state_step.step(state, match(state, event))
+    state.filter.expected_points = Mock(return_value=event.points)
     velocities = VelocityHistory(timeout_ns=10**9)
     velocities.append(velocity(0.0, np.zeros(6)))
-    carried_forward(frame.slam, event, velocities, event.stamp_ns + 10**8)
-    np.testing.assert_array_equal(frame.slam.gains.recall.call_args.args[1], [0, 1])
+    carried_forward(state, event, velocities, event.stamp_ns + 10**8)
+    np.testing.assert_array_equal(state.filter.expected_points.call_args.args[0], [0, 1])
 
 
-def test_a_landmark_that_is_placed_anew_moves_as_its_sensor_says_from_then_on():
+def test_a_landmark_that_is_placed_again_moves_as_its_sensor_says_from_then_on():
     estimator, point = Estimator(Settings(reorder_window=0.0, confirmations=1)), np.ones((1, 3))
     for step in range(40):
         has_jumped, speed = step >= 20, np.array([[0.5, 0.0, 0.0]])
@@ -1011,15 +1016,15 @@ def test_a_landmark_that_is_placed_anew_moves_as_its_sensor_says_from_then_on():
 
 @pytest.mark.parametrize('on_time_jump', ['hold', 'reset'])
 def test_what_waits_for_late_events_is_used_before_the_clock_jumps(on_time_jump):
-    settings, told, added = Settings(on_time_jump=on_time_jump, reorder_window=0.5), [], 0
-    estimator = Estimator(settings, on_jump=lambda: told.append(estimator.stamp_ns))
+    settings, reported, added = Settings(on_time_jump=on_time_jump, reorder_window=0.5), [], 0
+    estimator = Estimator(settings, on_jump=lambda: reported.append(estimator.stamp_ns))
     for _ in range(2):
         for step in range(200):
             estimator.add(velocity(100.0 + 0.05 * step, np.zeros(6)))
             added += 1
     estimator.flush()
     assert estimator.jumps == 1
-    assert told == [None], 'once, before anything of the new time is used'
+    assert reported == [None], 'once, before anything of the new time is used'
     assert estimator.counts['velocity'] + estimator.dropped.total() == added
 
 
@@ -1043,7 +1048,7 @@ def test_a_pose_that_is_held_is_that_of_the_newest_velocity_not_of_the_last_obse
     estimator = Estimator(Settings(on_time_jump='hold', reorder_window=0.0, gains=gains))
     for event in [observation(0.0), *[velocity(0.05 * step) for step in range(21)]]:
         estimator.add(event)
-    estimator.restart_time()
+    estimator.handle_clock_jump()
     np.testing.assert_allclose(estimator.pose, true_pose(1.0), atol=1e-9)
 
 
@@ -1080,7 +1085,7 @@ def test_after_a_jump_back_in_time_landmarks_out_of_view_make_room_for_new_ones(
             stamp_ns = start_ns + step * 10**8
             assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
             assert estimator.add(ObservationEvent(stamp_ns, np.array(ids), points))
-        estimator.restart_time()
+        estimator.handle_clock_jump()
     assert sorted(estimator.landmark_ids) == [2, 7, 8]
 
 
@@ -1104,7 +1109,7 @@ def test_observations_in_a_row_of_which_all_landmarks_were_rejected_are_counted(
         off = 50.0 * (step in (6, 7, 8, 10, 11)) * np.array([1.0, -2.0, 3.0])
         estimator.add(VelocityEvent(START_NS + step * 10**8, np.zeros(6)))
         estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), LANDMARKS + off))
-        counted.append(estimator._slam.rejected_in_a_row)
+        counted.append(estimator._hypotheses.best.rejected_in_a_row)
     assert counted == [0, 0, 0, 0, 0, 0, 1, 2, 3, 0, 1, 2]
 
 
@@ -1113,32 +1118,32 @@ def test_after_a_jump_all_starts_where_the_run_began_though_the_robot_was_moved_
     estimator = Estimator(Settings(), initial_pose=start)
     assert estimator.add(velocity(0.0))
     estimator.set_pose(true_pose(7.0))
-    estimator.restart_time()
+    estimator.handle_clock_jump()
     np.testing.assert_array_equal(estimator.pose, start)
 
 
-def test_told_of_a_jump_the_estimator_starts_again_at_once():
+def test_after_a_jump_the_estimator_starts_again_at_once():
     estimator = run(drive())
-    estimator.restart_time()
+    estimator.handle_clock_jump()
     assert len(estimator.landmark_ids) == 0
     assert estimator.stamp_ns is None
     assert estimator.add(velocity(-1e6))
 
 
-def test_all_events_of_a_stamp_are_told_of_once_and_also_after_a_jump_of_the_clock():
-    told = []
+def test_all_events_of_a_stamp_are_reported_once_and_also_after_a_jump_of_the_clock():
+    reported = []
     settings = Settings(reorder_window=0.0, on_time_jump='hold')
-    estimator = Estimator(settings, on_stamp=lambda: told.append(estimator.stamp_ns))
+    estimator = Estimator(settings, on_stamp=lambda: reported.append(estimator.stamp_ns))
     for step in range(3):
         stamp_ns = START_NS + step * 10**8
         estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         estimator.add(ObservationEvent(stamp_ns, np.arange(5), LANDMARKS))
-    assert told == [START_NS, START_NS + 10**8]
-    estimator.restart_time()
-    assert told == [START_NS + step * 10**8 for step in range(3)]
+    assert reported == [START_NS, START_NS + 10**8]
+    estimator.handle_clock_jump()
+    assert reported == [START_NS + step * 10**8 for step in range(3)]
     estimator.add(VelocityEvent(START_NS, np.zeros(6)))
     estimator.flush()
-    assert told[3:] == [START_NS]
+    assert reported[3:] == [START_NS]
 
 
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])

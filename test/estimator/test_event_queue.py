@@ -173,7 +173,7 @@ def test_stamps_at_the_limits_are_taken(stamp_ns):
 
 @pytest.mark.parametrize('late_limit_ns', [0, 2 * SECOND])
 @pytest.mark.parametrize('ahead_s', [0.5, 2.5, 9.0, 20.0])
-def test_one_stamp_ahead_tells_of_no_jump_of_the_clock(ahead_s, late_limit_ns):
+def test_one_stamp_ahead_is_no_jump_of_the_clock(ahead_s, late_limit_ns):
     queue = filled(*dense(SECOND), late_limit_ns=late_limit_ns)
     with contextlib.suppress(InvalidEventError):
         assert not queue.push(velocity(SECOND + round(ahead_s * SECOND) + 1))
@@ -211,7 +211,7 @@ def test_after_a_pause_the_newest_stamp_is_the_largest_in_whatever_order_they_ca
     assert filled(*dense(SECOND), *after).newest_ns == after[0].stamp_ns
 
 
-def test_one_stamp_far_behind_tells_of_no_jump_of_the_clock_right_after_a_pause():
+def test_one_stamp_far_behind_is_no_jump_of_the_clock_right_after_a_pause():
     queue = filled(*dense(SECOND), *[velocity(6 * SECOND + n) for n in range(AGREEING_STAMPS)])
     with pytest.raises(InvalidEventError):
         queue.push(velocity(3 * SECOND))
@@ -254,7 +254,7 @@ def test_a_stamp_ahead_waits_after_a_silence_and_is_refused_where_there_was_none
 
 
 @pytest.mark.parametrize('is_first_received', [False, True])
-def test_a_time_of_reception_that_some_events_lack_tells_of_no_silence(is_first_received):
+def test_a_time_of_reception_that_some_events_have_not_is_no_silence(is_first_received):
     first, ahead = velocity(0), velocity(20 * SECOND)
     if is_first_received:
         queue = filled(received(first, 0))
@@ -347,7 +347,7 @@ def push_or_reason(queue, event):
 
 
 @pytest.mark.parametrize('held_up_since_s', [6, 2])
-def test_a_burst_of_what_was_held_up_tells_of_no_jump_of_the_clock(held_up_since_s):
+def test_a_burst_of_what_was_held_up_is_no_jump_of_the_clock(held_up_since_s):
     """Of one detector, or of a second one: then observations have gone on meanwhile."""
     queue = make_queue()
     for event in dense(10 * SECOND):

@@ -74,7 +74,7 @@ def test_a_map_without_covariances_is_read_back_without(tmp_path):
     assert_same_map(read_map(path), bare)
 
 
-def test_a_file_tells_what_it_was_made_with_and_has_a_line_a_landmark(tmp_path):
+def test_a_file_says_what_it_was_made_with_and_has_a_line_a_landmark(tmp_path):
     path = tmp_path / 'map.yaml'
     write_map(path, a_map(9), Settings(gains='scheduled'))
     content = yaml.safe_load(path.read_text())
@@ -149,7 +149,7 @@ def test_a_map_is_written_where_a_link_leads_and_never_over_a_pipe(tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_whether_a_map_can_be_written_is_told_of_where_it_would_be_written(tmp_path):
+def test_whether_a_map_can_be_written_is_checked_where_it_would_be_written(tmp_path):
     (tmp_path / 'elsewhere').mkdir()
     (tmp_path / 'link.yaml').symlink_to('elsewhere/map.yaml')
     check_writable(tmp_path / 'link.yaml')
