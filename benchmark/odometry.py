@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import paths, se3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -51,9 +51,9 @@ class Odometry:
         """
         start_ns = stamp_ns if self._stamp_ns is None else self._stamp_ns
         held = self._velocities.held(start_ns, stamp_ns)
-        path = paths.path(np.eye(4), held.body_velocities * held.dt_s[:, None])
+        path = se3.path(np.eye(4), held.body_velocities * held.dt_s[:, None])
         Ad = se3.adjoint(se3.inverse(path[-1]) @ path)
-        covariance = paths.summed_noise(Ad, self._noise.covariances(held))
+        covariance = se3.summed_noise(Ad, self._noise.covariances(held))
         self._velocities.forget_before(stamp_ns)
         self._stamp_ns = stamp_ns
         return path[-1], covariance

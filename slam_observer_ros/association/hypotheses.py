@@ -34,10 +34,9 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
-from slam_observer_ros.state.map_management import disbelieve
 from slam_observer_ros.state.matching import match, MatchedObservation
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import Outcome, step
+from slam_observer_ros.state.step import disbelieve, Outcome, step
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,11 +28,11 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import Localiser
+from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.settings.parameter_table import changed_names, checked, table
-from slam_observer_ros.state import covariances
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import Outcome
 
@@ -104,7 +104,7 @@ class Estimator:
         self._on_motion, self._on_jump = on_motion, on_jump
         self._start_pose: FloatArray | None = None
         self._is_placed = False  # by somebody: the settings don't say any more where it is
-        self._hypotheses = Hypotheses(State(self._live, np.eye(4)))
+        self._hypotheses = Hypotheses(self._state_at(np.eye(4)))
         self._localiser = Localiser()
         self.reset(initial_pose)
         self._warn_of_unused()
@@ -411,7 +411,7 @@ class Estimator:
         state = self._state
         if state.is_fixed:
             return None
-        return covariances.of_configuration(state.filter, state.confirmed[rows])
+        return state.filter.configuration_covariance(state.confirmed[rows])
 
     @property
     def landmark_velocities(self) -> FloatArray:
@@ -510,9 +510,13 @@ class Estimator:
         At ``pose`` (4, 4); by default identity, or unknown in a map that was loaded.
         ``covariance`` (6, 6) is that of a pose in a loaded map; default exact.
         """
-        state = State(self._live, np.eye(4) if pose is None else self._allowed(pose))
+        state = self._state_at(np.eye(4) if pose is None else self._allowed(pose))
         self._hypotheses.reset(state)
         self._localiser.start(state, pose is not None, covariance)
+
+    def _state_at(self, pose: FloatArray) -> State:
+        """Return a state at its start, with P° = ``pose`` (4, 4)."""
+        return State(make_filter(self._live, pose), self._live)
 
     def _allowed(self, pose: FloatArray) -> FloatArray:
         """Return a pose (4, 4), or with ``two_d_mode`` what of it lies in the plane."""

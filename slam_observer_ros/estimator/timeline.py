@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
-from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns, to_s
@@ -16,6 +15,7 @@ from slam_observer_ros.sensor_models.integration import transition
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 from slam_observer_ros.state.late_observation import carried_forward
+from slam_observer_ros.state.state import State
 
 OnMotion: TypeAlias = Callable[[VelocityHistory, int, int], None]
 """Called with velocities, and with the two stamps between which they lead, nanoseconds."""
@@ -24,12 +24,23 @@ MAX_PENDING_VELOCITIES = 128
 """Velocities that may wait for an observation before the state is moved on without one."""
 
 
+class Moved(Protocol):
+    """What is moved along the velocities: hypotheses, the most likely of which is ``best``."""
+
+    @property
+    def best(self) -> State:
+        """The most likely state."""
+
+    def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
+        """Move on from stamp to stamp, nanoseconds (27)."""
+
+
 class Timeline:
     """Velocities of the recent past, and how far the hypotheses have been moved along them.
 
     Parameters
     ----------
-    hypotheses : Hypotheses
+    hypotheses : Moved
         What is moved along them; no event has been used yet.
     settings : Settings
         ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
@@ -48,7 +59,7 @@ class Timeline:
     """
 
     def __init__(
-        self, hypotheses: Hypotheses, settings: Settings, on_motion: OnMotion | None = None
+        self, hypotheses: Moved, settings: Settings, on_motion: OnMotion | None = None
     ) -> None:
         self._hypotheses = hypotheses
         timeout_ns = to_ns(settings.velocity_timeout)

@@ -12,7 +12,7 @@ from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.output_files import unfinished_file
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
-from slam_observer_ros.geometry import paths, so3
+from slam_observer_ros.geometry import se3, so3
 
 MAX_GAP_NS = NANOSECONDS_PER_SECOND // 2
 """Truth is not interpolated between samples further apart than this."""
@@ -94,7 +94,7 @@ def interpolate(
     usable = (elapsed_ns == 0) | ((gap_ns > 0) & (gap_ns <= max_gap_ns))
     covered[covered] = usable
     fraction = elapsed_ns[usable] / np.maximum(gap_ns[usable], 1)
-    poses[covered] = paths.interpolate(
+    poses[covered] = se3.interpolate(
         trajectory.poses[before[usable]], trajectory.poses[after[usable]], fraction
     )
     return poses, covered

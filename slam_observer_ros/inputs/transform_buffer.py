@@ -17,7 +17,7 @@ from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.geometry import paths, se3
+from slam_observer_ros.geometry import se3
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ class _Track:
         if self.stamps_ns[after] == stamp_ns:
             return self.poses[after]
         start_ns, end_ns = self.stamps_ns[after - 1 : after + 1]
-        return paths.interpolate(
+        return se3.interpolate(
             self.poses[after - 1], self.poses[after], (stamp_ns - start_ns) / (end_ns - start_ns)
         )
 

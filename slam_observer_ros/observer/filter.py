@@ -160,6 +160,23 @@ class Filter:
         """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks."""
         return None
 
+    def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (m k, m k) of where m landmarks are seen from the robot, m².
+
+        Joint, along the axes of the body that are estimated. The choice of the world's frame has
+        no part in it.
+        """
+        P, axes = self.joint_covariance(rows), self.axes
+        if P is None:
+            return None
+        m, k, p = len(rows), axes.point, axes.p
+        C = axes.output_matrix(self.points[rows]).reshape(-1, p)
+        CP = C @ P[:p] - P[p:]
+        blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
+        R = self.observer.A[:k, :k]
+        seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
+        return seen
+
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
         return np.zeros(len(residuals.r))

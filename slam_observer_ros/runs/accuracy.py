@@ -8,6 +8,7 @@ import logging
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.metrics import (
     landmark_errors,
@@ -17,7 +18,6 @@ from slam_observer_ros.evaluation.metrics import (
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.recording.recorded_truth import Truth
-from slam_observer_ros.runs.replay import Replay
 
 logger = logging.getLogger(__name__)
 
@@ -41,16 +41,27 @@ class Accuracy:
     configuration_anees: float | None
 
 
-def measure(result: Replay, truth: Truth) -> Accuracy:
-    """Compare a replay with the truth."""
+def measure(
+    trajectory: Trajectory,
+    pose_covariances: FloatArray | None,
+    dead_reckoning: Trajectory,
+    landmarks: tuple[IntArray, FloatArray],
+    configuration: ConfigurationError,
+    truth: Truth,
+) -> Accuracy:
+    """Compare what came of a replay with the truth.
+
+    ``pose_covariances`` (k, 6, 6) of the trajectory are None where no pose is certain;
+    ``landmarks`` are ids (n,) and positions (n, 3), metres.
+    """
     pose_truth = Trajectory(truth.stamps_ns, truth.poses)
     return Accuracy(
-        _pose_errors('trajectory', result.trajectory, pose_truth),
-        _pose_errors('dead reckoning', result.dead_reckoning, pose_truth),
-        _landmark_rmse_m(result.estimator.landmark_ids, result.estimator.world_points, truth),
-        result.configuration.rmse_m,
-        _anees(result, pose_truth),
-        result.configuration.anees,
+        _pose_errors('trajectory', trajectory, pose_truth),
+        _pose_errors('dead reckoning', dead_reckoning, pose_truth),
+        _landmark_rmse_m(*landmarks, truth),
+        configuration.rmse_m,
+        _anees(trajectory, pose_covariances, pose_truth),
+        configuration.anees,
     )
 
 
@@ -80,11 +91,13 @@ def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> Trajecto
         return None
 
 
-def _anees(result: Replay, truth: Trajectory) -> float | None:
-    if result.pose_covariances is None or result.in_known_map:
+def _anees(
+    trajectory: Trajectory, pose_covariances: FloatArray | None, truth: Trajectory
+) -> float | None:
+    if pose_covariances is None:
         return None
     try:
-        return anchored_average_nees(result.trajectory, result.pose_covariances, truth)
+        return anchored_average_nees(trajectory, pose_covariances, truth)
     except EvaluationError as error:
         logger.warning('The ANEES is not known: %s', error)
         return None

@@ -129,8 +129,7 @@ class _RunningReplay:
         self._clear_figures()
 
     def _clear_figures(self) -> None:
-        has_truth = self._pose_truth is not None and len(self._pose_truth.poses) > 0
-        self._sampler = TrajectorySampler(self._estimator, with_covariances=has_truth)
+        self._sampler = TrajectorySampler()
         self._dead_reckoning = DeadReckoning()
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
@@ -182,7 +181,12 @@ class _RunningReplay:
     def _on_stamp(self) -> None:
         if self._start_ns is None:
             self._start_ns = self._estimator.stamp_ns
-        self._sampler.sample()
+        stamp_ns, is_localised = self._estimator.stamp_ns, self._estimator.is_localised
+        if stamp_ns is None or not is_localised or not self._sampler.is_due(stamp_ns):
+            return
+        has_truth = self._pose_truth is not None and len(self._pose_truth.poses) > 0
+        covariance = self._estimator.pose_covariance if has_truth else None  # takes longer
+        self._sampler.add(stamp_ns, self._estimator.pose, covariance)
 
     def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         self._dead_reckoning.advance(velocities, start_ns, end_ns)

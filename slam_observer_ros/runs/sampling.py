@@ -6,9 +6,8 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
-from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.trajectory import Trajectory
-from slam_observer_ros.geometry import paths, se3, so3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 
 SAMPLE_PERIOD_NS = 50_000_000
@@ -38,25 +37,19 @@ class PoseSamples:
 
 
 class TrajectorySampler:
-    """Collects the poses that an estimator passes through, and if asked their covariances."""
+    """Collects poses and their covariances (6, 6), where these are known."""
 
-    def __init__(self, estimator: Estimator, with_covariances: bool) -> None:
-        self._estimator = estimator
-        self._with_covariances = with_covariances
+    def __init__(self) -> None:
         self._samples = PoseSamples()
         self._covariances: list[FloatArray] = []
 
-    def sample(self) -> None:
-        """Keep the present pose, if it is due and in the frame of the map that was loaded."""
-        stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None or not self._estimator.is_localised:
-            return
-        if not self._samples.is_due(stamp_ns):
-            return
-        self._samples.add(stamp_ns, self._estimator.pose)
-        if not self._with_covariances:  # they take longer to compute
-            return
-        covariance = self._estimator.pose_covariance
+    def is_due(self, stamp_ns: int) -> bool:
+        """Return whether a pose of that stamp is to be added."""
+        return self._samples.is_due(stamp_ns)
+
+    def add(self, stamp_ns: int, pose: FloatArray, covariance: FloatArray | None) -> None:
+        """Append a pose, and its covariance."""
+        self._samples.add(stamp_ns, pose)
         if covariance is not None:
             self._covariances.append(covariance)
 
@@ -86,7 +79,7 @@ class DeadReckoning:
         held = velocities.held(start_ns, end_ns)
         if not (self._samples.stamps_ns or held.dt_s.any()):
             return
-        path = paths.path(self._pose, held.body_velocities * held.dt_s[:, None])
+        path = se3.path(self._pose, held.body_velocities * held.dt_s[:, None])
         elapsed_s = np.append(0.0, np.cumsum(held.dt_s + held.gap_s))
         stamps_ns = start_ns + np.rint(elapsed_s * NANOSECONDS_PER_SECOND).astype(np.int64)
         for stamp_ns, pose in zip(stamps_ns.tolist(), path, strict=True):

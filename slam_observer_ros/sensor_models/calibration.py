@@ -11,7 +11,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.estimates import CalibrationEstimate
-from slam_observer_ros.geometry import paths
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
@@ -109,7 +109,7 @@ class Calibration:
             return np.empty((Ad.shape[1], 0))
         rates = measured_velocities[:, self._calibrated]
         rates[:, self._scales :] = _moves(measured_velocities)[:, None]
-        shares = paths.at_poses(rates * dt_s[:, None])
+        shares = se3.at_poses(rates * dt_s[:, None])
         of_rates = Ad[:, :, self._calibrated] * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
         F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
@@ -117,6 +117,10 @@ class Calibration:
             first, last = self.apply(at_ends)
             F[:, -1] = Ad[0] @ first - Ad[-1] @ last
         return F
+
+    def initial_covariance(self) -> FloatArray:
+        """Return that of (ε, c̃) at the start, (p + c, p + c): the pose is the reference."""
+        return np.diag(np.append(np.zeros(self.axes.p), self.initial_variances))
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.geometry import paths, se3
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion
@@ -35,7 +35,7 @@ def transition_covariance(
     """Return the covariance (6, 6) of w in exp(w) Φ, Φ the `transition`, axes of the start."""
     held = _held(velocities, calibration, start_ns, end_ns)
     Ad = se3.adjoint(_path(np.eye(4), held, calibration))
-    return paths.summed_noise(Ad, noise.covariances(held))
+    return se3.summed_noise(Ad, noise.covariances(held))
 
 
 def integrate(
@@ -81,7 +81,7 @@ def _held(
 
 def _path(start: FloatArray, held: HeldVelocities, calibration: Calibration) -> FloatArray:
     """Return the poses (k + 1, 4, 4) that velocities lead to, from ``start`` (4, 4) on."""
-    return paths.path(start, calibration.apply(held.body_velocities) * held.dt_s[:, None])
+    return se3.path(start, calibration.apply(held.body_velocities) * held.dt_s[:, None])
 
 
 def _around(velocities: VelocityHistory, calibration: Calibration, stamp_ns: int) -> FloatArray:

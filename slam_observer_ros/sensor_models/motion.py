@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry import paths, se3
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.matrices import symmetric
 from slam_observer_ros.sensor_models.calibration import Calibration
 
 
@@ -27,7 +28,7 @@ class Motion:
     @cached_property
     def noise(self) -> FloatArray:
         """(p, p) Σ Ad_Â Q Ad_Âᵀ, what the motion adds to the covariance of ε."""
-        return paths.summed_noise(self._adjoints, self.covariances)
+        return se3.summed_noise(self._adjoints, self.covariances)
 
     @cached_property
     def sensitivity(self) -> FloatArray:
@@ -40,6 +41,18 @@ class Motion:
     def drift(self) -> FloatArray:
         """(c, c) what the motion's time adds to the covariance of the calibration."""
         return self.calibration.drift_covariance * self.duration_s
+
+    def predict(self, P: FloatArray) -> None:
+        """Let ε become ε + F c̃ + w, w ~ N(0, noise), in P, the covariance of (ε, c̃, …)."""
+        F = self.sensitivity
+        p, c = len(F), slice(len(F), sum(F.shape))
+        if F.shape[1]:
+            P[:p] += F @ P[c]
+            P[:p, :p] += P[:p, c] @ F.T
+            P[p:, :p] = P[:p, p:].T
+            P[c, c] += self.drift
+        # No observation takes a skew part away again, so rounding must not add to it.
+        P[:p, :p] = symmetric(P[:p, :p] + self.noise)
 
     @cached_property
     def _adjoints(self) -> FloatArray:

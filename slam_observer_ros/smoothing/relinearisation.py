@@ -21,8 +21,9 @@ from slam_observer_ros.common.errors import ParameterError, SmoothingError
 from slam_observer_ros.common.types import FloatArray, Immutable, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.observer.filter import Filter
+from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -62,8 +63,8 @@ class Relinearisation:
 
     Parameters
     ----------
-    filter_, joint : Filter, JointCovariance
-        The filter, at its start, and its covariance; relinearising changes what they know.
+    observer, calibration, joint : Observer, Calibration, JointCovariance
+        A filter's state and what it knows, at its start; relinearising changes them.
     settings : Settings
         ``hindsight_*``, ``huber_threshold``, ``rejection_distance``, noise of observations.
 
@@ -74,8 +75,15 @@ class Relinearisation:
 
     """
 
-    def __init__(self, filter_: Filter, joint: JointCovariance, settings: Settings) -> None:
-        self._filter, self._joint, self._settings = filter_, joint, settings
+    def __init__(
+        self,
+        observer: Observer,
+        calibration: Calibration,
+        joint: JointCovariance,
+        settings: Settings,
+    ) -> None:
+        self._observer, self._calibration, self._joint = observer, calibration, joint
+        self._axes, self._settings = calibration.axes, settings
         self._observation_noise = ObservationNoise(settings)
         self._warning = _Warning()
         self._seen = self._observations = 0
@@ -85,7 +93,7 @@ class Relinearisation:
     @property
     def is_active(self) -> bool:
         """Whether there is a history, of what the smoother takes for constant."""
-        return self._settings.hindsight_interval > 0 and not self._filter.calibration.drifts
+        return self._settings.hindsight_interval > 0 and not self._calibration.drifts
 
     def reset(self, since: str) -> None:
         """Forget all but what is known now; ``since`` is why, in words."""
@@ -95,7 +103,7 @@ class Relinearisation:
         """Note a motion of the robot."""
         if not self.is_active:
             return
-        if self._filter.observer.u.any():
+        if self._observer.u.any():
             # How far they went depends on how the robot was turned, which no smoother here knows.
             self.reset('a landmark came with a velocity')
         else:
@@ -116,7 +124,7 @@ class Relinearisation:
         """
         if not len(keyframe.rows):  # says nothing: the motions before and after it add up
             return
-        self.history.add(keyframe, self._filter.observer.A)
+        self.history.add(keyframe, self._observer.A)
         self._seen += 1
         self._observations += 1
         if in_doubt:
@@ -160,16 +168,12 @@ class Relinearisation:
     def _check_smoothable(self) -> None:
         if self._settings.hindsight_interval == 0:
             raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
-        if self._filter.calibration.drifts:
+        if self._calibration.drifts:
             raise ParameterError(
                 "smoothing takes the calibration to stay: 'calibration_drift' must be 0"
             )
-        if self._filter.observer.have_moved:
+        if self._observer.have_moved:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
-
-    @property
-    def _axes(self) -> EstimatedAxes:
-        return self._filter.axes
 
     def _start(self, prior: Prior, since: str) -> None:
         self.history = History(self._axes, self._observation_noise, prior, since)
@@ -235,26 +239,26 @@ class Relinearisation:
         ``covariance`` belongs to the step's start. Taken for that of its end it would say
         something of the gauge, of which nothing is known.
         """
-        start, end, observer = step.start, step.end, self._filter.observer
+        start, end, observer = step.start, step.end, self._observer
         observer.A = start.poses[-1]
         observer.set_reference(start.points)
         P = _with_pose_error_by(observer.A, covariance, self._axes)
         self._joint.set_of_positions(P, start.points)
-        self._filter.calibration.shift(end.calibration - self._filter.calibration.values)
+        self._calibration.shift(end.calibration - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)
 
     def _solution_from(self, first: int) -> Solution:
         """Return the present estimates, of poses those from before keyframe ``first`` on."""
         poses = np.array(self.history.poses[first:])
-        return Solution(poses, self._filter.calibration.values, self._filter.observer.points)
+        return Solution(poses, self._calibration.values, self._observer.points)
 
     def _known(self) -> Prior:
         """Return what is known now."""
-        observer, points = self._filter.observer, self._filter.observer.points
+        observer, points = self._observer, self._observer.points
         P = self._joint.of_positions(points)
         P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)
-        return Prior(observer.A, self._filter.calibration.values, points, P)
+        return Prior(observer.A, self._calibration.values, points, P)
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import limited
-from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.observer import Observer
 
 MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
@@ -25,24 +24,6 @@ def of_landmarks(observer: Observer, covariances: FloatArray | None) -> FloatArr
     R = observer.reference_pose[:3, :3]
     world: FloatArray = R @ covariances @ R.T
     return world
-
-
-def of_configuration(filter_: Filter, rows: IntArray) -> FloatArray | None:
-    """Return the covariance (m k, m k) of where landmarks are seen from the robot, m².
-
-    Joint, along the axes of the body that are estimated. The choice of the world's frame has no
-    part in it.
-    """
-    P, axes = filter_.joint_covariance(rows), filter_.axes
-    if P is None:
-        return None
-    m, k, p = len(rows), axes.point, axes.p
-    C = axes.output_matrix(filter_.points[rows]).reshape(-1, p)
-    CP = C @ P[:p] - P[p:]
-    blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
-    R = filter_.observer.A[:k, :k]
-    seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
-    return seen
 
 
 def of_pose(observer: Observer, covariance: FloatArray | None, A: FloatArray) -> FloatArray | None:

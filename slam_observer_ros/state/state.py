@@ -10,7 +10,7 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.designs import make_filter
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.sensor_models.integration import integrate
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
@@ -27,10 +27,10 @@ class State:
 
     Parameters
     ----------
+    filter_ : Filter
+        At the start.
     settings : Settings
         The settings in force.
-    initial_pose : FloatArray
-        (4, 4) pose at the start, body to world; also the reference P°.
 
     Attributes
     ----------
@@ -57,15 +57,17 @@ class State:
 
     """
 
-    def __init__(self, settings: Settings, initial_pose: FloatArray) -> None:
+    def __init__(self, filter_: Filter, settings: Settings) -> None:
         self.settings = settings
         self.is_mapping = True
-        self.filter = make_filter(settings, initial_pose)
+        self.filter = filter_
         self.observer, self.axes = self.filter.observer, self.filter.axes
         self.landmarks = LandmarkTable()
         self.relinearisation: Relinearisation | None = None
-        if self.filter.joint is not None and not self.landmark_velocity_error:
-            self.relinearisation = Relinearisation(self.filter, self.filter.joint, settings)
+        if filter_.joint is not None and not self.landmark_velocity_error:
+            self.relinearisation = Relinearisation(
+                self.observer, filter_.calibration, filter_.joint, settings
+            )
         self.counts: Counter[str] = Counter()
         self.rejected_in_a_row = 0
         self.was_contradicted = False

@@ -1,4 +1,4 @@
-"""A robot that is not where odometry has it, distinguished from outliers and from landmarks that moved."""
+"""A robot that is not where odometry has it, and not outliers or landmarks that moved."""
 
 from __future__ import annotations
 

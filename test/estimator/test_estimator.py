@@ -34,6 +34,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -263,7 +264,7 @@ def test_an_observation_carried_forward_is_as_uncertain_as_the_motion_since(m, a
         angular_velocity_noise=(0.0, 0.0, 0.2),
         linear_velocity_noise=(0.3, 0.0, 0.0),
     )
-    timeline = Timeline(Hypotheses(State(settings, np.eye(4))), settings)
+    timeline = Timeline(Hypotheses(State(make_filter(settings, np.eye(4)), settings)), settings)
     turning = np.array([0.0, 0.0, 1e-9, 0.0, 0.0, 0.0])
     for step in range(21):
         timeline.append(velocity(0.1 * step, turning))
@@ -287,7 +288,7 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
         linear_velocity_noise=still,
         landmark_velocity_error=0.5 * is_estimated,
     )
-    hypotheses = Hypotheses(State(settings, np.eye(4)))
+    hypotheses = Hypotheses(State(make_filter(settings, np.eye(4)), settings))
     timeline = Timeline(hypotheses, settings)
     turning = np.array([0.0, 0.0, turn_rad / 0.9, 0.0, 0.0, 0.0])
     for step in range(11):
@@ -662,7 +663,9 @@ def test_where_many_landmarks_seem_to_move_the_odometry_is_named(caplog):
         points = LANDMARKS + 3.0 * np.outer(times_moved, [0.0, 0.0, 1.0])
         estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), points))
     reported = [message for message in caplog.messages if 'seem to have moved' in message]
-    assert reported[0].startswith('5 landmarks seem to have moved within a minute: odometry may err')
+    assert reported[0].startswith(
+        '5 landmarks seem to have moved within a minute: odometry may err'
+    )
 
 
 def test_landmarks_that_moved_before_a_jump_of_the_clock_did_not_move_lately(caplog):
@@ -991,7 +994,8 @@ def test_gains_that_estimate_no_velocities_of_landmarks_take_them_as_messages_sa
 
 def test_a_late_observation_is_judged_by_where_its_landmarks_are_by_now():
     """Scheduled gains put off moving those that were out of view."""
-    state = State(Settings(gains='scheduled', confirmations=1), np.eye(4))
+    settings = Settings(gains='scheduled', confirmations=1)
+    state = State(make_filter(settings, np.eye(4)), settings)
     event = observation(0.0, [0, 1])
     state_step.step(state, match(state, event))
     state.filter.expected_points = Mock(return_value=event.points)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from slam_observer_ros.observer.prediction import initial_covariance, predict
 from strategies import generators
 
 from slam_observer_ros.estimates import CalibrationEstimate
@@ -18,7 +19,6 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.observer.prediction import initial_covariance, predict
 from slam_observer_ros.sensor_models.calibration import Calibration, MIN_DELAY_S
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings

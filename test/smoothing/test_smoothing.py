@@ -17,6 +17,7 @@ from gain_worlds import (
 from hypothesis import given
 import numpy as np
 import pytest
+from slam_observer_ros.observer.prediction import initial_covariance, predict
 from strategies import generators
 
 from slam_observer_ros.common.errors import ParameterError
@@ -28,7 +29,6 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.observer.filter import FrameObservation
 from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.prediction import initial_covariance, predict
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion

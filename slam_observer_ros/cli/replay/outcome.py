@@ -97,11 +97,20 @@ def outcome_of(
     recording: Recording, selected: SelectedTopics, result: Replay, truth: Truth
 ) -> ReplayOutcome:
     """Measure a replay of a recording that has been read to its end."""
+    estimator = result.estimator
+    accuracy = measure(
+        result.trajectory,
+        None if result.in_known_map else result.pose_covariances,
+        result.dead_reckoning,
+        (estimator.landmark_ids, estimator.world_points),
+        result.configuration,
+        truth,
+    )
     return ReplayOutcome(
         selected,
         result,
         truth,
-        measure(result, truth),
+        accuracy,
         recording.duration_s,
         unused_messages(recording, selected),
         recording.contents.missing_ids(selected.landmarks),

@@ -155,7 +155,12 @@ class EstimatePublisher:
         )
         if self._markers.get_subscription_count() > 0:
             header = MESSAGES.header(stamp_ns, map_frame)
-            self._markers.publish(landmark_markers(header, estimator))
+            landmarks = (
+                estimator.landmark_ids,
+                estimator.world_points,
+                estimator.landmark_covariances,
+            )
+            self._markers.publish(landmark_markers(header, *landmarks, estimator.last_update))
 
     def _publish_estimates(self, stamp_ns: int) -> None:
         ids = self._estimator.landmark_ids

@@ -7,8 +7,8 @@ import numpy as np
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import Update
 from slam_observer_ros.nodes.message_classes import MESSAGES
 
 POINT_SIZE_M = 0.2
@@ -25,22 +25,27 @@ ELLIPSOID_SIGMAS = 3.0  # half axes, in standard deviations
 MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
 
 
-def landmark_markers(header: Header, estimator: Estimator) -> MarkerArray:
-    """Return markers that replace all earlier ones.
+def landmark_markers(
+    header: Header,
+    ids: IntArray,
+    points: FloatArray,
+    covariances: FloatArray | None,
+    update: Update | None,
+) -> MarkerArray:
+    """Return markers that replace all earlier ones, of landmarks (n,) in the header's frame.
 
     They are points, ids, the last residuals and, where covariances are known, ellipsoids.
     """
-    points = estimator.world_points
     if not len(points):
         return no_markers(header)
     labels = [
         _label(header, number, landmark_id, point)
         for number, (landmark_id, point) in enumerate(
-            zip(estimator.landmark_ids[:MAX_LABELS].tolist(), points, strict=False)
+            zip(ids[:MAX_LABELS].tolist(), points, strict=False)
         )
     ]
-    lines = _residual_lines(header, estimator)
-    ellipsoids = _ellipsoids(header, points, estimator.landmark_covariances)
+    lines = _residual_lines(header, ids, points, update)
+    ellipsoids = _ellipsoids(header, points, covariances)
     drawn = [_points(header, points), lines, *ellipsoids, *labels]
     return MarkerArray(markers=[*no_markers(header).markers, *drawn])
 
@@ -76,13 +81,14 @@ def _ellipsoids(
     return markers
 
 
-def _residual_lines(header: Header, estimator: Estimator) -> Marker:
+def _residual_lines(
+    header: Header, ids: IntArray, points: FloatArray, update: Update | None
+) -> Marker:
     """Return a line from each landmark just seen to where it was seen."""
     marker = _marker(header, 'residuals', Marker.LINE_LIST, ORANGE, LINE_WIDTH_M)
-    update = estimator.last_update
     if update is not None:
-        _, seen, rows = np.intersect1d(update.ids, estimator.landmark_ids, return_indices=True)
-        ends = estimator.world_points[rows]
+        _, seen, rows = np.intersect1d(update.ids, ids, return_indices=True)
+        ends = points[rows]
         lines = np.stack((ends, ends + update.residuals[seen]), axis=1).reshape(-1, 3)
         marker.points = [MESSAGES.point(point) for point in lines]
     return marker

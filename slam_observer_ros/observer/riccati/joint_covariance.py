@@ -14,7 +14,6 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import block_diagonal, kalman_update, transpose
-from slam_observer_ros.observer.prediction import initial_covariance, predict
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
@@ -34,7 +33,7 @@ class JointCovariance:
 
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         self._axes, self._p = axes, axes.p
-        self.P = initial_covariance(axes, calibration)
+        self.P = calibration.initial_covariance()
         self.first = len(self.P)
         self._stride = axes.point  # columns of each landmark
         self._first_columns = self.first + np.arange(axes.point)
@@ -223,7 +222,7 @@ class ExactMapCovariance(JointCovariance):
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
         """Add a motion's noise to that of the pose."""
-        predict(self.P, motion)
+        motion.predict(self.P)
 
     def lever_arms(self, residuals: Residuals) -> FloatArray:
         """Return ŷ_i (m, 3) of r_i = [−[ŷ_i]×, I] ε."""

@@ -17,7 +17,6 @@ from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
-from slam_observer_ros.observer.prediction import predict
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
 from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
@@ -133,7 +132,7 @@ class RiccatiFilter(Filter):
         if motion is None:
             return self.axes.full_pose_covariance(self.joint.pose)
         P = self.joint.P[: self.joint.first, : self.joint.first].copy()
-        predict(P, motion)
+        motion.predict(P)
         return self.axes.full_pose_covariance(P[: self.axes.p, : self.axes.p])
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:

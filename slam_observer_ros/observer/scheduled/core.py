@@ -16,7 +16,6 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import kalman_update, symmetric, transpose
-from slam_observer_ros.observer.prediction import initial_covariance, predict
 from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
@@ -56,7 +55,7 @@ class Core:
     """
 
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
-        start = initial_covariance(axes, calibration)
+        start = calibration.initial_covariance()
         self._axes, self._calibration = axes, calibration
         self._p = axes.p
         self._places = len(start) + np.arange(CAPACITY * axes.point).reshape(CAPACITY, axes.point)
@@ -69,7 +68,7 @@ class Core:
     def predict(self, motion: Motion) -> None:
         """Add a motion's noise to the pose, and what the calibration's error adds."""
         before, Phi = self.P.copy(), np.eye(len(self.P))
-        predict(self.P, motion)
+        motion.predict(self.P)
         Phi[: self._p, self._p : self._p + self._calibration.count] = motion.sensitivity
         self._change_core(before, Phi)
 
