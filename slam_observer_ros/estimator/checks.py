@@ -1,14 +1,19 @@
-"""Refuses events and poses that can't be used, before they touch the state."""
+"""Refuses events, points and poses that can't be used, before they touch the state."""
 
 from __future__ import annotations
+
+from collections import Counter
 
 import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
+    flatten,
+    is_automatic,
     MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,
@@ -16,6 +21,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.settings.estimator_settings import Settings
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 """Relative error of a covariance whose message has it in single precision."""
@@ -183,3 +189,30 @@ def _check_definite(name: str, covariances: FloatArray) -> None:
         raise InvalidEventError(
             'bad_covariance', f'{name}: asymmetric, or with a negative eigenvalue'
         )
+
+
+def usable_points(
+    event: ObservationEvent,
+    settings: Settings,
+    needs_ids: bool,
+    counts: Counter[str],
+    warnings: EventWarnings,
+) -> ObservationEvent:
+    """Return an observation as the states use it; count its points, warn of those left out."""
+    counts['observed_point'] += len(event.ids)
+    event = flatten(event) if settings.two_d_mode else event
+    reserved = is_automatic(event.ids)  # given here, to landmarks without an id
+    if reserved.any():
+        warnings.reserved_ids(event.ids[reserved].tolist())
+        counts['reserved_id'] += int(np.sum(reserved))
+        event = event.select(~reserved)
+    if repeated_ids := event.repeated_ids():  # nobody knows which of the points is right
+        warnings.repeated_ids(repeated_ids)
+        repeated = np.isin(event.ids, repeated_ids)
+        counts['repeated_id'] += int(np.sum(repeated))
+        event = event.select(~repeated)
+    if needs_ids and (unknown := event.ids == UNKNOWN_ID).any():
+        warnings.unknown_ids(settings.gains)
+        counts['unknown_id'] += int(np.sum(unknown))
+        event = event.select(~unknown)
+    return event

@@ -13,11 +13,10 @@ from slam_observer_ros.common.errors import InvalidEventError, ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
-from slam_observer_ros.estimator.checks import check_event, check_map, check_pose
+from slam_observer_ros.estimator.checks import check_event, check_map, check_pose, usable_points
 from slam_observer_ros.estimator.event_queue import EventQueue
 from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
-from slam_observer_ros.estimator.usable_points import usable_points
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
@@ -479,6 +478,8 @@ class Estimator:
 
     def _localise(self, outcome: Outcome) -> None:
         """Look for the pose in a loaded map if it is not known, or not any more."""
+        if self._localiser.loaded is None:
+            return
         reason = self._localiser.reason_to_restart(self._state, outcome)
         if reason is not None:
             logger.warning('%s; localising again.', reason)

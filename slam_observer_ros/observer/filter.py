@@ -45,12 +45,15 @@ class Filter:
         What of the pose and of points is estimated.
     joint : JointCovariance or None
         The covariance of the errors of pose and landmarks together, where it is kept.
+    has_joint_covariance : bool
+        Whether it is, so that observations can be judged by it, as association does.
     ignores : tuple of str
         Settings without effect on the filter.
 
     """
 
     joint: JointCovariance | None = None
+    has_joint_covariance: ClassVar[bool] = False
     ignores: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
@@ -58,11 +61,6 @@ class Filter:
         self.axes = axes_of(settings.two_d_mode)
         self.observer = Observer(reference_pose)
         self.calibration = Calibration(settings, self.axes)
-
-    @property
-    def has_joint_covariance(self) -> bool:
-        """Whether observations can be judged by it, as association and relinearising do."""
-        return self.joint is not None
 
     # The step (27)-(31)
 

@@ -54,6 +54,8 @@ class Calibration:
         self._scales = int(np.sum(self._estimated < 6))
         self._calibrated = self._estimated[self._estimated < DELAY] % 6
         self._all: FloatArray = NOMINAL.copy()
+        # τ; where it is negative the latest velocity is held for longer.
+        self.delay_ns = 0
         self.count = len(self._estimated)  # c
         self.delay_error_ns = to_ns(settings.velocity_delay_error)
         self.initial_variances = errors[self._estimated] ** 2
@@ -80,11 +82,6 @@ class Calibration:
             )
             for i, variance, error in zip(self._estimated, variances, stated, strict=True)
         ]
-
-    @property
-    def delay_ns(self) -> int:
-        """Delay τ in its limits; where it is negative the latest velocity is held for longer."""
-        return to_ns(float(self._all[DELAY]))
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
         """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so."""
@@ -126,6 +123,7 @@ class Calibration:
         """Add ``change`` (c,) to the estimates."""
         self._all[self._estimated] += change
         self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)
+        self.delay_ns = to_ns(float(self._all[DELAY]))
 
 
 def _moves(body_velocities: FloatArray) -> BoolArray:

@@ -90,9 +90,14 @@ class JointCovariance:
         P += half + half.T
         P[c, c] += motion.drift
 
-    def lever_arms(self, residuals: Residuals) -> FloatArray:
-        """Return y_i (m, 3) of r_i = [−[y_i]×, I] ε − ξ_i: zero, in these coordinates."""
-        return np.zeros_like(residuals.r)
+    def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
+        """Return C_i (m, k, p) of r_i = C_i ε − ξ_i: [0, I], in these coordinates.
+
+        That is at ŷ_i; ``chord`` is how far on the way from there to R_Â y_i + x_Â. Turning the
+        one to the other, by however much, moves it at right angles to the middle: judged by C at
+        ŷ_i, a robot that has turned further than it knows would reject what it sees.
+        """
+        return self._axes.output_matrix(chord * residuals.r)
 
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return H P (m k, …) and H P Hᵀ (m k, m k) of H x = C_i ε − ξ_i, C_i (m, k, p)."""
@@ -224,9 +229,9 @@ class ExactMapCovariance(JointCovariance):
         """Add a motion's noise to that of the pose."""
         motion.predict(self.P)
 
-    def lever_arms(self, residuals: Residuals) -> FloatArray:
-        """Return ŷ_i (m, 3) of r_i = [−[ŷ_i]×, I] ε."""
-        return residuals.landmarks
+    def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
+        """Return C_i (m, k, p) of r_i = C_i ε: [−[ŷ_i]×, I]."""
+        return self._axes.output_matrix(residuals.landmarks + chord * residuals.r)
 
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return H P and H P Hᵀ of H x = C_i ε."""

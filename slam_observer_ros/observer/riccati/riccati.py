@@ -12,6 +12,8 @@ X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landma
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
@@ -37,6 +39,7 @@ class RiccatiFilter(Filter):
     """
 
     joint: JointCovariance
+    has_joint_covariance: ClassVar[bool] = True
     ignores = OF_CONSTANT_GAINS
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
@@ -56,27 +59,29 @@ class RiccatiFilter(Filter):
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
         r, R = residuals.on(self.axes)
+        # A gate, then Huber's weights; errors that last make R larger, too.
         weights = observation_weights(r, self.predicted(residuals)[1], R, self._settings)
         passed = weights > 0.0
-        used = residuals.select(passed)
-        r, R = used.on(self.axes)
+        used, r, R = residuals.select(passed), r[passed], R[passed]
         repeated = repetition_factors(used.dt_s, self._settings.observation_error_time)
-        C = self.axes.output_matrix(self.joint.lever_arms(used))
-        HP, HPH = self.joint.project(C, used.rows)
-        S = with_blocks(HPH, R / (weights[passed] / repeated)[:, None, None])
-        K = self.joint.update(HP, S)
-        self._move(-K @ r.ravel())  # for (30) and (31)
+        R = R / (weights[passed] / repeated)[:, None, None]
+        # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
+        HP, HPH = self.joint.project(self.joint.output_matrix(used), used.rows)
+        K = self.joint.update(HP, with_blocks(HPH, R))
+        self._move(-K @ r.ravel())
         return weights
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
         r, R = residuals.on(self.axes)
-        _, predicted = self.joint.output(self._chord_output(residuals), residuals.rows)
+        C = self.joint.output_matrix(residuals, chord=0.5)
+        _, predicted = self.joint.output(C, residuals.rows)
         return mahalanobis(r, predicted + R)
 
     def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
-        return self.joint.outputs(self._chord_output(residuals), residuals.rows)
+        C = self.joint.output_matrix(residuals, chord=0.5)
+        return self.joint.outputs(C, residuals.rows)
 
     def add(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
@@ -143,14 +148,6 @@ class RiccatiFilter(Filter):
     def joint_covariance(self, rows: IntArray) -> FloatArray:
         """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks."""
         return self.joint.with_pose(rows, self.observer.points[rows])
-
-    def _chord_output(self, residuals: Residuals) -> FloatArray:
-        """Return C_i (m, k, p) at the middle of the chord from ŷ_i to R_Â y_i + x_Â.
-
-        Turning one to the other, by however much, moves it at right angles to the middle; with C
-        at ŷ_i a robot that has turned further than it knows would reject what it sees.
-        """
-        return self.axes.output_matrix(self.joint.lever_arms(residuals) + 0.5 * residuals.r)
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
