@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.observer.constant import ConstantFilter
 from slam_observer_ros.observer.filter import Filter
@@ -11,12 +9,12 @@ from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.observer.scheduled.scheduled import ScheduledFilter
 from slam_observer_ros.settings.estimator_settings import Settings
 
-DESIGNS: dict[str, Callable[[Settings, FloatArray], Filter]] = {
+DESIGNS: dict[str, type[Filter]] = {
     'constant': ConstantFilter,
     'scheduled': ScheduledFilter,
     'riccati': RiccatiFilter,
 }
-"""The values of the parameter ``gains``, and what makes the filter at a reference pose."""
+"""The values of the parameter ``gains``, and their filters."""
 
 
 def make_filter(settings: Settings, reference_pose: FloatArray) -> Filter:

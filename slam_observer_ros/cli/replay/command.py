@@ -32,6 +32,7 @@ from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
 from slam_observer_ros.common.errors import OutputError, UsageError
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -87,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
     defaults = {'hindsight_window': 0} if args.smooth else {}
     settings = read_settings(args, INPUT_NAMES, INSTEAD, **defaults)
     inputs = read_inputs(args)
-    if args.smooth and settings.gains != 'riccati':
+    if args.smooth and not DESIGNS[settings.gains].has_joint_covariance:
         raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
     check_files(args)
     warn_of_unused(args, settings)

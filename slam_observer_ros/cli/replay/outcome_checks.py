@@ -15,6 +15,7 @@ from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.replay import Replay
@@ -136,7 +137,7 @@ def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
 def _advice(result: Replay) -> str:
     """Return what to do if the landmarks seen did not determine the pose."""
     counts, settings = result.estimator.counts, result.estimator.settings
-    if counts['unknown_id'] and settings.gains != 'riccati':
+    if counts['unknown_id'] and not DESIGNS[settings.gains].has_joint_covariance:
         return f'; {counts["unknown_id"]} points without id take --gains riccati'
     if 2 * counts['repeated_id'] > counts['observed_point']:
         return f'; {counts["repeated_id"]} points were {UNUSED_POINTS["repeated_id"]}'

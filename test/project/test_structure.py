@@ -1,0 +1,75 @@
+"""The structure stays as short as it is: `python benchmark/structure.py` prints the figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+BENCHMARK = CHECKOUT / 'benchmark'
+PACKAGE = CHECKOUT / 'slam_observer_ros'
+
+VAGUE = re.compile(
+    r'(?<![a-z])(tells?|told|telling|anew|fate|befell|lacks?|meets?)(?![a-z])', re.IGNORECASE
+)
+"""Words for which the field has better ones."""
+
+
+@pytest.fixture(name='structure')
+def fixture_structure(monkeypatch):
+    if not BENCHMARK.is_dir():
+        pytest.skip('the benchmark is not installed')
+    monkeypatch.syspath_prepend(str(BENCHMARK))
+    import structure
+
+    return structure
+
+
+def sources():
+    return [*PACKAGE.rglob('*.py'), *(CHECKOUT / 'docs').glob('*.md'), CHECKOUT / 'README.md']
+
+
+def test_folders_show_the_architecture(structure):
+    assert len(structure.loose_modules()) <= 5
+    assert structure.layers() <= 12
+    assert len(structure.longest_chain()) <= 18
+
+
+def test_a_step_with_ids_takes_no_more_calls_than_it_did(structure):
+    step = structure.traced_step()
+    assert len(step.modules) <= 36
+    assert step.changes <= 133
+    assert step.depth <= 14
+
+
+def test_docstrings_are_a_fifth_of_all_lines_at_most(structure):
+    docstrings, lines = structure.docstring_lines()
+    assert docstrings <= 0.2 * lines
+
+
+def test_filters_are_distinguished_by_what_they_have_not_by_name():
+    for path in PACKAGE.rglob('*.py'):
+        text = path.read_text(encoding='utf-8')
+        assert not re.search(r'isinstance\([^)]*Filter\)', text), path
+        assert not re.search(r"[!=]= '(riccati|scheduled|constant)'", text), path
+
+
+def test_settings_are_changed_in_one_place():
+    definitions = [
+        path
+        for path in PACKAGE.rglob('*.py')
+        for _ in re.findall(r'def change_settings\(', path.read_text(encoding='utf-8'))
+    ]
+    assert len(definitions) == 1
+
+
+@pytest.mark.parametrize('path', sources(), ids=lambda path: str(path.relative_to(CHECKOUT)))
+def test_words_are_those_of_the_field(path):
+    found = [
+        f'{number}: {line.strip()}'
+        for number, line in enumerate(path.read_text(encoding='utf-8').splitlines(), 1)
+        if VAGUE.search(line)
+    ]
+    assert not found
