@@ -100,7 +100,7 @@ def localise(world: World, gains: str, mode: str) -> Estimates:
 
 def smooth(world: World) -> Estimates:
     """Return the smoothed trajectory and map."""
-    estimator = Estimator(replace(world.settings, gains='riccati', hindsight_window=0))
+    estimator = Estimator(replace(world.settings, gains='riccati', smoothing_window=0))
     observed(estimator, world)
     smoothed = estimator.smooth()
     return {'poses': list(smoothed.poses), 'points': [smoothed.world_points]}

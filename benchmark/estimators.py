@@ -157,7 +157,7 @@ def run_online(estimator: OnlineEstimator, events: Iterable[Event]) -> Run:
 
 def run_smoothed(settings: Settings, events: list[Event]) -> Run:
     """Run the Riccati observer, then smooth everything; each snapshot holds the final map."""
-    estimator = Estimator(replace(settings, gains='riccati', hindsight_window=0))
+    estimator = Estimator(replace(settings, gains='riccati', smoothing_window=0))
     start_s = time.process_time()
     for event in events:
         estimator.add(event)

@@ -28,12 +28,12 @@ SMALL_STEREO = Loop('stereo_inertial', 60.0, 180.0, 20, 6.0, 5)
 
 MOVING_SHARE = 0.1
 
-NEVER_RELINEARISED = {'hindsight_interval': 0}
+NEVER_RELINEARISED = {'relinearization_interval': 0}
 NO_SLIPS = {'unknown_angular_motion': 0.0, 'unknown_linear_motion': 0.0}
 """It has no other effect here: velocities have no gaps for which these figures count."""
 
 NO_DOUBTS = NO_SLIPS | {'max_hypotheses': 1}
-VELOCITIES = {'landmark_velocity_error': 0.04}
+VELOCITIES = {'landmark_velocity_stddev': 0.04}
 """Root mean square of each component over all landmarks, a tenth of which move."""
 
 Make: TypeAlias = Callable[[int], World]

@@ -103,8 +103,8 @@ Written by `python benchmark/accuracy.py --write-docs`; `make benchmark-accuracy
 run, with the same events and noise figures for all: those of `config/wheeled_bearing_range.yaml`
 and `config/stereo_inertial.yaml`, which come from descriptions of the sensors and not from these
 recordings. The simulated worlds have the noise that these files state, but with errors independent
-from one observation to the next. Where errors last (`observation_error_time`, for wheeled robots)
-all estimators are given the same larger covariances.
+from one observation to the next. Where errors last (`observation_correlation_time`, for wheeled
+robots) all estimators are given the same larger covariances.
 
 - **constant, scheduled, riccati**: this project's gain designs. In the wheeled configuration
   `scheduled` and `riccati` also estimate scale, bias and delay of the odometry, which GTSAM and

@@ -50,7 +50,7 @@ def main() -> None:
 def update_s(design: str, map_size: int, seen: int) -> float:
     """Return the least time of a velocity and an observation of ``seen`` known landmarks."""
     rng = np.random.default_rng(0)
-    settings = Settings(gains=design, reorder_window=0.0, hindsight_interval=0)
+    settings = Settings(gains=design, reorder_window=0.0, relinearization_interval=0)
     estimator = Estimator(settings)
     points = rng.uniform(-20.0, 20.0, (map_size, 3))
     estimator.add(VelocityEvent(0, np.zeros(6)))

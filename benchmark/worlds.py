@@ -155,7 +155,7 @@ def shipped_settings(config: str) -> Settings:
 
 def simulated_settings(config: str) -> Settings:
     """Return the same for a simulated sensor, whose errors are new in each observation."""
-    return replace(shipped_settings(config), observation_error_time=0.0)
+    return replace(shipped_settings(config), observation_correlation_time=0.0)
 
 
 def without_calibration(settings: Settings) -> Settings:
@@ -163,11 +163,11 @@ def without_calibration(settings: Settings) -> Settings:
     zero = (0.0, 0.0, 0.0)
     return replace(
         settings,
-        angular_scale_error=zero,
-        linear_scale_error=zero,
-        angular_bias_error=zero,
-        linear_bias_error=zero,
-        velocity_delay_error=0.0,
+        angular_scale_stddev=zero,
+        linear_scale_stddev=zero,
+        angular_bias_stddev=zero,
+        linear_bias_stddev=zero,
+        velocity_delay_stddev=0.0,
     )
 
 

@@ -77,7 +77,7 @@ def find_assignments(
     r, noise = residuals.on(axes)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
-    gate_cost = unpaired_cost(state.settings.rejection_distance)
+    gate_cost = unpaired_cost(state.settings.rejection_threshold)
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), gate_cost)
     # Beyond what is searched; a point of no landmark costs the same whatever it might have been.
     fixed_cost = m * gate_cost - float(unpaired_costs[np.unique(at)].sum())
@@ -131,7 +131,7 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     distances = state.filter.distances(_as_residuals(state.observer, seen, at, rows))
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
-    passes = distances[order] <= state.settings.rejection_distance
+    passes = distances[order] <= state.settings.rejection_threshold
     near = order[(rank < MAX_CANDIDATES) & passes]
     return at[near], rows[near]
 
@@ -144,7 +144,7 @@ def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     C = SPATIAL.output_matrix(seen.points)
     of_points = C @ of_pose @ transpose(C) + seen.noise
     spread_m = _spread_m(of_points) + np.max(_spread_m(of_landmarks), initial=0.0)
-    reach_m = state.settings.rejection_distance * spread_m
+    reach_m = state.settings.rejection_threshold * spread_m
     return index.near(state.observer.points, seen.points, reach_m)
 
 

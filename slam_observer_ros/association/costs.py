@@ -33,7 +33,7 @@ MAX_OF_ONE_CAUSE = 3
 
 def outlier_cost(state: State) -> float:
     """Return what it costs that a point is of no landmark that is known."""
-    return unpaired_cost(state.settings.rejection_distance)
+    return unpaired_cost(state.settings.rejection_threshold)
 
 
 def pairing_cost(state: State, m: int, residuals: Residuals) -> float:

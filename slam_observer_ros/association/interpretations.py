@@ -145,7 +145,7 @@ def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
     if not state.filter.has_joint_covariance:
         return False
     sensor_distances = _sensor_distances(state, residuals)
-    if (sensor_distances <= state.settings.rejection_distance).all():
+    if (sensor_distances <= state.settings.rejection_threshold).all():
         return False  # by all of S they are no further off
     some_are_suspect = bool(_suspects(state, residuals, sensor_distances).any())
     return some_are_suspect or is_contradiction(_are_rejected(state, residuals))
@@ -207,7 +207,7 @@ def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
 
 def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
     """Return which points (m,) the gate rejects."""
-    return np.asarray(state.filter.distances(residuals) > state.settings.rejection_distance)
+    return np.asarray(state.filter.distances(residuals) > state.settings.rejection_threshold)
 
 
 def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:

@@ -280,7 +280,7 @@ class Estimator:
         """Return trajectory and map in hindsight; the state is not changed.
 
         They cover the observations since the history began, all of them with the setting
-        ``hindsight_window`` 0, as far as a point of them was believed.
+        ``smoothing_window`` 0, as far as a point of them was believed.
 
         Raises
         ------

@@ -41,14 +41,14 @@ class ConstantFilter(Filter):
     """
 
     ignores = (
-        'angular_scale_error',
-        'linear_scale_error',
-        'angular_bias_error',
-        'linear_bias_error',
-        'velocity_delay_error',
+        'angular_scale_stddev',
+        'linear_scale_stddev',
+        'angular_bias_stddev',
+        'linear_bias_stddev',
+        'velocity_delay_stddev',
         'calibration_drift',
-        'landmark_velocity_error',
-        'observation_error_time',
+        'landmark_velocity_stddev',
+        'observation_correlation_time',
     )
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:

@@ -39,10 +39,10 @@ def observation_weights(
     noise : FloatArray
         (m, k, k) covariances of the observations, m².
     settings : Settings
-        ``rejection_distance`` and ``huber_threshold``.
+        ``rejection_threshold`` and ``huber_threshold``.
 
     """
-    gate, weights = settings.rejection_distance, np.ones(len(r))
+    gate, weights = settings.rejection_threshold, np.ones(len(r))
     S_inv_r = _solve_residuals(r, predicted, noise)
     # No residual is further out than all of them together are.
     if np.vdot(r, S_inv_r) > gate**2:
@@ -67,7 +67,7 @@ def are_far(sensor_distances: FloatArray, settings: Settings) -> BoolArray:
 
     ``sensor_distances`` (m,) are theirs by the sensor's noise alone.
     """
-    return sensor_distances > SUSPICION * settings.rejection_distance
+    return sensor_distances > SUSPICION * settings.rejection_threshold
 
 
 def far_from_the_others(
@@ -94,7 +94,7 @@ def gated(
 
     Parameters as above.
     """
-    passed = distances(r, predicted, noise) <= settings.rejection_distance
+    passed = distances(r, predicted, noise) <= settings.rejection_threshold
     used = np.flatnonzero(np.repeat(passed, r.shape[1]))
     return passed, predicted[used][:, used]
 

@@ -45,9 +45,9 @@ class Calibration:
 
     def __init__(self, settings: Settings, axes: EstimatedAxes) -> None:
         self.axes = axes
-        scale = np.array([*settings.angular_scale_error, *settings.linear_scale_error])
-        bias = np.array([*settings.angular_bias_error, *settings.linear_bias_error])
-        errors = np.concatenate([scale, bias, [settings.velocity_delay_error]])
+        scale = np.array([*settings.angular_scale_stddev, *settings.linear_scale_stddev])
+        bias = np.array([*settings.angular_bias_stddev, *settings.linear_bias_stddev])
+        errors = np.concatenate([scale, bias, [settings.velocity_delay_stddev]])
         pose = np.arange(6)[axes.pose]
         possible = np.concatenate([pose, 6 + pose, [DELAY]])
         self._estimated: IntArray = possible[errors[possible] > 0.0]
@@ -57,7 +57,7 @@ class Calibration:
         # τ; where it is negative the latest velocity is held for longer.
         self.delay_ns = 0
         self.count = len(self._estimated)  # c
-        self.delay_error_ns = to_ns(settings.velocity_delay_error)
+        self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
         self.initial_variances = errors[self._estimated] ** 2
         self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
         self.drifts = bool(self.drift_covariance.any())

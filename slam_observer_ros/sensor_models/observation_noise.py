@@ -39,7 +39,7 @@ class ObservationNoise(Immutable):
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.error_time_s = settings.observation_error_time
+        self.error_time_s = settings.observation_correlation_time
 
     def covariances(
         self, event: ObservationEvent, lines_of_sight: FloatArray | None = None

@@ -177,7 +177,7 @@ class Settings(Immutable):
     disparity_noise: float = parameter(
         1.0, 'Stereo: standard deviation of the disparity', unit='px', minimum=1e-6
     )
-    observation_error_time: float = parameter(
+    observation_correlation_time: float = parameter(
         0.0,
         'Scheduled and Riccati gains: correlation time of the error of an observed landmark, such '
         'as that of a calibration, or of a tag seen from one side; 0 for errors that are '
@@ -186,33 +186,33 @@ class Settings(Immutable):
         minimum=0.0,
         maximum=60.0,
     )
-    angular_scale_error: Vector3 = parameter(
+    angular_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Scheduled and Riccati gains: scale error of the angular velocity x y z to be estimated: '
         'its standard deviation',
         minimum=0.0,
     )
-    linear_scale_error: Vector3 = parameter(
+    linear_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Scheduled and Riccati gains: scale error of the linear velocity x y z to be estimated: '
         'its standard deviation',
         minimum=0.0,
     )
-    angular_bias_error: Vector3 = parameter(
+    angular_bias_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Scheduled and Riccati gains: bias of the angular velocity x y z to be estimated: its '
         'standard deviation',
         unit='rad/s',
         minimum=0.0,
     )
-    linear_bias_error: Vector3 = parameter(
+    linear_bias_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Scheduled and Riccati gains: bias of the linear velocity x y z to be estimated: its '
         'standard deviation',
         unit='m/s',
         minimum=0.0,
     )
-    velocity_delay_error: float = parameter(
+    velocity_delay_stddev: float = parameter(
         0.0,
         'Scheduled and Riccati gains: delay from the stamp of a velocity to its effect in '
         'observations, to be estimated: its standard deviation',
@@ -228,7 +228,7 @@ class Settings(Immutable):
         unit='1/√s',
         minimum=0.0,
     )
-    landmark_velocity_error: float = parameter(
+    landmark_velocity_stddev: float = parameter(
         0.0,
         'Riccati gains: spread of unknown constant landmark velocities to be estimated; 0: static',
         unit='m/s',
@@ -241,7 +241,7 @@ class Settings(Immutable):
         minimum=0.0,
         read_only=False,
     )
-    rejection_distance: float = parameter(
+    rejection_threshold: float = parameter(
         6.0,
         'Scheduled and Riccati gains: standard deviations of the residual beyond which an '
         'observation is rejected',
@@ -277,20 +277,20 @@ class Settings(Immutable):
         'have slipped: most hypotheses that are followed until it is clear which one is right',
         minimum=1,
     )
-    hindsight_interval: int = parameter(
+    relinearization_interval: int = parameter(
         20,
         'Riccati gains: fewest new observations before relinearising; a tenth of all so far if '
         'that is more, but at most 300; 0 for never',
         minimum=0,
     )
-    hindsight_turn: float = parameter(
+    relinearization_angle: float = parameter(
         0.2,
         'Riccati gains: relinearise once attitude corrections have reached this as a root sum '
         'square; after a single one of this size a tenth of the interval is enough',
         unit='rad',
         minimum=0.0,
     )
-    hindsight_window: int = parameter(
+    smoothing_window: int = parameter(
         3000,
         'Riccati gains: most observations that are smoothed together; the next ones go on from '
         'the estimate then; 0 for all together, the default of replay --smooth',

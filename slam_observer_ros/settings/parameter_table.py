@@ -20,7 +20,19 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
 
 
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    'angular_bias_error': 'angular_bias_stddev',
+    'angular_scale_error': 'angular_scale_stddev',
+    'hindsight_interval': 'relinearization_interval',
+    'hindsight_turn': 'relinearization_angle',
+    'hindsight_window': 'smoothing_window',
+    'landmark_velocity_error': 'landmark_velocity_stddev',
+    'linear_bias_error': 'linear_bias_stddev',
+    'linear_scale_error': 'linear_scale_stddev',
+    'observation_error_time': 'observation_correlation_time',
+    'rejection_distance': 'rejection_threshold',
+    'velocity_delay_error': 'velocity_delay_stddev',
+}
 """Former names of parameters, and what these are called now: old files are refused with it."""
 
 

@@ -151,7 +151,7 @@ class Smoother:
     keyframes : Keyframes
         What happened since.
     settings : Settings
-        ``huber_threshold`` and ``rejection_distance``.
+        ``huber_threshold`` and ``rejection_threshold``.
 
     """
 
@@ -284,7 +284,7 @@ class Smoother:
 
     def _weights(self, error: FloatArray) -> FloatArray:
         """Return Huber's weights (M,), which fall off faster where a filter would reject."""
-        huber, rejection = self._settings.huber_threshold, self._settings.rejection_distance
+        huber, rejection = self._settings.huber_threshold, self._settings.rejection_threshold
         squared = (error[:, None, :] @ self._keyframes.information @ error[:, :, None])[:, 0, 0]
         weights: FloatArray = np.minimum(1.0, rejection**2 / np.maximum(squared, rejection**2))
         if huber > 0.0:

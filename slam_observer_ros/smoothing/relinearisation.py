@@ -66,7 +66,7 @@ class Relinearisation:
     observer, calibration, joint : Observer, Calibration, JointCovariance
         A filter's state and what it knows, at its start; relinearising changes them.
     settings : Settings
-        ``hindsight_*``, ``huber_threshold``, ``rejection_distance``, noise of observations.
+        ``hindsight_*``, ``huber_threshold``, ``rejection_threshold``, noise of observations.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Relinearisation:
     @property
     def is_active(self) -> bool:
         """Whether there is a history, of what the smoother takes for constant."""
-        return self._settings.hindsight_interval > 0 and not self._calibration.drifts
+        return self._settings.relinearization_interval > 0 and not self._calibration.drifts
 
     def reset(self, since: str) -> None:
         """Forget all but what is known now; ``since`` is why, in words."""
@@ -166,8 +166,10 @@ class Relinearisation:
             ) from error
 
     def _check_smoothable(self) -> None:
-        if self._settings.hindsight_interval == 0:
-            raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
+        if self._settings.relinearization_interval == 0:
+            raise ParameterError(
+                "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
+            )
         if self._calibration.drifts:
             raise ParameterError(
                 "smoothing takes the calibration to stay: 'calibration_drift' must be 0"
@@ -187,7 +189,7 @@ class Relinearisation:
     @property
     def _window_is_full(self) -> bool:
         """Whether the history has as many keyframes as it may have."""
-        return 0 < self._settings.hindsight_window <= len(self.history.stamps_ns)
+        return 0 < self._settings.smoothing_window <= len(self.history.stamps_ns)
 
     @property
     def _is_due(self) -> bool:
@@ -198,10 +200,12 @@ class Relinearisation:
         if self._is_owed:
             return True
         settings = self._settings
-        least = max(settings.hindsight_interval, min(SHARE_OF_HISTORY * self._seen, MAX_INTERVAL))
-        if 0.0 < settings.hindsight_turn < self._largest_turn:
+        least = max(
+            settings.relinearization_interval, min(SHARE_OF_HISTORY * self._seen, MAX_INTERVAL)
+        )
+        if 0.0 < settings.relinearization_angle < self._largest_turn:
             least *= EARLY_SHARE
-        turned_far = self._turn_squared > settings.hindsight_turn**2
+        turned_far = self._turn_squared > settings.relinearization_angle**2
         return turned_far and self._observations >= least
 
     def _sum_up(self, is_done: bool) -> None:
@@ -209,7 +213,7 @@ class Relinearisation:
         self._rest()
         known, angle_rad = self._known().least_nonlinear(self._axes)
         if self._window_is_full:
-            self._start(known, 'the history was cut (hindsight_window=0 keeps all of it)')
+            self._start(known, 'the history was cut (smoothing_window=0 keeps all of it)')
         elif is_done and angle_rad < MAX_TURN_RAD:
             self.history.summarise(known)
 

@@ -52,7 +52,7 @@ def carried_forward(
     C = back[:3, :3] @ SPATIAL.output_matrix(points)
     shared = len(points) * C @ Q @ transpose(C)
     rows = state.landmarks.rows_of(event.ids)
-    own = (lag_s * state.landmark_velocity_error) ** 2 * np.eye(3)
+    own = (lag_s * state.landmark_velocity_stddev) ** 2 * np.eye(3)
     return replace(moved, covariances=point_covariances(state, moved, rows) + shared + own)
 
 
@@ -64,7 +64,7 @@ def _landmark_velocities(state: State, event: ObservationEvent, A: FloatArray) -
     velocities = np.zeros_like(event.points)
     if state.is_fixed:
         return velocities
-    if not state.landmark_velocity_error:
+    if not state.landmark_velocity_stddev:
         return velocities if event.velocities is None else event.velocities
     rows = state.landmarks.rows_of(event.ids)
     velocities[rows >= 0] = state.observer.u[rows[rows >= 0]]

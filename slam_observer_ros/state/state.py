@@ -64,7 +64,7 @@ class State:
         self.observer, self.axes = self.filter.observer, self.filter.axes
         self.landmarks = LandmarkTable()
         self.relinearisation: Relinearisation | None = None
-        if filter_.joint is not None and not self.landmark_velocity_error:
+        if filter_.joint is not None and not self.landmark_velocity_stddev:
             self.relinearisation = Relinearisation(
                 self.observer, filter_.calibration, filter_.joint, settings
             )
@@ -82,10 +82,10 @@ class State:
         return not self.is_mapping and self.settings.localization_mode == 'fixed'
 
     @property
-    def landmark_velocity_error(self) -> float:
+    def landmark_velocity_stddev(self) -> float:
         """How fast landmarks may move, m/s, where it is estimated; else 0, as sensors give it."""
-        is_ignored = 'landmark_velocity_error' in self.filter.ignores
-        return 0.0 if self.is_fixed or is_ignored else self.settings.landmark_velocity_error
+        is_ignored = 'landmark_velocity_stddev' in self.filter.ignores
+        return 0.0 if self.is_fixed or is_ignored else self.settings.landmark_velocity_stddev
 
     @property
     def confirmed(self) -> IntArray:
@@ -207,12 +207,14 @@ class State:
         """Return the smoothed trajectory and map; see :meth:`.Relinearisation.smooth`."""
         if self.is_fixed:
             raise ParameterError("there is nothing to smooth with 'localization_mode: fixed'")
-        if self.landmark_velocity_error:
+        if self.landmark_velocity_stddev:
             raise ParameterError(
-                "smoothing takes landmarks to rest: 'landmark_velocity_error' must be 0"
+                "smoothing takes landmarks to rest: 'landmark_velocity_stddev' must be 0"
             )
         if self.relinearisation is None:
-            raise ParameterError("smoothing needs 'gains: riccati' and a 'hindsight_interval'")
+            raise ParameterError(
+                "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
+            )
         found, rows = self.relinearisation.smooth(), self.confirmed
         history, P = self.relinearisation.history, self.observer.reference_pose
         return Smoothed(

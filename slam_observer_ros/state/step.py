@@ -138,7 +138,7 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     """
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
-    far = state.filter.distances(residuals) > state.settings.rejection_distance
+    far = state.filter.distances(residuals) > state.settings.rejection_threshold
     moved = far & (state.landmarks.counts[rows] >= state.settings.confirmations)
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
@@ -152,7 +152,7 @@ def _note_velocities(state: State, event: ObservationEvent, rows: IntArray) -> N
     velocities = event.velocities
     if velocities is None and state.observer.have_moved:
         velocities = np.zeros((len(rows), 3))
-    if velocities is None or state.landmark_velocity_error or state.is_fixed:
+    if velocities is None or state.landmark_velocity_stddev or state.is_fixed:
         return
     used = state.landmarks.rejections[rows] == 0
     state.observer.set_landmark_velocities(rows[used], velocities[used])

@@ -202,7 +202,12 @@ class TestReport:
     def test_the_velocitys_calibration_is_reported_with_its_uncertainty(
         self, slam_observer, simulated
     ):
-        options = ('--set', 'velocity_delay_error=0.1', '--set', 'angular_bias_error=[0, 0, 0.1]')
+        options = (
+            '--set',
+            'velocity_delay_stddev=0.1',
+            '--set',
+            'angular_bias_stddev=[0, 0, 0.1]',
+        )
         ended = slam_observer.succeed('replay', simulated, *options, '--json')
         calibration = ended.json['calibration']
         assert set(calibration) == {'angular_bias_z', 'velocity_delay'}
@@ -219,7 +224,7 @@ class TestReport:
     ):
         output = io.TextIOWrapper(io.BytesIO(), encoding='ascii')
         monkeypatch.setattr(sys, 'stdout', output)
-        assert main(['replay', str(simulated), '--set', 'velocity_delay_error=0.1']) == 0
+        assert main(['replay', str(simulated), '--set', 'velocity_delay_stddev=0.1']) == 0
         assert b'velocity_delay' in output.buffer.getvalue()
 
     @pytest.mark.parametrize('columns', [24, 60])
@@ -508,11 +513,12 @@ class TestSmoothing:
 
     def test_history_that_is_cut_short_is_reported(self, slam_observer, simulated):
         ended = slam_observer(
-            'replay', simulated, '--smooth', '--gains', 'riccati', '--set', 'hindsight_turn=0',
-            '--set', 'hindsight_interval=10', '--set', 'hindsight_window=20',
+            'replay', simulated, '--smooth', '--gains', 'riccati',
+            '--set', 'relinearization_angle=0', '--set', 'relinearization_interval=10',
+            '--set', 'smoothing_window=20',
         )  # fmt: skip
         assert ended.code == 0
-        assert 'hindsight_window=0' in ended.errors
+        assert 'smoothing_window=0' in ended.errors
 
     def test_all_of_a_long_recording_is_smoothed(self, slam_observer, tmp_path):
         count, points = 3100, np.array([[2.0, 1.0, 0.0], [0.0, 3.0, 1.0], [-1.0, -2.0, 0.0]])

@@ -150,7 +150,7 @@ def test_covariances_of_a_smoothed_map_are_those_of_relinearising(slam_observer,
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
     smoothed, relinearised = tmp_path / 'smoothed.yaml', tmp_path / 'relinearised.yaml'
     slam_observer.succeed('replay', path, '--smooth', '--map', smoothed, *SETTINGS)
-    at_the_end = ('--set', 'hindsight_interval=80', '--set', 'hindsight_turn=0')
+    at_the_end = ('--set', 'relinearization_interval=80', '--set', 'relinearization_angle=0')
     slam_observer.succeed('replay', path, '--map', relinearised, *SETTINGS, *at_the_end)
     online, exact = read_map(smoothed), read_map(relinearised)
     np.testing.assert_array_equal(online.ids, exact.ids)
@@ -251,7 +251,7 @@ class TestPoseInMapNotKnown:
 
     def test_a_scale_that_nobody_can_mean_is_reported(self, slam_observer, tmp_path, saved):
         twice = record(tmp_path / 'run.mcap', np.eye(4), seed=2, speed_factor=2.0)
-        stated = '--set', 'linear_scale_error=[0.05,0.0,0.0]'
+        stated = '--set', 'linear_scale_stddev=[0.05,0.0,0.0]'
         ended = slam_observer('replay', twice, *SETTINGS, *stated)
         assert re.search(r'linear_scale_x is [\d.]+, \d+ times its stated error', ended.errors)
 
@@ -285,7 +285,7 @@ def test_smoothing_says_what_cut_the_history_short(slam_observer, tmp_path):
     assert 'those since the clock jumped' in jumped.errors
     loaded = slam_observer('replay', path, '--load-map', saved, '--smooth', *SETTINGS)
     assert 'those since the place in the loaded map was found' in loaded.errors
-    assert 'hindsight_window' not in jumped.errors + loaded.errors
+    assert 'smoothing_window' not in jumped.errors + loaded.errors
 
 
 @pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
@@ -313,14 +313,14 @@ def test_smoothing_says_that_landmarks_had_to_make_room(slam_observer, tmp_path)
     limited = ('--smooth', '--set', 'max_landmarks=30', *SETTINGS)
     errors = slam_observer('replay', path, *limited).errors
     assert 'those since landmarks had to make room (max_landmarks)' in errors
-    window = ('--set', 'hindsight_window=10', '--set', 'hindsight_interval=1')
+    window = ('--set', 'smoothing_window=10', '--set', 'relinearization_interval=1')
     errors = slam_observer('replay', path, *limited, *window).errors
-    assert 'those since the history was cut (hindsight_window=0 keeps all of it)' in errors
+    assert 'those since the history was cut (smoothing_window=0 keeps all of it)' in errors
 
 
 def test_nothing_to_smooth_is_an_error_and_writes_nothing(slam_observer, tmp_path):
     path = record(tmp_path / 'run.mcap', np.eye(4), seed=1)
-    window = ('--set', 'hindsight_window=1', '--set', 'hindsight_interval=1')
+    window = ('--set', 'smoothing_window=1', '--set', 'relinearization_interval=1')
     outputs = ('--smooth', '--tum', tmp_path / 'smoothed.tum')
     errors = slam_observer.fail('replay', path, *outputs, *window, *SETTINGS)
     assert 'nothing to smooth: no observation since the history was cut' in errors

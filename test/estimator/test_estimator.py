@@ -286,7 +286,7 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
         observation_model='stereo',
         angular_velocity_noise=still,
         linear_velocity_noise=still,
-        landmark_velocity_error=0.5 * is_estimated,
+        landmark_velocity_stddev=0.5 * is_estimated,
     )
     hypotheses = Hypotheses(State(make_filter(settings, np.eye(4)), settings))
     timeline = Timeline(hypotheses, settings)
@@ -304,7 +304,7 @@ def test_a_landmark_that_has_moved_on_is_as_uncertain_as_it_was_when_seen(turn_r
     R = so3.exp(np.array([0.0, 0.0, turn_rad]))
     np.testing.assert_allclose(carried.points, (seen + 0.9 * speed) @ R, atol=1e-9)
     expected = R.T @ ObservationNoise(settings).at(seen) @ R
-    expected = expected + (0.9 * settings.landmark_velocity_error) ** 2 * np.eye(3)
+    expected = expected + (0.9 * settings.landmark_velocity_stddev) ** 2 * np.eye(3)
     np.testing.assert_allclose(carried.covariances, expected, rtol=1e-6)
 
 
@@ -636,8 +636,8 @@ def test_points_with_ids_that_are_kept_for_others_are_left_out_counted_and_named
 
 def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
     asked = {
-        'landmark_velocity_error': 0.1,
-        'linear_bias_error': (0.2, 0.0, 0.0),
+        'landmark_velocity_stddev': 0.1,
+        'linear_bias_stddev': (0.2, 0.0, 0.0),
         'calibration_drift': 0.1,
         'gain_k': 2.0,
     }
@@ -649,9 +649,9 @@ def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
     Estimator(Settings(gains='scheduled', **asked)).reset()
     Estimator(Settings(gains='constant', **asked))
     assert caplog.messages == [
-        'No effect on scheduled gains: landmark_velocity_error.',
-        'No effect on constant gains: linear_bias_error, calibration_drift, '
-        'landmark_velocity_error.',
+        'No effect on scheduled gains: landmark_velocity_stddev.',
+        'No effect on constant gains: linear_bias_stddev, calibration_drift, '
+        'landmark_velocity_stddev.',
     ]
 
 
@@ -797,7 +797,9 @@ def test_landmarks_with_known_velocities_are_followed_through_the_lift_19(gains)
     speed = np.array(
         [[0.2, 0.0, 0.0], [0.0, -0.3, 0.1], [0.0, 0.0, 0.0], [0.1, 0.1, 0.0], [0, 0, 0.2]]
     )
-    estimator = Estimator(Settings(gains=gains, hindsight_interval=20, hindsight_turn=0.0))
+    estimator = Estimator(
+        Settings(gains=gains, relinearization_interval=20, relinearization_angle=0.0)
+    )
     for step in range(200):
         time_s = 0.05 * step
         estimator.add(velocity(time_s))
@@ -918,8 +920,8 @@ def with_velocities(event, noise):
 def test_where_landmarks_move_what_was_seen_is_not_looked_back_at():
     noise = np.random.default_rng(1)
     events = [with_velocities(event, noise) for event in drive()]
-    often = run(events, gains='riccati', hindsight_interval=5, hindsight_turn=0.0)
-    assert_same_state(often, run(events, gains='riccati', hindsight_interval=0))
+    often = run(events, gains='riccati', relinearization_interval=5, relinearization_angle=0.0)
+    assert_same_state(often, run(events, gains='riccati', relinearization_interval=0))
     with pytest.raises(ParameterError, match='came with velocities'):
         often.smooth()
 
@@ -942,7 +944,7 @@ def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():
     speed = np.array([[0.2, 0.0, 0], [0, -0.3, 0.1], [0, 0, 0], [0.1, 0.1, 0], [0, 0, 0.2]])
     noise = np.random.default_rng(4)
     estimator = Estimator(
-        Settings(landmark_velocity_error=0.5, point_noise=0.01, observation_model='cartesian')
+        Settings(landmark_velocity_stddev=0.5, point_noise=0.01, observation_model='cartesian')
     )
     for step in range(600):
         time_s = 0.05 * step
@@ -957,7 +959,7 @@ def test_unknown_constant_landmark_velocities_are_estimated_when_asked_for():
 
 def moving_landmark(speeds=None):
     """An estimator of a landmark's velocity that saw one for a second and then drives on."""
-    settings = Settings(landmark_velocity_error=0.5, reorder_window=0.0, velocity_timeout=10.0)
+    settings = Settings(landmark_velocity_stddev=0.5, reorder_window=0.0, velocity_timeout=10.0)
     estimator = Estimator(settings)
     for step in range(40):
         stamp_ns = START_NS + step * 10**8
@@ -982,7 +984,7 @@ def test_where_velocities_of_landmarks_are_estimated_those_of_messages_are_not_u
 
 @pytest.mark.parametrize('gains', ['constant', 'scheduled'])
 def test_gains_that_estimate_no_velocities_of_landmarks_take_them_as_messages_say(gains):
-    settings = Settings(gains=gains, landmark_velocity_error=0.5, confirmations=1)
+    settings = Settings(gains=gains, landmark_velocity_stddev=0.5, confirmations=1)
     estimator, speeds = Estimator(settings), np.full((5, 3), 0.1)
     for time_s, reported, expected in [(0.0, speeds, speeds), (0.1, None, 0.0 * speeds)]:
         estimator.add(velocity(time_s, np.zeros(6)))
@@ -1185,10 +1187,10 @@ def test_settings_made_in_python_are_checked_like_those_of_a_file(wrong, expecte
 
 def test_only_settings_that_may_change_while_running_do():
     estimator = Estimator(Settings())
-    estimator.change_settings(Settings(gain_k=1.0, rejection_distance=4.0))
+    estimator.change_settings(Settings(gain_k=1.0, rejection_threshold=4.0))
     with pytest.raises(ParameterError, match='gains, confirmations can only be set'):
         estimator.change_settings(Settings(gains='constant', confirmations=9, gain_k=7.0))
-    assert estimator.settings == Settings(gain_k=1.0, rejection_distance=4.0)
+    assert estimator.settings == Settings(gain_k=1.0, rejection_threshold=4.0)
 
 
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
@@ -1202,7 +1204,7 @@ def test_settings_that_change_while_running_count_from_then_on(gains):
         estimator.add(ObservationEvent(START_NS + step * 10**8, np.arange(5), seen))
         return estimator.counts['rejected_landmark'] - before
 
-    for changed, expected in ((settings, 1), (replace(settings, rejection_distance=1e6), 0)):
+    for changed, expected in ((settings, 1), (replace(settings, rejection_threshold=1e6), 0)):
         estimator = Estimator(settings)
         for step in range(10):
             assert rejected(estimator, step) == 0

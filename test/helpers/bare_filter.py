@@ -10,7 +10,7 @@ from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
 
-PLAIN = Settings(huber_threshold=0.0, rejection_distance=1e9, hindsight_interval=0)
+PLAIN = Settings(huber_threshold=0.0, rejection_threshold=1e9, relinearization_interval=0)
 """No robustness, no looking back: a plain filter."""
 
 

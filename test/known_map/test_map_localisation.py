@@ -163,8 +163,8 @@ def test_tracking_in_an_uncertain_map_stays_honest(mode):
             angular_velocity_noise=(0.02 * 0.1**0.5,) * 3,
             linear_velocity_noise=(0.02 * 0.1**0.5,) * 3,
             huber_threshold=0.0,
-            hindsight_interval=20,
-            hindsight_turn=0.0,
+            relinearization_interval=20,
+            relinearization_angle=0.0,
         )
         estimator = Estimator(settings)
         estimator.load_map(world.map())
@@ -178,7 +178,7 @@ def test_the_velocitys_scale_is_estimated_in_a_map_that_is_known(mode):
     """As without one; in a fixed map, too."""
     world = World(3, is_planar=True)
     settings = world.settings(
-        localization_mode=mode, linear_scale_error=(0.2, 0.0, 0.0), hindsight_interval=0
+        localization_mode=mode, linear_scale_stddev=(0.2, 0.0, 0.0), relinearization_interval=0
     )
     estimator = Estimator(settings)
     estimator.load_map(world.map(sigma_m=0.001), world.pose(0.0))
@@ -497,7 +497,7 @@ def test_a_robot_set_down_elsewhere_finds_back_once_its_pose_is_set():
 @pytest.mark.parametrize('gains', GAINS)
 def test_a_map_loaded_while_running_is_merged_with_what_was_mapped(gains):
     world = World(10)
-    settings = world.settings(gains=gains, hindsight_interval=10, hindsight_turn=0.0)
+    settings = world.settings(gains=gains, relinearization_interval=10, relinearization_angle=0.0)
     estimator = add(Estimator(settings), world.drive(0.0, 5.0))
     mapped = set(estimator.landmark_ids)
     known = world.map(range(0, 50, 2))
@@ -958,7 +958,7 @@ def test_landmarks_of_an_exact_map_stay_where_it_has_them(gains, velocity_error)
     place, random = se3.exp(np.array([0.0, 0.0, 1.0, 3.0, 2.0, 1.0])), np.random.default_rng(0)
     known = LandmarkMap(np.arange(5), se3.transform(place, points), None, np.full(5, 10))
     settings = Settings(gains=gains, localization_mode='fixed', reorder_window=0.0)
-    estimator = Estimator(replace(settings, landmark_velocity_error=velocity_error))
+    estimator = Estimator(replace(settings, landmark_velocity_stddev=velocity_error))
     estimator.load_map(known)
     for step in range(100):
         stamp_ns = 10**9 + step * 10**8
@@ -1019,7 +1019,7 @@ def test_a_saved_map_leaves_out_what_moves_and_keeps_what_rests(gains):
 def test_a_saved_map_leaves_out_what_is_estimated_to_move():
     points, speed = 5.0 * np.eye(4, 3) + [[1.0, 1.0, 0.0]], np.zeros((4, 3))
     speed[2, 0] = 0.5
-    estimator = Estimator(Settings(landmark_velocity_error=0.5, reorder_window=0.0))
+    estimator = Estimator(Settings(landmark_velocity_stddev=0.5, reorder_window=0.0))
     for step in range(100):
         stamp_ns = 10**9 + step * 10**8
         estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))

@@ -226,7 +226,7 @@ def test_forgotten_landmarks_stay_neither_in_the_latched_map_nor_drawn(ros, tmp_
         assert not ids(maps), 'published before the pose in the loaded map is known'
 
 
-DELAYED = ('-p', 'velocity_delay_error:=0.1')
+DELAYED = ('-p', 'velocity_delay_stddev:=0.1')
 
 
 def test_diagnostics_report_rates_ages_drops_and_times(ros, tmp_path):

@@ -24,23 +24,23 @@ from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 EVERYTHING = Settings(
-    angular_scale_error=(0.1, 0.1, 0.1),
-    linear_scale_error=(0.1, 0.1, 0.1),
-    angular_bias_error=(0.01, 0.01, 0.01),
-    linear_bias_error=(0.1, 0.1, 0.1),
-    velocity_delay_error=0.1,
+    angular_scale_stddev=(0.1, 0.1, 0.1),
+    linear_scale_stddev=(0.1, 0.1, 0.1),
+    angular_bias_stddev=(0.01, 0.01, 0.01),
+    linear_bias_stddev=(0.1, 0.1, 0.1),
+    velocity_delay_stddev=0.1,
 )
 
 WHEELS = Settings(
     two_d_mode=True,
-    angular_scale_error=(0.0, 0.0, 0.1),
-    linear_scale_error=(0.1, 0.0, 0.0),
+    angular_scale_stddev=(0.0, 0.0, 0.1),
+    linear_scale_stddev=(0.1, 0.0, 0.0),
 )
 WHEEL_SCALE = np.array([1.0, 1.0, 0.95, 1.05, 1.0, 1.0])
 
 DELAY_NS = 150_000_000
 
-GYROSCOPE = Settings(angular_bias_error=(0.05, 0.05, 0.05), angular_velocity_noise=(0.01,) * 3)
+GYROSCOPE = Settings(angular_bias_stddev=(0.05, 0.05, 0.05), angular_velocity_noise=(0.01,) * 3)
 GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
 
 
@@ -60,9 +60,9 @@ def with_gains(settings, gains):
     return Settings(**{**vars(settings), 'gains': gains})
 
 
-@pytest.mark.parametrize('hindsight_interval', [0, 20])
-def test_a_wheels_scale_is_found_as_well_as_its_covariance_says(hindsight_interval):
-    settings = Settings(**{**vars(WHEELS), 'hindsight_interval': hindsight_interval})
+@pytest.mark.parametrize('relinearization_interval', [0, 20])
+def test_a_wheels_scale_is_found_as_well_as_its_covariance_says(relinearization_interval):
+    settings = Settings(**{**vars(WHEELS), 'relinearization_interval': relinearization_interval})
     normalised_squared = []
     for seed in range(3):
         world = drive(settings, 60.0, seed, scale=WHEEL_SCALE)
@@ -105,15 +105,17 @@ def test_a_robot_whose_wheels_stand_does_not_turn_by_a_bias(gains):
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
-@pytest.mark.parametrize('hindsight_interval', [0, 20])
+@pytest.mark.parametrize('relinearization_interval', [0, 20])
 @pytest.mark.parametrize('delay_ns', [0, DELAY_NS])
-def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_interval, delay_ns):
+def test_a_delay_is_found_as_well_as_its_covariance_says(
+    two_d_mode, relinearization_interval, delay_ns
+):
     """Where the velocity changes by far more than its noise."""
     settings = Settings(
         two_d_mode=two_d_mode,
         angular_velocity_noise=(0.005, 0.005, 0.005),
-        velocity_delay_error=0.2,
-        hindsight_interval=hindsight_interval,
+        velocity_delay_stddev=0.2,
+        relinearization_interval=relinearization_interval,
     )
     normalised_squared = []
     for seed in range(3):
@@ -128,7 +130,7 @@ def test_a_delay_is_found_as_well_as_its_covariance_says(two_d_mode, hindsight_i
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
 def test_a_delay_that_is_made_up_for_does_no_harm(gains):
     settings = Settings(gains=gains, two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.01))
-    estimating = Settings(**{**vars(settings), 'velocity_delay_error': 0.3})
+    estimating = Settings(**{**vars(settings), 'velocity_delay_stddev': 0.3})
 
     def mean_error_m(settings, delay_ns):
         worlds = [drive(settings, 30.0, seed, seen=2, delay_ns=delay_ns) for seed in range(4)]
@@ -142,9 +144,9 @@ def test_a_delay_that_is_made_up_for_does_no_harm(gains):
 def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
     """As an odometry's that is averaged over the time before its stamp."""
     settings = Settings(
-        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_error=0.2
+        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_stddev=0.2
     )
-    left_alone = Settings(**{**vars(settings), 'velocity_delay_error': 0.0})
+    left_alone = Settings(**{**vars(settings), 'velocity_delay_stddev': 0.0})
     errors_m, errors_left_m = [], []
     for seed in range(4):
         world = drive(settings, 60.0, seed, delay_ns=-DELAY_NS)
@@ -158,7 +160,7 @@ def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
 
 def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
     settings = Settings(
-        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_error=0.2
+        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_stddev=0.2
     )
     for seed in range(4):
         estimator = estimate(drive(settings, 60.0, seed, delay_ns=-200_000_000), settings)
@@ -167,7 +169,7 @@ def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
 
 
 def test_a_delay_stays_within_what_is_made_up_for():
-    calibration = Calibration(Settings(velocity_delay_error=0.1), PLANAR)
+    calibration = Calibration(Settings(velocity_delay_stddev=0.1), PLANAR)
     for change_s, limit_s in ((-5.0, MIN_DELAY_S), (10.0, MAX_DELAY_S)):
         calibration.shift(np.array([change_s]))
         assert calibration.delay_ns == round(limit_s * 1e9)
@@ -175,7 +177,7 @@ def test_a_delay_stays_within_what_is_made_up_for():
 
 def test_the_velocity_that_is_told_is_the_one_that_moves_the_pose():
     step_ns = 10_000_000
-    for settings in (WHEELS, replace(EVERYTHING, velocity_delay_error=0.0)):
+    for settings in (WHEELS, replace(EVERYTHING, velocity_delay_stddev=0.0)):
         estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
         after = estimator.pose_at(estimator.stamp_ns + step_ns)
         moved = estimator.pose @ se3.exp(estimator.body_velocity * step_ns * 1e-9)
@@ -184,7 +186,7 @@ def test_the_velocity_that_is_told_is_the_one_that_moves_the_pose():
 
 def test_at_constant_velocity_nobody_can_tell_the_delay():
     """Not even at the start, where no velocity is known yet."""
-    settings = Settings(two_d_mode=True, velocity_delay_error=0.2)
+    settings = Settings(two_d_mode=True, velocity_delay_stddev=0.2)
     world = drive(settings, 5.0)
     velocity = world.events[0].body_velocity
     estimator = Estimator(settings)
@@ -200,7 +202,7 @@ def test_a_robot_at_rest_again_is_where_its_velocities_say_whatever_their_delay(
     settings = Settings(
         angular_velocity_noise=(0.0, 0.0, 0.0),
         linear_velocity_noise=(0.0, 0.0, 0.0),
-        velocity_delay_error=0.2,
+        velocity_delay_stddev=0.2,
         reorder_window=0.0,
     )
     rng = np.random.default_rng(0)
@@ -288,8 +290,8 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
 
 def test_drift_lets_the_uncertainty_grow_with_time():
     settings = Settings(
-        angular_bias_error=(0.0, 0.0, 0.02),
-        linear_scale_error=(0.1, 0.0, 0.0),
+        angular_bias_stddev=(0.0, 0.0, 0.02),
+        linear_scale_stddev=(0.1, 0.0, 0.0),
         calibration_drift=0.5,
     )
     calibration = Calibration(settings, SPATIAL)
@@ -318,10 +320,10 @@ def test_a_bias_that_drifts_is_followed():
 def test_looking_back_does_not_undo_that_a_scale_has_changed():
     settings = Settings(
         two_d_mode=True,
-        linear_scale_error=(0.1, 0.0, 0.0),
+        linear_scale_stddev=(0.1, 0.0, 0.0),
         calibration_drift=0.2,
-        hindsight_interval=10,
-        hindsight_turn=0.0,
+        relinearization_interval=10,
+        relinearization_angle=0.0,
     )
     scale = np.where(np.arange(1200) < 600, 1.0, 1.15)[:, None]
     world = drive(settings, 60.0, scale=scale)
@@ -365,6 +367,6 @@ def test_a_calibration_that_nobody_can_mean_is_told():
 
 
 def test_a_bias_that_may_drift_is_plausible_wherever_it_is():
-    drifts = replace(GYROSCOPE, angular_bias_error=(0.002,) * 3, calibration_drift=1.0)
+    drifts = replace(GYROSCOPE, angular_bias_stddev=(0.002,) * 3, calibration_drift=1.0)
     estimator = estimate(drive(drifts, 60.0, bias=5.0 * GYROSCOPE_BIAS), drifts)
     assert not any(part.problem for part in estimator.calibration)

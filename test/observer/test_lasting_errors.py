@@ -24,8 +24,8 @@ SETTINGS = Settings(
     reorder_window=0.0,
     observation_model='cartesian',
     point_noise=0.05,
-    observation_error_time=ERROR_TIME_S,
-    hindsight_turn=0.0,
+    observation_correlation_time=ERROR_TIME_S,
+    relinearization_angle=0.0,
 )
 
 
@@ -77,7 +77,7 @@ def test_a_robot_that_stands_knows_how_well_it_sees(gains):
         linear_velocity_noise=(1e-4,) * 3,
         huber_threshold=0.0,
     )
-    told, untold = still, replace(still, observation_error_time=0.0)
+    told, untold = still, replace(still, observation_correlation_time=0.0)
     band = chi2.ppf([0.005, 0.995], 12 * 20) / 20
     nees = [
         np.mean([configuration_nees(standing(settings, seed)) for seed in range(20)])
@@ -91,7 +91,9 @@ def test_hindsight_counts_an_observation_as_the_filter_did():
     estimator = standing(SETTINGS, seed=0, duration_s=5.0)
     smoothed = estimator.smooth()
     np.testing.assert_allclose(smoothed.world_points, estimator.world_points, atol=2e-3)
-    again = standing(replace(SETTINGS, hindsight_turn=1e-9, hindsight_interval=5), 0, 5.0)
+    again = standing(
+        replace(SETTINGS, relinearization_angle=1e-9, relinearization_interval=5), 0, 5.0
+    )
     variances = np.diag(covariance_of(again))
     np.testing.assert_allclose(variances, np.diag(covariance_of(estimator)), rtol=0.1)
 

@@ -99,7 +99,7 @@ def test_a_velocity_known_in_the_world_stays_known_while_the_robot_turns_unsurel
 
     def predicted(point, velocity):
         """The covariance of the residual after two blind motions of a second each."""
-        settings = replace(PLAIN, two_d_mode=two_d_mode, landmark_velocity_error=1e-9)
+        settings = replace(PLAIN, two_d_mode=two_d_mode, landmark_velocity_stddev=1e-9)
         slam = Filter(FullMapGains(settings))
         slam.add(point, np.zeros((1, 3, 3)))
         slam.observer.set_landmark_velocities(np.array([0]), velocity)
@@ -257,7 +257,9 @@ def tilted(event):
 
 @pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
 def test_planar_mode_is_planar_to_the_bit(gains):
-    settings = Settings(gains=gains, two_d_mode=True, hindsight_interval=10, hindsight_turn=0.0)
+    settings = Settings(
+        gains=gains, two_d_mode=True, relinearization_interval=10, relinearization_angle=0.0
+    )
     world = drive(settings, 15.0)
     poses_seen = []
     estimator = estimate(
@@ -278,7 +280,7 @@ def test_planar_mode_is_planar_to_the_bit(gains):
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_the_estimate_of_a_moved_world_is_the_moved_estimate(gains, two_d_mode):
     settings = Settings(
-        gains=gains, two_d_mode=two_d_mode, hindsight_interval=10, hindsight_turn=0.0
+        gains=gains, two_d_mode=two_d_mode, relinearization_interval=10, relinearization_angle=0.0
     )
     world = drive(settings, 10.0)
     twist = np.array([0.0, 0.0, 2.0, 30.0, -40.0, 0.0])
@@ -299,7 +301,7 @@ def test_the_estimate_of_a_moved_world_is_the_moved_estimate(gains, two_d_mode):
 
 @given(poses(), generators())
 def test_pose_covariance_is_that_of_rotation_and_position_in_the_world(initial_pose, rng):
-    settings = Settings(hindsight_interval=0)
+    settings = Settings(relinearization_interval=0)
     world = drive(settings, 2.0, seed=int(rng.integers(1000)))
     estimator = estimate(world, settings, initial_pose=initial_pose)
     pose, slam = estimator.pose, estimator._slam
@@ -316,7 +318,7 @@ def test_pose_covariance_is_that_of_rotation_and_position_in_the_world(initial_p
 
 
 def test_the_order_of_landmarks_in_a_message_does_not_matter():
-    settings = Settings(hindsight_interval=10, hindsight_turn=0.0)
+    settings = Settings(relinearization_interval=10, relinearization_angle=0.0)
     world = drive(settings, 10.0)
 
     def reversed_order(index, event):
@@ -359,7 +361,7 @@ class Looks:
 
 def test_what_was_looked_back_at_once_is_not_looked_back_at_again(monkeypatch):
     looks = Looks(monkeypatch)
-    settings = Settings(hindsight_interval=2, hindsight_turn=0.0)
+    settings = Settings(relinearization_interval=2, relinearization_angle=0.0)
     world = drive(settings, 30.0)
     estimate(world, settings)
     assert len(looks.frames) > 10
@@ -372,7 +374,7 @@ def test_a_landmark_that_is_often_in_doubt_does_not_keep_the_rest_from_being_sum
     monkeypatch, turn_rad
 ):
     looks = Looks(monkeypatch)
-    settings = Settings(hindsight_interval=20, hindsight_turn=turn_rad)
+    settings = Settings(relinearization_interval=20, relinearization_angle=turn_rad)
 
     def swing(index, event):
         """Landmark 0, a door, is elsewhere every other ten frames."""
@@ -388,6 +390,6 @@ def test_a_landmark_that_is_often_in_doubt_does_not_keep_the_rest_from_being_sum
 
 def test_what_looking_back_failed_for_is_looked_back_at_later(monkeypatch):
     looks = Looks(monkeypatch, failures=2)
-    settings = Settings(hindsight_interval=20, hindsight_turn=0.0)
+    settings = Settings(relinearization_interval=20, relinearization_angle=0.0)
     estimate(drive(settings, 30.0), settings)
     assert looks.frames[:4] == [20, 40, 60, 20]

@@ -53,7 +53,7 @@ def test_huber_weights_are_one_within_the_threshold_and_fall_off_beyond(rng, thr
 @given(generators())
 def test_threshold_zero_is_plain_least_squares(rng):
     r, predicted, noise = random_problem(rng)
-    settings = Settings(huber_threshold=0.0, rejection_distance=1e9)
+    settings = Settings(huber_threshold=0.0, rejection_threshold=1e9)
     weights = observation_weights(100.0 * r, predicted, noise, settings)
     np.testing.assert_array_equal(weights, 1.0)
 
@@ -63,7 +63,7 @@ def test_reweighted_least_squares_settles_on_hubers_estimate(rng):
     """Weights are those of what is left of the residuals once the correction is made."""
     r, predicted, noise = random_problem(rng)
     r[0] *= 5.0
-    settings = Settings(huber_threshold=1.345, rejection_distance=1e9)
+    settings = Settings(huber_threshold=1.345, rejection_threshold=1e9)
     weights = observation_weights(r, 1e-3 * predicted, noise, settings)
     R = block_diagonal(noise / weights[:, None, None])
     S_inv_r = np.linalg.solve(1e-3 * predicted + R, r.ravel()).reshape(r.shape)
@@ -85,7 +85,7 @@ def test_each_observation_is_gated_by_its_own_distance(rng, scale, k):
     r, predicted, noise = random_problem(rng, k=k)
     own = np.einsum('ijik->ijk', predicted.reshape(len(r), k, len(r), k)) + noise
     distances = np.sqrt(scale**2 * np.einsum('ij,ijk,ik->i', r, np.linalg.inv(own), r))
-    weights = observation_weights(scale * r, predicted, noise, Settings(rejection_distance=6.0))
+    weights = observation_weights(scale * r, predicted, noise, Settings(rejection_threshold=6.0))
     np.testing.assert_array_equal(weights == 0.0, distances > 6.0)
 
 
@@ -105,7 +105,7 @@ def test_far_from_the_others_is_judged_by_what_these_foretell(rng, spread, scale
         )
         left = (r[i] - foretold)[None]
         expected[i] = mahalanobis(left, noise[[i]])[0] > 3.0 * 6.0
-    found = far_from_the_others(r, predicted, noise, Settings(rejection_distance=6.0))
+    found = far_from_the_others(r, predicted, noise, Settings(rejection_threshold=6.0))
     np.testing.assert_array_equal(found, expected)
 
 
@@ -339,7 +339,7 @@ def test_a_landmark_seen_twice_outlives_an_outlier(gains):
 @modes
 def test_a_landmark_that_moved_is_recognised_and_started_anew(gains, two_d_mode, caplog):
     settings = Settings(
-        gains=gains, two_d_mode=two_d_mode, hindsight_interval=10, hindsight_turn=0.0
+        gains=gains, two_d_mode=two_d_mode, relinearization_interval=10, relinearization_angle=0.0
     )
     world = drive(settings, 20.0, landmarks=5, seen=5)
 
@@ -417,7 +417,7 @@ def test_all_landmarks_moved_together_are_followed_again(gains):
 
 def test_a_landmark_that_is_started_anew_may_move_otherwise_than_before():
     settings = Settings(
-        landmark_velocity_error=0.1,
+        landmark_velocity_stddev=0.1,
         confirmations=1,
         observation_model='cartesian',
         point_noise=0.01,

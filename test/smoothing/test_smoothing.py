@@ -39,7 +39,7 @@ from slam_observer_ros.smoothing.history import History
 from slam_observer_ros.smoothing.prior import Prior
 from slam_observer_ros.smoothing.relinearisation import Hindsight
 
-LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_distance=1e9)
+LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_threshold=1e9)
 FRAMES, LANDMARKS = 5, 4
 
 
@@ -228,7 +228,7 @@ def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_togethe
 def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
     """A stretch without observations reaches the history in pieces."""
     rng, d, k = np.random.default_rng(0), axes.p, 6
-    settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
+    settings = Settings(linear_scale_stddev=(0.1, 0.1, 0.1), angular_bias_stddev=(0.0, 0.0, 0.1))
     V, dt_s = np.zeros((k, 6)), np.full(k, 0.2)
     V[:, axes.pose] = rng.normal(size=(k, d))
     path = [np.eye(4)]
@@ -265,7 +265,7 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
 @given(rng=generators())
 def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     d = axes.p
-    settings = Settings(linear_scale_error=(0.1, 0.1, 0.1), angular_bias_error=(0.0, 0.0, 0.1))
+    settings = Settings(linear_scale_stddev=(0.1, 0.1, 0.1), angular_bias_stddev=(0.0, 0.0, 0.1))
     calibration = Calibration(settings, axes)
     c = calibration.count
     start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(d + c))
@@ -386,11 +386,11 @@ def test_hindsight_beats_the_online_estimate(two_d_mode):
 def test_looking_back_a_piece_at_a_time_comes_to_what_all_of_it_tells(two_d_mode, calibrated):
     settings = Settings(
         two_d_mode=two_d_mode,
-        hindsight_interval=5,
-        hindsight_turn=0.0,
+        relinearization_interval=5,
+        relinearization_angle=0.0,
         huber_threshold=0.0,
-        linear_scale_error=(0.3 * calibrated,) * 3,
-        angular_bias_error=(0.1 * calibrated,) * 3,
+        linear_scale_stddev=(0.3 * calibrated,) * 3,
+        angular_bias_stddev=(0.1 * calibrated,) * 3,
     )
     for seed in range(3):
         world = drive(settings, 30.0, seed, scale=1.0 + 0.2 * calibrated)
@@ -410,13 +410,13 @@ def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode, max_landma
         range_noise=1e-3,
         bearing_noise=3e-4,
         huber_threshold=0.0,
-        hindsight_interval=0,
+        relinearization_interval=0,
         max_landmarks=max_landmarks,
     )
     world = drive(exact, 20.0)
     plain = estimate(world, exact)
     assert (plain.counts['forgotten_landmark'] > 0) == (max_landmarks > 0)
-    often = estimate(world, replace(exact, hindsight_interval=4, hindsight_turn=0.0))
+    often = estimate(world, replace(exact, relinearization_interval=4, relinearization_angle=0.0))
     sigma_m = np.sqrt(plain.pose_covariance.diagonal()[3:].max())
     np.testing.assert_allclose(often.pose, plain.pose, atol=0.05 * sigma_m)
     np.testing.assert_allclose(often.world_points, plain.world_points, atol=0.1 * sigma_m)
@@ -438,7 +438,7 @@ def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode, max_landma
     ],
 )
 def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
-    settings = Settings(hindsight_interval=20, hindsight_turn=0.2)
+    settings = Settings(relinearization_interval=20, relinearization_angle=0.2)
     calibration = Calibration(settings, SPATIAL)
     joint = JointCovariance(SPATIAL, calibration, 0.0)
     hindsight, observer = Hindsight(SPATIAL, settings, calibration, joint), Observer(np.eye(4))
@@ -455,7 +455,7 @@ def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad
 
 def test_what_observations_leave_open_is_told_once_with_what_to_do(caplog, monkeypatch):
     monkeypatch.setattr(Smoother, 'smooth', Mock(side_effect=np.linalg.LinAlgError))
-    settings = Settings(hindsight_turn=0.0)
+    settings = Settings(relinearization_angle=0.0)
     estimate(drive(settings, 10.0), settings)
     (warning,) = [text for text in caplog.messages if 'look back' in text]
     assert warning.startswith('Could not look back')
@@ -465,7 +465,7 @@ def test_what_observations_leave_open_is_told_once_with_what_to_do(caplog, monke
 def test_odometry_that_knows_nothing_of_height_roll_and_pitch_can_be_looked_back_at(caplog):
     world = drive(Settings(two_d_mode=True), 10.0, seen=1)
     covariance = np.diag([1e12, 1e12, 1e-3, 1e-3, 1e-3, 1e12])
-    estimator = Estimator(Settings(hindsight_turn=0.01))
+    estimator = Estimator(Settings(relinearization_angle=0.01))
     for event in world.events:
         is_velocity = isinstance(event, VelocityEvent)
         estimator.add(replace(event, covariance=covariance) if is_velocity else event)
@@ -474,7 +474,7 @@ def test_odometry_that_knows_nothing_of_height_roll_and_pitch_can_be_looked_back
 
 
 def test_observations_of_nothing_take_no_room_in_the_window_and_tell_nothing():
-    settings = Settings(hindsight_interval=10, hindsight_turn=0.0, hindsight_window=0)
+    settings = Settings(relinearization_interval=10, relinearization_angle=0.0, smoothing_window=0)
     world = drive(settings, 15.0)
     nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
     stamps_ns = range(START_NS + STEP_NS // 2, START_NS + 300 * STEP_NS, STEP_NS)
@@ -491,11 +491,14 @@ def test_observations_of_nothing_take_no_room_in_the_window_and_tell_nothing():
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_a_short_window_stays_close_to_an_unlimited_one(two_d_mode):
     settings = Settings(
-        two_d_mode=two_d_mode, hindsight_interval=10, hindsight_turn=0.0, hindsight_window=0
+        two_d_mode=two_d_mode,
+        relinearization_interval=10,
+        relinearization_angle=0.0,
+        smoothing_window=0,
     )
     world = drive(settings, 30.0)
     unlimited = estimate(world, settings)
-    short = estimate(world, replace(settings, hindsight_window=20))
+    short = estimate(world, replace(settings, smoothing_window=20))
     assert len(unlimited.smooth().stamps_ns) == len(world.observations())
     assert len(short.smooth().stamps_ns) < 20
     sigma_m = np.sqrt(unlimited.pose_covariance.diagonal()[3:])
@@ -505,7 +508,7 @@ def test_a_short_window_stays_close_to_an_unlimited_one(two_d_mode):
 
 
 def test_the_window_bounds_the_history_even_if_nothing_ever_turns():
-    settings = Settings(hindsight_window=20, hindsight_turn=1e9)
+    settings = Settings(smoothing_window=20, relinearization_angle=1e9)
     estimator = Estimator(settings)
     longest = 0
     for event in drive(settings, 15.0, noise=0.0).events:
@@ -517,7 +520,10 @@ def test_the_window_bounds_the_history_even_if_nothing_ever_turns():
 @pytest.mark.parametrize('window', range(41, 48))
 def test_a_landmark_that_moves_as_the_window_closes_stays_where_it_went(window):
     settings = Settings(
-        hindsight_window=window, hindsight_interval=5, hindsight_turn=0.0, confirmations=1
+        smoothing_window=window,
+        relinearization_interval=5,
+        relinearization_angle=0.0,
+        confirmations=1,
     )
     world = drive(settings, 15.0, landmarks=4)
 
@@ -549,9 +555,9 @@ def test_an_estimator_that_has_seen_nothing_has_nothing_to_smooth():
     [
         {'gains': 'constant'},
         {'gains': 'scheduled'},
-        {'hindsight_interval': 0},
-        {'landmark_velocity_error': 0.1},
-        {'linear_scale_error': (0.1, 0.0, 0.0), 'calibration_drift': 0.1},
+        {'relinearization_interval': 0},
+        {'landmark_velocity_stddev': 0.1},
+        {'linear_scale_stddev': (0.1, 0.0, 0.0), 'calibration_drift': 0.1},
     ],
 )
 def test_designs_that_keep_no_history_say_that_they_cannot_smooth(changes):
@@ -562,7 +568,9 @@ def test_designs_that_keep_no_history_say_that_they_cannot_smooth(changes):
 
 
 def test_forgotten_landmarks_leave_the_history_too():
-    settings = Settings(hindsight_interval=10, hindsight_turn=0.0, hindsight_window=30)
+    settings = Settings(
+        relinearization_interval=10, relinearization_angle=0.0, smoothing_window=30
+    )
     world = drive(settings, 15.0)
     estimator = Estimator(settings)
     for index, event in enumerate(world.events):

@@ -85,7 +85,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(args: argparse.Namespace) -> None:
     """Replay a recording, and write what was asked for."""
-    defaults = {'hindsight_window': 0} if args.smooth else {}
+    defaults = {'smoothing_window': 0} if args.smooth else {}
     settings = read_settings(args, INPUT_NAMES, INSTEAD, **defaults)
     inputs = read_inputs(args)
     if args.smooth and not DESIGNS[settings.gains].has_joint_covariance:

@@ -44,7 +44,7 @@ class RiccatiFilter(Filter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        error = settings.landmark_velocity_error
+        error = settings.landmark_velocity_stddev
         self.joint = (
             MovingLandmarksCovariance(self.axes, self.calibration, error)
             if error > 0.0
@@ -63,7 +63,7 @@ class RiccatiFilter(Filter):
         weights = observation_weights(r, self.predicted(residuals)[1], R, self._settings)
         passed = weights > 0.0
         used, r, R = residuals.select(passed), r[passed], R[passed]
-        repeated = repetition_factors(used.dt_s, self._settings.observation_error_time)
+        repeated = repetition_factors(used.dt_s, self._settings.observation_correlation_time)
         R = R / (weights[passed] / repeated)[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
         HP, HPH = self.joint.project(self.joint.output_matrix(used), used.rows)

@@ -89,7 +89,7 @@ class _Step:
 class ScheduledFilter(Filter):
     """Gains from the covariance of a small core and how each landmark depends on it."""
 
-    ignores = (*OF_CONSTANT_GAINS, 'landmark_velocity_error')
+    ignores = (*OF_CONSTANT_GAINS, 'landmark_velocity_stddev')
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
@@ -106,7 +106,7 @@ class ScheduledFilter(Filter):
         rows = residuals.rows
         F, N, _ = self._postponed.now(rows)
         H = self._output_matrix(residuals.landmarks) - F
-        passed = self._distances(residuals, F, N) <= self._settings.rejection_distance
+        passed = self._distances(residuals, F, N) <= self._settings.rejection_threshold
         step = self._reweighted_step(residuals, H, N, passed)
         Delta, gain_k = step.Delta, step.gain_k
         delta = self.axes.full_points((F @ Delta + N @ step.k_left).ravel())
@@ -236,7 +236,7 @@ class ScheduledFilter(Filter):
         """Return the step Δ that the points which passed the gate ask for, by Huber's weights."""
         r, R = residuals.r[:, : self.axes.point, None], self._noise(residuals.covariances)
         repeated = repetition_factors(
-            residuals.dt_s[passed], self._settings.observation_error_time
+            residuals.dt_s[passed], self._settings.observation_correlation_time
         )
         weights, gain_k = passed.astype(np.float64), np.zeros_like(N)
         for remaining in reversed(range(1 + REWEIGHTINGS)):
