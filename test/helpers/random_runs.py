@@ -45,7 +45,7 @@ def observe(
     return filter_.correct(residuals_of(filter_, rows, points, covariances))
 
 
-def step(
+def random_step(
     filter_: Filter, rng: np.random.Generator, motion_variance: float, point_variance: float
 ) -> None:
     """One random motion and one random observation of some of the landmarks."""

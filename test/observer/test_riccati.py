@@ -16,8 +16,8 @@ from random_runs import (
     PLAIN,
     propagate,
     random_covariances,
+    random_step,
     residuals_of,
-    step,
 )
 from strategies import generators, poses
 
@@ -35,7 +35,7 @@ def started(rng, settings=PLAIN, n=4):
     riccati = RiccatiFilter(settings, np.eye(4))
     riccati.add(rng.normal(scale=4.0, size=(n, 3)), 0.01 * random_covariances(rng, n, 3))
     for _ in range(5):
-        step(riccati, rng, 1e-4, 1e-2)
+        random_step(riccati, rng, 1e-4, 1e-2)
     return riccati
 
 
@@ -218,7 +218,7 @@ def test_observations_never_determine_where_the_worlds_frame_is(rng):
         points = random.normal(scale=4.0, size=(4, 3))
         riccati.add(points, 0.01 * random_covariances(random, 4, 3))
         for _ in range(20):
-            step(riccati, random, 1e-4, 1e-2)
+            random_step(riccati, random, 1e-4, 1e-2)
         return riccati
 
     sure, unsure = run(np.zeros((6, 6))), run(unsure_of_frame)
@@ -240,12 +240,14 @@ def test_covariance_stays_symmetric_and_positive_over_hours_of_any_noise(
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
     Q = 10.0 ** rng.uniform(-10.0, -2.0, (steps, 1, 6, 1)) * np.eye(6)
     R = 10.0 ** rng.uniform(*point_variance_exponents, (steps, 1, 1, 1)) * np.eye(3)
-    for i in range(steps):
-        propagate(riccati, V[i], dt_s, Q[i])
-        seen = np.array([i // 7 % 3])
-        points = riccati.expected_points(seen) + np.sqrt(R[i, :, 0, 0]) * rng.normal(size=(1, 3))
-        observe(riccati, seen, points, R[i])
-        if i % 200 == 0:
+    for step in range(steps):
+        propagate(riccati, V[step], dt_s, Q[step])
+        seen = np.array([step // 7 % 3])
+        points = riccati.expected_points(seen) + np.sqrt(R[step, :, 0, 0]) * rng.normal(
+            size=(1, 3)
+        )
+        observe(riccati, seen, points, R[step])
+        if step % 200 == 0:
             for P in (riccati.joint.P, covariance_of_all(riccati)):
                 np.testing.assert_allclose(P, P.T, rtol=0.0, atol=1e-15 * np.abs(P).max())
                 deviations = np.sqrt(np.diag(P))
