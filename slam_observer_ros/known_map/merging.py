@@ -98,9 +98,10 @@ def shape_covariances(state: State) -> FloatArray | None:
     n, axes, points = len(state.landmarks), state.axes, state.observer.points
     k, R = axes.point, state.observer.reference_pose[:3, :3]
     joint = state.filter.joint
-    if joint is None or state.is_fixed or n == 0:
+    with_pose = None if joint is None else joint.with_pose(np.arange(n), points)
+    if with_pose is None or n == 0:
         return state.landmark_covariances()
-    P = joint.with_pose(np.arange(n), points)[axes.p :, axes.p :]
+    P = with_pose[axes.p :, axes.p :]
     G = axes.output_matrix(points - points.mean(axis=0)).reshape(n * k, -1)
     least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
     information = gauge_information(G, with_variances_above(least_m2, P))

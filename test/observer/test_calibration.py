@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from slam_observer_ros.observer.prediction import initial_covariance, predict
 from strategies import generators
 
 from slam_observer_ros.estimates import CalibrationEstimate
@@ -46,14 +45,14 @@ GYROSCOPE_BIAS = np.array([0.04, -0.03, 0.05, 0.0, 0.0, 0.0])
 
 def scale_and_bias(estimator):
     """Estimated factors (6,) and biases (6,), as they are applied to a velocity."""
-    calibrated = estimator._slam.gains.calibration.apply
+    calibrated = estimator._state.filter.calibration.apply
     once, twice = calibrated(np.array([np.ones(6), 2.0 * np.ones(6)]))
     return twice - once, 2.0 * once - twice
 
 
 def deviations(estimator, count):
     """Standard deviations of the ``count`` estimated entries."""
-    return np.sqrt(estimator._slam.gains.calibration_variances[:count])
+    return np.sqrt(estimator._state.filter.calibration_variances[:count])
 
 
 def with_gains(settings, gains):
@@ -95,13 +94,13 @@ def test_a_robot_whose_wheels_stand_does_not_turn_by_a_bias(gains):
     start_ns = estimator.stamp_ns
     estimator.add(VelocityEvent(start_ns + 1, np.zeros(6)))
     estimator.flush()
-    parked, variances = estimator.pose, estimator._slam.gains.calibration_variances.copy()
+    parked, variances = estimator.pose, estimator._state.filter.calibration_variances.copy()
     for n in range(1, 1000):
         estimator.add(VelocityEvent(start_ns + n * 10**8, np.zeros(6)))
     estimator.flush()
     np.testing.assert_allclose(estimator.pose, parked, atol=1e-9)
     np.testing.assert_array_equal(estimator.body_velocity, 0.0)
-    np.testing.assert_array_equal(estimator._slam.gains.calibration_variances, variances)
+    np.testing.assert_array_equal(estimator._state.filter.calibration_variances, variances)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -120,7 +119,7 @@ def test_a_delay_is_found_as_well_as_its_covariance_says(
     normalised_squared = []
     for seed in range(3):
         estimator = estimate(drive(settings, 60.0, seed, delay_ns=delay_ns), settings)
-        error_s = (estimator._slam.gains.calibration.delay_ns - delay_ns) * 1e-9
+        error_s = (estimator._state.filter.calibration.delay_ns - delay_ns) * 1e-9
         sigma_s = deviations(estimator, 1)[0]
         normalised_squared.append((error_s / sigma_s) ** 2)
         assert sigma_s < 0.03
@@ -141,7 +140,7 @@ def test_a_delay_that_is_made_up_for_does_no_harm(gains):
     assert mean_error_m(settings, 2 * DELAY_NS) > 1.2 * in_time
 
 
-def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
+def test_a_velocity_stamped_late_shows_as_a_negative_delay():
     """As an odometry's that is averaged over the time before its stamp."""
     settings = Settings(
         two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_stddev=0.2
@@ -151,7 +150,7 @@ def test_a_velocity_stamped_late_is_told_by_a_negative_delay():
     for seed in range(4):
         world = drive(settings, 60.0, seed, delay_ns=-DELAY_NS)
         estimator = estimate(world, settings)
-        found_ns = estimator._slam.gains.calibration.delay_ns
+        found_ns = estimator._state.filter.calibration.delay_ns
         assert found_ns == pytest.approx(-DELAY_NS, rel=0.3)
         errors_m.append(configuration_error_m(estimator, world))
         errors_left_m.append(configuration_error_m(estimate(world, left_alone), world))
@@ -175,7 +174,7 @@ def test_a_delay_stays_within_what_is_made_up_for():
         assert calibration.delay_ns == round(limit_s * 1e9)
 
 
-def test_the_velocity_that_is_told_is_the_one_that_moves_the_pose():
+def test_the_velocity_that_is_reported_is_the_one_that_moves_the_pose():
     step_ns = 10_000_000
     for settings in (WHEELS, replace(EVERYTHING, velocity_delay_stddev=0.0)):
         estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
@@ -184,7 +183,7 @@ def test_the_velocity_that_is_told_is_the_one_that_moves_the_pose():
         np.testing.assert_allclose(after, moved, atol=1e-9)
 
 
-def test_at_constant_velocity_nobody_can_tell_the_delay():
+def test_at_constant_velocity_nobody_can_know_the_delay():
     """Not even at the start, where no velocity is known yet."""
     settings = Settings(two_d_mode=True, velocity_delay_stddev=0.2)
     world = drive(settings, 5.0)
@@ -243,8 +242,8 @@ def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
     settings = Settings(gains=gains, two_d_mode=two_d_mode)
     estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
     V = true_velocities(5, planar=False)
-    np.testing.assert_array_equal(estimator._slam.gains.calibration.apply(V), V)
-    assert estimator._slam.gains.calibration.delay_ns == 0
+    np.testing.assert_array_equal(estimator._state.filter.calibration.apply(V), V)
+    assert estimator._state.filter.calibration.delay_ns == 0
 
 
 @pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 13), (PLANAR, 7)])
@@ -277,11 +276,9 @@ def test_sensitivity_is_the_derivative_of_the_motion(rng, axes):
         return np.array(poses)
 
     nominal = path(np.zeros(calibration.count))
-    motion = Motion(
-        nominal, V, np.full(pieces, dt_s), np.zeros((pieces, 6, 6)), pieces * dt_s, V[[0, -1]]
-    )
-    Ad = se3.adjoint(nominal)[:, axes.pose]
-    F = calibration.sensitivity(Ad, motion)
+    held_s, no_noise = np.full(pieces, dt_s), np.zeros((pieces, 6, 6))
+    motion = Motion(nominal, V, held_s, no_noise, pieces * dt_s, V[[0, -1]], calibration)
+    F = motion.sensitivity
     h = 1e-6
     for column, unit in enumerate(np.eye(calibration.count)):
         error = se3.log(path(h * unit)[-1] @ se3.inverse(nominal[-1]))[axes.pose] / h
@@ -295,7 +292,7 @@ def test_drift_lets_the_uncertainty_grow_with_time():
         calibration_drift=0.5,
     )
     calibration = Calibration(settings, SPATIAL)
-    P = initial_covariance(SPATIAL, calibration)
+    P = calibration.initial_covariance()
     still = Motion(
         np.tile(np.eye(4), (5, 1, 1)),
         np.zeros((4, 6)),
@@ -303,8 +300,9 @@ def test_drift_lets_the_uncertainty_grow_with_time():
         np.zeros((4, 6, 6)),
         4.0,  # half a second of it without a velocity
         np.zeros((2, 6)),
+        calibration,
     )
-    predict(P, SPATIAL, calibration, still)
+    still.predict(P)
     # Four seconds at half the initial standard deviation per √s: σ² (1 + 4 · 0.25).
     np.testing.assert_allclose(np.diag(P)[6:], np.array([0.1, 0.02]) ** 2 * 2.0)
 
@@ -317,7 +315,7 @@ def test_a_bias_that_drifts_is_followed():
     np.testing.assert_allclose(found[:3], GYROSCOPE_BIAS[:3], atol=0.02)
 
 
-def test_looking_back_does_not_undo_that_a_scale_has_changed():
+def test_relinearising_does_not_undo_that_a_scale_has_changed():
     settings = Settings(
         two_d_mode=True,
         linear_scale_stddev=(0.1, 0.0, 0.0),
@@ -336,8 +334,8 @@ def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
     calibration.shift(np.full(calibration.count, 0.1))
     path = np.array([np.eye(4), se3.exp(np.array([0.0, 0.0, 0.8, 2.0, 0.0, 0.0]))])
     zero = np.zeros(1)
-    carried = Motion(path, np.zeros((1, 6)), zero, np.zeros((1, 6, 6)), 0.0, None)
-    assert not calibration.sensitivity(se3.adjoint(path), carried).any()
+    carried = Motion(path, np.zeros((1, 6)), zero, np.zeros((1, 6, 6)), 0.0, None, calibration)
+    assert not carried.sensitivity.any()
 
 
 @pytest.mark.parametrize(
@@ -351,11 +349,11 @@ def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
         (1e-30, '0.012345000 ± 0.000000000 rad/s'),
     ],
 )
-def test_an_estimate_is_told_as_far_as_it_is_known(deviation, expected):
+def test_an_estimate_is_written_as_far_as_it_is_known(deviation, expected):
     assert str(CalibrationEstimate('angular_bias_x', 0.012345, deviation, 'rad/s')) == expected
 
 
-def test_a_calibration_that_nobody_can_mean_is_told():
+def test_a_calibration_that_nobody_can_mean_is_reported():
     """Yaw rates with the wrong sign, for which the scale makes up; real wheels are not."""
     wrong = drive(WHEELS, 60.0, scale=np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0]))
     angular, linear = estimate(wrong, WHEELS).calibration

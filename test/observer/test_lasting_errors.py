@@ -1,4 +1,4 @@
-"""Errors of observations that last: a landmark seen again soon tells little more."""
+"""Errors of observations that last: a landmark seen again soon says little more."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SETTINGS = Settings(
 
 
 @given(st.integers(1, 60), st.floats(0.01, 10.0), st.floats(0.01, 10.0))
-def test_observations_tell_together_what_their_joint_covariance_says(n, dt_s, error_time_s):
+def test_observations_say_together_what_their_joint_covariance_says(n, dt_s, error_time_s):
     rho = np.exp(-dt_s / error_time_s)
     joint = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     expected = np.linalg.solve(joint, np.ones(n)).sum()
@@ -77,17 +77,17 @@ def test_a_robot_that_stands_knows_how_well_it_sees(gains):
         linear_velocity_noise=(1e-4,) * 3,
         huber_threshold=0.0,
     )
-    told, untold = still, replace(still, observation_correlation_time=0.0)
+    unaware = replace(still, observation_correlation_time=0.0)
     band = chi2.ppf([0.005, 0.995], 12 * 20) / 20
     nees = [
         np.mean([configuration_nees(standing(settings, seed)) for seed in range(20)])
-        for settings in (told, untold)
+        for settings in (still, unaware)
     ]
     assert band[0] < nees[0] < band[1]
     assert nees[1] > 5.0 * band[1]
 
 
-def test_hindsight_counts_an_observation_as_the_filter_did():
+def test_smoothing_counts_an_observation_as_the_filter_did():
     estimator = standing(SETTINGS, seed=0, duration_s=5.0)
     smoothed = estimator.smooth()
     np.testing.assert_allclose(smoothed.world_points, estimator.world_points, atol=2e-3)
@@ -112,8 +112,9 @@ def test_another_sensor_that_sees_at_the_same_instant_counts_like_the_first():
     one, two = Estimator(SETTINGS), Estimator(SETTINGS)
     for step in range(20):
         first = ObservationEvent(step * 10**8, np.arange(len(POINTS)), POINTS)
-        shares = [*two._slam.landmarks.unseen_s(np.arange(len(two._slam.landmarks)), step * 10**8)]
-        assert all(share in (np.inf, 0.1) for share in shares)
+        landmarks = two._state.landmarks
+        unseen_s = landmarks.unseen_s(np.arange(len(landmarks)), step * 10**8)
+        assert np.isin(unseen_s, (np.inf, 0.1)).all()
         for estimator in (one, two):
             estimator.add(first)
         two.add(replace(first, points=POINTS + 1e-3))
@@ -121,13 +122,13 @@ def test_another_sensor_that_sees_at_the_same_instant_counts_like_the_first():
     assert 0.4 < ratio < 0.8
 
 
-def test_a_landmark_that_was_placed_anew_has_not_been_seen_before():
+def test_a_landmark_that_was_relocated_has_not_been_seen_before():
     landmarks, row = LandmarkTable(), np.array([0])
     landmarks.add(np.array([7]), 0)
     landmarks.accept(row, 10**9)
     assert landmarks.unseen_s(row, 2 * 10**9) == 1.0
     assert landmarks.unseen_s(row, 10**9) == 1.0, 'by another sensor'
-    landmarks.restart(row, 3 * 10**9)
+    landmarks.take_for_new(row, 3 * 10**9)
     assert landmarks.unseen_s(row, 3 * 10**9) == np.inf
     assert landmarks.unseen_s(row, 4 * 10**9) == 1.0
 
@@ -135,9 +136,9 @@ def test_a_landmark_that_was_placed_anew_has_not_been_seen_before():
 def test_where_a_landmark_was_rejected_is_still_known_when_another_one_was_removed():
     landmarks, last = LandmarkTable(), np.array([2])
     landmarks.add(np.array([7, 8, 9]), 0)
-    place, tolerance_m = np.array([[4.0, 5.0, 6.0]]), np.array([0.1])
-    landmarks.reject(last, place, tolerance_m)
+    position, tolerance_m = np.array([[4.0, 5.0, 6.0]]), np.array([0.1])
+    landmarks.reject(last, position, tolerance_m)
     landmarks.remove(np.array([0]))
-    assert landmarks.are_rejected_again(np.array([1]), place, tolerance_m).all()
-    landmarks.reject(np.array([1]), place, tolerance_m)
+    assert landmarks.are_rejected_again(np.array([1]), position, tolerance_m).all()
+    landmarks.reject(np.array([1]), position, tolerance_m)
     assert landmarks.rejections.tolist() == [0, 2]

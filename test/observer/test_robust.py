@@ -59,7 +59,7 @@ def test_threshold_zero_is_plain_least_squares(rng):
 
 
 @given(generators())
-def test_reweighted_least_squares_settles_on_hubers_estimate(rng):
+def test_reweighted_least_squares_ends_at_hubers_estimate(rng):
     """Weights are those of what is left of the residuals once the correction is made."""
     r, predicted, noise = random_problem(rng)
     r[0] *= 5.0
@@ -90,7 +90,7 @@ def test_each_observation_is_gated_by_its_own_distance(rng, scale, k):
 
 
 @given(generators(), st.floats(0.0, 1e3), st.floats(0.0, 300.0), st.sampled_from([2, 3]))
-def test_far_from_the_others_is_judged_by_what_these_foretell(rng, spread, scale, k):
+def test_far_from_the_others_is_judged_by_what_these_predict(rng, spread, scale, k):
     r, predicted, noise = random_problem(rng, k=k)
     r, predicted = scale * r, spread * predicted
     S = predicted + block_diagonal(noise)
@@ -100,10 +100,10 @@ def test_far_from_the_others_is_judged_by_what_these_foretell(rng, spread, scale
     for i in passed:
         one = k * i + np.arange(k)
         others = (k * passed[passed != i][:, None] + np.arange(k)).ravel()
-        foretold = S[np.ix_(one, others)] @ np.linalg.solve(
+        expected_r = S[np.ix_(one, others)] @ np.linalg.solve(
             S[np.ix_(others, others)], r.ravel()[others]
         )
-        left = (r[i] - foretold)[None]
+        left = (r[i] - expected_r)[None]
         expected[i] = mahalanobis(left, noise[[i]])[0] > 3.0 * 6.0
     found = far_from_the_others(r, predicted, noise, Settings(rejection_threshold=6.0))
     np.testing.assert_array_equal(found, expected)
@@ -140,7 +140,7 @@ def drive_on_blindly(settings, wrong, do_then=None, is_stray_seen=False):
 @pytest.mark.parametrize('wrong', [{2: 0}, {2: 0, 3: 1}, {2: 1, 3: 0}], ids=str)
 @pytest.mark.parametrize('is_stray_seen', [False, True])
 def test_wrong_ids_after_a_blind_stretch_do_not_throw_the_pose(two_d_mode, wrong, is_stray_seen):
-    """Seen once, they look like a loop closed; where the robot really is, others tell later."""
+    """Seen once, they look like a loop closed; where the robot really is, others show later."""
     settings = Settings(two_d_mode=two_d_mode)
     errors_m, estimator = drive_on_blindly(settings, wrong, is_stray_seen=is_stray_seen)
     assert errors_m[10] > 1.0  # an id is believed until something speaks against it
@@ -169,7 +169,7 @@ def test_a_wrong_id_among_right_ones_after_a_blind_stretch_does_not_throw_the_po
 def test_a_landmark_that_one_wrong_id_has_placed_does_not_throw_the_pose_for_good(
     two_d_mode, off_m
 ):
-    """It is what is seen first after a blind stretch; later the others tell where the robot is."""
+    """It is what is seen first after a blind stretch; later the others show where the robot is."""
     estimator = Estimator(Settings(two_d_mode=two_d_mode, unknown_linear_motion=1.0))
     for step in range(60):
         stamp_ns = (100 + step) * 100_000_000 + (step >= 10) * 8_000_000_000
@@ -200,9 +200,10 @@ def test_a_landmark_that_is_disbelieved_may_have_made_room_for_a_new_one():
         assert estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))
         assert estimator.add(ObservationEvent(stamp_ns, ids, points))
     estimator.flush()
-    for slam in estimator._frame.hypotheses._states:
-        assert len(slam.landmarks) <= 3
-        assert np.all(slam.landmarks.rejections[slam.landmarks.ids == 3] == 0)
+    for hypothesis in estimator._hypotheses._all:
+        landmarks = hypothesis.state.landmarks
+        assert len(landmarks) <= 3
+        assert np.all(landmarks.rejections[landmarks.ids == 3] == 0)
 
 
 def test_with_a_single_hypothesis_a_wrong_id_is_believed_for_good():
@@ -232,7 +233,7 @@ def test_what_says_nothing_of_the_pose_leaves_open_which_state_is_right(do_then)
 
 def test_a_landmark_is_forgotten_in_all_states_that_are_followed():
     def forget(estimator):
-        assert len(estimator._frame.hypotheses) == 2
+        assert len(estimator._hypotheses) == 2
         assert estimator.forget(1)
 
     _, estimator = drive_on_blindly(Settings(two_d_mode=True), {2: 0}, forget)
@@ -305,7 +306,7 @@ def test_an_outlier_at_first_sight_does_not_survive(gains, two_d_mode):
 
 @designs
 def test_a_landmark_gives_way_once_it_was_contradicted_more_often_than_seen(gains):
-    """Seen twice at a wrong place and five times at the right one, then out of view."""
+    """Seen twice at a wrong position and five times at the right one, then out of view."""
     settings = Settings(gains=gains, confirmations=3)
     world = drive(settings, 5.0, landmarks=5, seen=5)
 
@@ -337,7 +338,7 @@ def test_a_landmark_seen_twice_outlives_an_outlier(gains):
 
 @designs
 @modes
-def test_a_landmark_that_moved_is_recognised_and_started_anew(gains, two_d_mode, caplog):
+def test_a_landmark_that_moved_is_recognised_and_taken_for_new(gains, two_d_mode, caplog):
     settings = Settings(
         gains=gains, two_d_mode=two_d_mode, relinearization_interval=10, relinearization_angle=0.0
     )
@@ -382,7 +383,7 @@ def test_swapped_ids_do_no_harm(gains, two_d_mode):
 
 
 @designs
-def test_outliers_at_ever_other_places_are_not_taken_for_a_landmark_that_moved(gains):
+def test_outliers_at_ever_other_positions_are_not_taken_for_a_landmark_that_moved(gains):
     settings = Settings(gains=gains)
     world = drive(settings, 20.0, landmarks=5, seen=5)
     random = np.random.default_rng(0)
@@ -401,7 +402,7 @@ def test_outliers_at_ever_other_places_are_not_taken_for_a_landmark_that_moved(g
 
 @designs
 def test_all_landmarks_moved_together_are_followed_again(gains):
-    """As when the robot was carried: none of them can be told from another by its residual."""
+    """As when the robot was carried: none of them differs from another by its residual."""
     settings = Settings(gains=gains)
     world = drive(settings, 25.0, landmarks=5, seen=5)
 
@@ -415,7 +416,7 @@ def test_all_landmarks_moved_together_are_followed_again(gains):
     assert configuration_error_m(estimator, moved) < 1.0
 
 
-def test_a_landmark_that_is_started_anew_may_move_otherwise_than_before():
+def test_a_landmark_that_is_taken_for_new_may_move_otherwise_than_before():
     settings = Settings(
         landmark_velocity_stddev=0.1,
         confirmations=1,

@@ -5,12 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 import tracemalloc
 
-from bare_filter import Filter, PLAIN, random_covariances
 from gain_worlds import configuration_error_m, drive, estimate, START_NS, STEP_NS
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from random_runs import (
+    covariance_of_all,
+    observe,
+    PLAIN,
+    propagate,
+    random_covariances,
+    random_step,
+    residuals_of,
+)
 from strategies import generators
 
 from slam_observer_ros.estimator.estimator import Estimator
@@ -20,8 +28,8 @@ from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.observer.scheduled.core import CAPACITY
-from slam_observer_ros.observer.scheduled.postponed_landmarks import Leaves
-from slam_observer_ros.observer.scheduled.scheduled import ScheduledGains
+from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
+from slam_observer_ros.observer.scheduled.scheduled import ScheduledFilter
 from slam_observer_ros.runs.simulated_run import run_simulation
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import Scenario, Simulation
@@ -84,13 +92,18 @@ def test_reading_the_map_changes_no_bit_of_it():
 
 def landmarks_about_a_robot(rng, n):
     """Filter that has seen n landmarks twice, on a motion that left it unsure of its pose."""
-    slam = Filter(ScheduledGains(PLAIN))
-    slam.gains.set_pose_error_covariance(1e-4 * random_covariances(rng, 1, 6)[0])
-    slam.add(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
+    scheduled = ScheduledFilter(PLAIN, np.eye(4))
+    scheduled.set_pose(np.eye(4), 1e-4 * random_covariances(rng, 1, 6)[0])
+    scheduled.add(rng.normal(scale=4.0, size=(n, 3)), 1e-4 * random_covariances(rng, n, 3))
     for _ in range(3):
-        slam.step(rng, 1e-4, 1e-2)
-    slam.move(rng.normal(size=(1, 6)), np.ones(1), 1e-3 * random_covariances(rng, 1, 6))
-    return slam
+        random_step(scheduled, rng, 1e-4, 1e-2)
+    V, Q = rng.normal(size=(1, 6)), 1e-3 * random_covariances(rng, 1, 6)
+    propagate(scheduled, V, np.ones(1), Q)
+    return scheduled
+
+
+def bring_up_to_date(scheduled):
+    scheduled.expected_points(np.arange(len(scheduled.points)))
 
 
 def of_pose_and_each_landmark(n):
@@ -102,13 +115,13 @@ def of_pose_and_each_landmark(n):
 
 @given(generators(), st.integers(2, 15))
 def test_an_observation_acts_on_all_landmarks_as_in_a_kalman_filter(rng, n):
-    """Given what the gains hold, nothing is left out: not what is shared, nor what is not seen."""
-    slam = landmarks_about_a_robot(rng, n)
+    """Given what the filter holds, nothing is left out: what is shared, or what is not seen."""
+    scheduled = landmarks_about_a_robot(rng, n)
     seen = np.sort(rng.permutation(n)[: rng.integers(1, n)])
-    slam.gains.recall(slam.observer, np.arange(n))
-    prior, points = slam.covariance, slam.points
+    bring_up_to_date(scheduled)
+    prior, points, A = covariance_of_all(scheduled), scheduled.points, scheduled.observer.A
     R = 1e-3 * random_covariances(rng, len(seen), 3)
-    residuals = slam.residuals(seen, slam.expected(seen) + 0.03, R)
+    residuals = residuals_of(scheduled, seen, scheduled.expected_points(seen) + 0.03, R)
     C = np.zeros((3 * len(seen), len(prior)))
     C[:, :6] = SPATIAL.output_matrix(points[seen]).reshape(-1, 6)
     C[np.arange(len(C)), (6 + 3 * seen[:, None] + np.arange(3)).ravel()] = -1.0
@@ -120,14 +133,15 @@ def test_an_observation_acts_on_all_landmarks_as_in_a_kalman_filter(rng, n):
     turn[6:, :6] = SPATIAL.turn_matrix(x[6:].reshape(n, 3)).reshape(-1, 6)
     posterior = turn @ (prior - K @ C @ prior) @ turn.T
 
-    correction, weights = slam.gains.correct(residuals)
-    slam.observer.correct(correction)
+    weights = scheduled.correct(residuals)
     np.testing.assert_array_equal(weights, 1.0)
-    np.testing.assert_allclose(correction.D, se3.exp(x[:6]), atol=1e-8)
-    np.testing.assert_allclose(slam.points, points + x[6:].reshape(n, 3), atol=1e-8)
+    D = scheduled.observer.A @ se3.inverse(A)
+    np.testing.assert_allclose(D, se3.exp(x[:6]), atol=1e-8)
+    np.testing.assert_allclose(scheduled.points, points + x[6:].reshape(n, 3), atol=1e-8)
     tolerance = 1e-7 * np.abs(prior).max()
     own = of_pose_and_each_landmark(n)
-    np.testing.assert_allclose(slam.covariance[own], posterior[own], atol=tolerance)
+    found = covariance_of_all(scheduled)
+    np.testing.assert_allclose(found[own], posterior[own], atol=tolerance)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -146,7 +160,7 @@ def test_few_landmarks_are_estimated_as_with_riccati_gains(two_d_mode):
 def test_landmarks_that_follow_late_have_not_missed_anything():
     """Composed changes, whenever they are taken over, are the changes one by one."""
     rng, q, n = np.random.default_rng(0), 12, 40
-    late, at_once = Leaves(SPATIAL, q), Leaves(SPATIAL, q)
+    late, at_once = PostponedLandmarks(SPATIAL, q), PostponedLandmarks(SPATIAL, q)
     everything, moved = np.arange(n), np.zeros((n, 3))
     F, N = rng.normal(size=(n, 3, q)), random_covariances(rng, n, 3)
     late.add(F, N)
@@ -155,9 +169,9 @@ def test_landmarks_that_follow_late_have_not_missed_anything():
     for _ in range(200):
         G, x = np.eye(q) + 0.01 * rng.normal(size=(q, q)), 1e-7 * rng.normal(size=q)
         V = 0.01 * random_covariances(rng, 1, q)[0]
-        for leaves in (late, at_once):
-            leaves.change_core(G, V)
-            leaves.shift(x)
+        for postponed in (late, at_once):
+            postponed.change_core(G, V)
+            postponed.shift(x)
         F, N, shifts = at_once.now(everything)
         at_once.update(everything, F, N)
         moved += shifts
@@ -173,14 +187,14 @@ def test_landmarks_that_follow_late_have_not_missed_anything():
 def test_landmarks_wait_in_few_groups():
     """What has to be kept up to date for those out of view grows with the logarithm of them."""
     rng, n = np.random.default_rng(0), 1000
-    leaves = Leaves(PLANAR, 5)
-    leaves.add(rng.normal(size=(n, 2, 5)), np.tile(np.eye(2), (n, 1, 1)))
+    postponed = PostponedLandmarks(PLANAR, 5)
+    postponed.add(rng.normal(size=(n, 2, 5)), np.tile(np.eye(2), (n, 1, 1)))
     touched = 0
     for _ in range(3000):
-        rows = np.union1d(rng.choice(n, 3), leaves.due())
-        F, N, _ = leaves.now(rows)
-        leaves.update(rows, F, N)
-        assert len(leaves._sizes) <= 2 + np.log2(n)
+        rows = np.union1d(rng.choice(n, 3), postponed.due())
+        F, N, _ = postponed.now(rows)
+        postponed.update(rows, F, N)
+        assert len(postponed._sizes) <= 2 + np.log2(n)
         touched += len(rows)
     assert touched < 3 * 3000 * np.log2(n)
 
@@ -188,55 +202,54 @@ def test_landmarks_wait_in_few_groups():
 @pytest.mark.parametrize('point_variance_exponents', [(-8.0, 2.0), (-8.0, -8.0), (2.0, 2.0)])
 def test_covariances_stay_positive_over_hours_of_any_noise(point_variance_exponents):
     rng, n = np.random.default_rng(4), 20
-    slam = Filter(ScheduledGains(PLAIN))
-    slam.add(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
+    scheduled = ScheduledFilter(PLAIN, np.eye(4))
+    scheduled.add(rng.normal(scale=4.0, size=(n, 3)), np.tile(1e-2 * np.eye(3), (n, 1, 1)))
     steps, dt_s = 4_000, np.ones(1)
     V = rng.normal(size=(steps, 1, 6)) * [0.5, 0.5, 0.5, 1.0, 1.0, 1.0]
     Q = 10.0 ** rng.uniform(-10.0, -2.0, (steps, 1, 6, 1)) * np.eye(6)
     R = 10.0 ** rng.uniform(*point_variance_exponents, (steps, 1, 1, 1)) * np.eye(3)
     for step in range(steps):
-        slam.move(V[step], dt_s, Q[step])
+        propagate(scheduled, V[step], dt_s, Q[step])
         seen = np.array([step // 7 % n])
-        points = slam.expected(seen) + np.sqrt(R[step, :, 0, 0]) * rng.normal(size=(1, 3))
-        slam.see(seen, points, R[step])
+        off = np.sqrt(R[step, :, 0, 0]) * rng.normal(size=(1, 3))
+        observe(scheduled, seen, scheduled.expected_points(seen) + off, R[step])
         if step % 200 == 0:
-            P = slam.covariance
+            P = covariance_of_all(scheduled)
             deviations = np.sqrt(np.diag(P))
             assert np.linalg.eigvalsh(P / np.outer(deviations, deviations))[0] > -1e-6
 
 
 def test_removed_landmarks_leave_the_others_as_they_were():
     rng, n = np.random.default_rng(1), 14
-    slam = landmarks_about_a_robot(rng, n)
-    slam.gains.recall(slam.observer, np.arange(n))
+    scheduled = landmarks_about_a_robot(rng, n)
+    bring_up_to_date(scheduled)
     removed, kept = np.array([0, 3, 12]), np.setdiff1d(np.arange(n), [0, 3, 12])
-    before, points = slam.gains.joint_covariance(kept), slam.points[kept]
-    slam.observer.remove_landmarks(removed)
-    slam.gains.remove_landmarks(removed)
-    np.testing.assert_allclose(slam.points, points, atol=1e-12)
-    own = of_pose_and_each_landmark(len(kept))
-    np.testing.assert_allclose(slam.covariance[own], before[own], atol=1e-6 * before.max())
+    before, points = scheduled.joint_covariance(kept), scheduled.points[kept]
+    scheduled.remove(removed)
+    np.testing.assert_allclose(scheduled.points, points, atol=1e-12)
+    own, after = of_pose_and_each_landmark(len(kept)), covariance_of_all(scheduled)
+    np.testing.assert_allclose(after[own], before[own], atol=1e-6 * before.max())
     for _ in range(5):
-        slam.step(rng, 1e-4, 1e-2)
-    assert np.isfinite(slam.covariance).all()
+        random_step(scheduled, rng, 1e-4, 1e-2)
+    assert np.isfinite(covariance_of_all(scheduled)).all()
 
 
-def test_after_landmarks_of_the_core_were_removed_what_tells_nothing_changes_nothing():
+def test_after_landmarks_of_the_core_were_removed_what_says_nothing_changes_nothing():
     """Else some would be taken for others that were in the core."""
     rng, n = np.random.default_rng(1), 14
-    slam = landmarks_about_a_robot(rng, n)
-    slam.gains.recall(slam.observer, np.arange(n))
-    last_seen = slam.gains._core.rows
+    scheduled = landmarks_about_a_robot(rng, n)
+    bring_up_to_date(scheduled)
+    last_seen = scheduled._core.rows
     removed = np.sort(last_seen[last_seen >= 0][:3])
-    slam.observer.remove_landmarks(removed)
-    slam.gains.remove_landmarks(removed)
+    scheduled.remove(removed)
     n -= 3
-    before, points, own = slam.covariance, slam.points, of_pose_and_each_landmark(n)
+    before, points = covariance_of_all(scheduled), scheduled.points
     for row in range(n):
         seen = np.array([row])
-        slam.see(seen, slam.expected(seen), 1e9 * np.eye(3)[None])
-    np.testing.assert_allclose(slam.points, points, atol=1e-9)
-    np.testing.assert_allclose(slam.covariance[own], before[own], atol=1e-6 * before.max())
+        observe(scheduled, seen, scheduled.expected_points(seen), 1e9 * np.eye(3)[None])
+    np.testing.assert_allclose(scheduled.points, points, atol=1e-9)
+    own, after = of_pose_and_each_landmark(n), covariance_of_all(scheduled)
+    np.testing.assert_allclose(after[own], before[own], atol=1e-6 * before.max())
 
 
 def test_a_landmark_that_is_relocated_is_as_uncertain_as_a_new_one():
@@ -249,8 +262,8 @@ def test_a_landmark_that_is_relocated_is_as_uncertain_as_a_new_one():
     of_one = np.append(np.arange(6), np.arange(9, 12))
     of_last = np.append(np.arange(6), 6 + 3 * n + np.arange(3))
     np.testing.assert_allclose(
-        relocated.covariance[np.ix_(of_one, of_one)],
-        added.covariance[np.ix_(of_last, of_last)],
+        covariance_of_all(relocated)[np.ix_(of_one, of_one)],
+        covariance_of_all(added)[np.ix_(of_last, of_last)],
         atol=1e-12,
     )
 

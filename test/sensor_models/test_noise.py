@@ -26,6 +26,7 @@ from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.state.matching import match
 
 SECOND = 1_000_000_000
 
@@ -421,7 +422,7 @@ def test_known_landmarks_too_are_as_uncertain_as_they_are_far_from_the_sensor(ga
         event = ObservationEvent(step * 10**8, np.arange(3), sights).moved(sensor)
         estimator.add(event)
     expected = observed(sights, **noise)
-    np.testing.assert_allclose(estimator._slam.match(event).covariances, expected, rtol=0.01)
+    np.testing.assert_allclose(match(estimator._state, event).covariances, expected, rtol=0.01)
 
 
 @pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
@@ -433,7 +434,8 @@ def test_the_range_that_counts_is_expected_and_the_direction_measured(gains):
     estimator.add(VelocityEvent(0, np.zeros(6)))
     estimator.add(ObservationEvent(0, np.arange(3), points))
     turned = points @ so3.exp(np.array([0.0, 0.0, 0.2]))
-    found = estimator._slam.match(ObservationEvent(10**8, np.arange(3), 1.25 * turned)).covariances
+    event = ObservationEvent(10**8, np.arange(3), 1.25 * turned)
+    found = match(estimator._state, event).covariances
     np.testing.assert_allclose(found, observed(turned, **noise), rtol=1e-6, atol=1e-9)
 
 
@@ -446,11 +448,11 @@ def test_of_a_landmark_in_doubt_what_counts_is_where_it_was_measured(gains):
     for step in range(5):
         estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
         estimator.add(ObservationEvent(step * 10**8, np.arange(3), points))
-    slam, further = estimator._slam, ObservationEvent(5 * 10**8, np.arange(3), 2.0 * points)
+    state, further = estimator._state, ObservationEvent(5 * 10**8, np.arange(3), 2.0 * points)
     expected, measured = observed(points, **noise), observed(2.0 * points, **noise)
-    np.testing.assert_allclose(slam.match(further).covariances, expected, rtol=0.01)
-    slam.landmarks.rejections[1] = slam.settings.max_rejections
-    found = slam.match(further).covariances
+    np.testing.assert_allclose(match(state, further).covariances, expected, rtol=0.01)
+    state.landmarks.rejections[1] = state.settings.max_rejections
+    found = match(state, further).covariances
     np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]], rtol=0.01)
     np.testing.assert_allclose(found[1], measured[1], rtol=0.01)
 

@@ -1,9 +1,10 @@
-"""Smoothing: least squares over prior, motions and observations, and looking back by it."""
+"""Smoothing: least squares over prior, motions and observations, and relinearising by it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 from gain_worlds import (
@@ -17,7 +18,6 @@ from gain_worlds import (
 from hypothesis import given
 import numpy as np
 import pytest
-from slam_observer_ros.observer.prediction import initial_covariance, predict
 from strategies import generators
 
 from slam_observer_ros.common.errors import ParameterError
@@ -27,20 +27,20 @@ from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
-from slam_observer_ros.observer.filter import FrameObservation
-from slam_observer_ros.observer.observer import Observer
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.gauss_newton import Frames, Smoother, Solution
-from slam_observer_ros.smoothing.history import History
+from slam_observer_ros.smoothing.gauss_newton import Keyframes, Smoother, Solution
+from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.prior import Prior
-from slam_observer_ros.smoothing.relinearisation import Hindsight
+from slam_observer_ros.smoothing.relinearisation import Relinearisation
 
 LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_threshold=1e9)
-FRAMES, LANDMARKS = 5, 4
+KEYFRAMES, LANDMARKS = 5, 4
+NOTHING = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+"""What a keyframe holds of an observation in which no landmark was seen."""
 
 
 def random_covariances(rng, count, size, scale):
@@ -58,7 +58,7 @@ class Problem:
         rng = np.random.default_rng(seed)
         d, k, c = axes.p, axes.point, calibrations
         self.axes, self.d, self.k, self.c = axes, d, k, c
-        motions = se3.exp(self._tangents(0.3 * rng.normal(size=(FRAMES, d))))
+        motions = se3.exp(self._tangents(0.3 * rng.normal(size=(KEYFRAMES, d))))
         prior_size = d + c + k * known_landmarks
         points = axes.full_points(rng.normal(scale=3.0, size=(LANDMARKS, k)))
         self.prior = Prior(
@@ -69,26 +69,26 @@ class Problem:
             random_covariances(rng, 1, prior_size, 0.1)[0],
             is_relative,
         )
-        frames = np.repeat(np.arange(FRAMES), 3)
-        landmarks = np.concatenate([rng.permutation(LANDMARKS)[:3] for _ in range(FRAMES)])
+        keyframes = np.repeat(np.arange(KEYFRAMES), 3)
+        landmarks = np.concatenate([rng.permutation(LANDMARKS)[:3] for _ in range(KEYFRAMES)])
         poses = np.array([self.prior.pose])
         for motion in motions:
             poses = np.concatenate([poses, poses[-1:] @ motion])
-        seen = se3.transform(se3.inverse(poses[frames + 1]), points[landmarks][:, None])[
+        seen = se3.transform(se3.inverse(poses[keyframes + 1]), points[landmarks][:, None])[
             :, 0
-        ] + 0.1 * axes.full_points(rng.normal(size=len(frames) * k))
-        self.frames = Frames(
+        ] + 0.1 * axes.full_points(rng.normal(size=len(keyframes) * k))
+        self.keyframes = Keyframes(
             motions,
-            random_covariances(rng, FRAMES, d, 0.1),
-            0.2 * rng.normal(size=(FRAMES, d, c)),
-            0.1 * rng.normal(size=(FRAMES, c)),
-            frames,
+            random_covariances(rng, KEYFRAMES, d, 0.1),
+            0.2 * rng.normal(size=(KEYFRAMES, d, c)),
+            0.1 * rng.normal(size=(KEYFRAMES, c)),
+            keyframes,
             landmarks,
             seen,
-            np.linalg.inv(random_covariances(rng, len(frames), k, 0.1)),
-            rng.uniform(0.1, 1.0, len(frames)),
+            np.linalg.inv(random_covariances(rng, len(keyframes), k, 0.1)),
+            rng.uniform(0.1, 1.0, len(keyframes)),
         )
-        eta = self._tangents(0.1 * rng.normal(size=(FRAMES + 1, d)))
+        eta = self._tangents(0.1 * rng.normal(size=(KEYFRAMES + 1, d)))
         self.start = Solution(poses @ se3.exp(eta), np.zeros(c), points)
 
     def _tangents(self, coordinates):
@@ -97,7 +97,7 @@ class Problem:
         return full
 
     def moved(self, solution, x):
-        poses = (FRAMES + 1) * self.d
+        poses = (KEYFRAMES + 1) * self.d
         eta = self._tangents(x[:poses].reshape(-1, self.d))
         return Solution(
             solution.poses @ se3.exp(eta),
@@ -107,7 +107,7 @@ class Problem:
 
     def residuals(self, solution):
         """All residuals, whitened: the cost is half the sum of their squares."""
-        pose, frames = self.axes.pose, self.frames
+        pose, keyframes = self.axes.pose, self.keyframes
         known, prior_points = solution.points[: len(self.prior.points)], self.prior.points
         if self.prior.is_relative:
             known = se3.transform(se3.inverse(solution.poses[0]), known)
@@ -118,25 +118,24 @@ class Problem:
             (known - prior_points)[:, : self.k].ravel(),
         ]
         whitened = [whiten(np.linalg.inv(self.prior.covariance), np.concatenate(off))]
-        for s in range(FRAMES):
-            by_calibration = frames.sensitivities[s] @ (
-                solution.calibration - frames.calibrations[s]
+        for s in range(KEYFRAMES):
+            by_calibration = keyframes.sensitivities[s] @ (
+                solution.calibration - keyframes.calibrations[s]
             )
-            motion = frames.motions[s] @ se3.exp(self._tangents(by_calibration[None])[0])
+            motion = keyframes.motions[s] @ se3.exp(self._tangents(by_calibration[None])[0])
             step = se3.inverse(solution.poses[s]) @ solution.poses[s + 1]
             error = se3.log(se3.inverse(motion) @ step)[pose]
-            whitened.append(whiten(np.linalg.inv(frames.motion_covariances[s]), error))
-        counted = frames.information * frames.shares[:, None, None]
-        for frame, landmark, point, information in zip(
-            frames.frames, frames.landmarks, frames.points, counted, strict=True
-        ):
-            back = se3.inverse(solution.poses[frame + 1])
+            whitened.append(whiten(np.linalg.inv(keyframes.motion_covariances[s]), error))
+        counted = keyframes.information * keyframes.shares[:, None, None]
+        seen = keyframes.keyframes, keyframes.landmarks, keyframes.points
+        for keyframe, landmark, point, information in zip(*seen, counted, strict=True):
+            back = se3.inverse(solution.poses[keyframe + 1])
             error = se3.transform(back, solution.points[None, landmark])[0] - point
             whitened.append(whiten(information, error[: self.k]))
         return np.concatenate(whitened)
 
     def jacobian(self, solution, h=1e-6):
-        size = (FRAMES + 1) * self.d + self.c + self.k * LANDMARKS
+        size = (KEYFRAMES + 1) * self.d + self.c + self.k * LANDMARKS
         columns = [
             self.residuals(self.moved(solution, h * x))
             - self.residuals(self.moved(solution, -h * x))
@@ -165,7 +164,7 @@ problems = pytest.mark.parametrize(
 def test_one_iteration_is_the_dense_gauss_newton_step(problem):
     J, r = problem.jacobian(problem.start), problem.residuals(problem.start)
     expected = problem.moved(problem.start, -np.linalg.solve(J.T @ J, J.T @ r))
-    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, LEAST_SQUARES)
     solution = smoother.smooth(problem.start, 1, 0.0).end
     np.testing.assert_allclose(solution.poses, expected.poses, atol=1e-6)
     np.testing.assert_allclose(solution.calibration, expected.calibration, atol=1e-6)
@@ -174,7 +173,7 @@ def test_one_iteration_is_the_dense_gauss_newton_step(problem):
 
 @problems
 def test_the_solution_is_where_the_gradient_of_the_cost_vanishes(problem):
-    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, LEAST_SQUARES)
     solution = smoother.smooth(problem.start, 200, 1e-10).end
     gradient = problem.jacobian(solution).T @ problem.residuals(solution)
     np.testing.assert_allclose(gradient, 0.0, atol=1e-5)
@@ -182,9 +181,9 @@ def test_the_solution_is_where_the_gradient_of_the_cost_vanishes(problem):
 
 @problems
 def test_marginal_is_that_of_the_dense_inverse(problem):
-    smoother = Smoother(problem.axes, problem.prior, problem.frames, LEAST_SQUARES)
+    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, LEAST_SQUARES)
     J = problem.jacobian(problem.start)
-    first = FRAMES * problem.d
+    first = KEYFRAMES * problem.d
     np.testing.assert_allclose(
         smoother.smooth(problem.start, 1, 0.0).marginal(),
         np.linalg.inv(J.T @ J)[first:, first:],
@@ -225,7 +224,7 @@ def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_togethe
 
 
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
-def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
+def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
     """A stretch without observations reaches the history in pieces."""
     rng, d, k = np.random.default_rng(0), axes.p, 6
     settings = Settings(linear_scale_stddev=(0.1, 0.1, 0.1), angular_bias_stddev=(0.0, 0.0, 0.1))
@@ -236,25 +235,18 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
         path.append(path[-1] @ motion)
     path, covariances = np.array(path), random_covariances(rng, k, 6, 0.1)
 
-    def frames(*cuts):
+    def keyframes(*cuts):
         calibration = Calibration(settings, axes)
         count = d + calibration.count
         start = Prior(np.eye(4), calibration.values, np.empty((0, 3)), np.eye(count))
         history = History(axes, ObservationNoise(settings), start, 'the start')
         for a, b in pairwise((0, *cuts, k)):
-            at_ends, duration_s = np.zeros((2, 6)), float(dt_s[a:b].sum())
-            part = Motion(
-                path[a : b + 1], V[a:b], dt_s[a:b], covariances[a:b], duration_s, at_ends
-            )
-            P = initial_covariance(axes, calibration)
-            history.move(part.path, *predict(P, axes, calibration, part), calibration.values)
-        nothing = FrameObservation(
-            0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
-        )
-        history.see(nothing, path[-1])
-        return history.frames()
+            pieces = path[a : b + 1], V[a:b], dt_s[a:b], covariances[a:b]
+            history.move(Motion(*pieces, float(dt_s[a:b].sum()), np.zeros((2, 6)), calibration))
+        history.add(Keyframe(0, *NOTHING), path[-1])
+        return history.keyframes()
 
-    whole, parts = frames(), frames(1, 3)
+    whole, parts = keyframes(), keyframes(1, 3)
     np.testing.assert_allclose(parts.motions, whole.motions, atol=1e-12)
     np.testing.assert_allclose(parts.motion_covariances, whole.motion_covariances, atol=1e-12)
     np.testing.assert_allclose(parts.sensitivities, whole.sensitivities, atol=1e-12)
@@ -263,7 +255,7 @@ def test_a_frames_motion_is_the_same_in_one_piece_or_several(axes):
 
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
 @given(rng=generators())
-def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
+def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     d = axes.p
     settings = Settings(linear_scale_stddev=(0.1, 0.1, 0.1), angular_bias_stddev=(0.0, 0.0, 0.1))
     calibration = Calibration(settings, axes)
@@ -277,33 +269,36 @@ def test_a_frame_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     sensitivities = rng.normal(size=(3, d, c))
     path = np.concatenate([np.eye(4)[None], poses])
     for part in range(3):
-        history.move(path[part : part + 2], noises[part], sensitivities[part], np.zeros(c))
-    nothing = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
-    history.see(FrameObservation(0, *nothing), path[-1])
-    history.see(FrameObservation(1, *nothing), path[-1])  # nothing has moved since
-    frames = history.frames()
+        motion = SimpleNamespace(
+            path=path[part : part + 2],
+            noise=noises[part],
+            sensitivity=sensitivities[part],
+            calibration=calibration,
+        )
+        history.move(motion)
+    history.add(Keyframe(0, *NOTHING), path[-1])
+    history.add(Keyframe(1, *NOTHING), path[-1])  # nothing has moved since
+    keyframes = history.keyframes()
     to_body = se3.adjoint(se3.inverse(path[-1]))[axes.pose, axes.pose]
     np.testing.assert_allclose(
-        frames.sensitivities, [to_body @ sensitivities.sum(axis=0), np.zeros((d, c))], atol=1e-9
+        keyframes.sensitivities, [to_body @ sensitivities.sum(axis=0), np.zeros((d, c))], atol=1e-9
     )
     expected = to_body @ noises.sum(axis=0) @ to_body.T
-    np.testing.assert_allclose(frames.motion_covariances[0], expected, atol=1e-9)
-    np.testing.assert_array_equal(frames.motion_covariances[1], 0.0)
+    np.testing.assert_allclose(keyframes.motion_covariances[0], expected, atol=1e-9)
+    np.testing.assert_array_equal(keyframes.motion_covariances[1], 0.0)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_smoothing_a_run_without_noise_returns_the_truth(two_d_mode):
     settings = Settings(two_d_mode=two_d_mode)
     world = drive(settings, 15.0, noise=0.0)
-    hindsight = estimate(world, settings).smooth()
-    assert len(hindsight.stamps_ns) == len(world.observations())
-    np.testing.assert_allclose(hindsight.poses, world.poses[::OBSERVED_EVERY], atol=1e-6)
-    np.testing.assert_allclose(
-        hindsight.world_points, world.world_points[hindsight.ids], atol=1e-6
-    )
+    smoothed = estimate(world, settings).smooth()
+    assert len(smoothed.stamps_ns) == len(world.observations())
+    np.testing.assert_allclose(smoothed.poses, world.poses[::OBSERVED_EVERY], atol=1e-6)
+    np.testing.assert_allclose(smoothed.world_points, world.world_points[smoothed.ids], atol=1e-6)
 
 
-def test_in_hindsight_too_a_point_counts_as_its_message_says():
+def test_in_smoothing_too_a_point_counts_as_its_message_says():
     """Every second observation is a foot off, and says so."""
     still = (1e-4,) * 3
     settings = Settings(angular_velocity_noise=still, linear_velocity_noise=still)
@@ -318,15 +313,15 @@ def test_in_hindsight_too_a_point_counts_as_its_message_says():
     np.testing.assert_allclose(estimator.smooth().world_points, points, atol=2e-3)
 
 
-def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkeypatch):
+def test_relinearising_takes_the_noise_of_where_a_landmark_was_found_to_be(monkeypatch):
     """A stereo camera that has turned further than it knew errs along where it looks now."""
-    noted, see = [], History.see
+    noted, add = [], History.add
 
-    def note(history, seen, *rest):
-        noted.append(seen)
-        see(history, seen, *rest)
+    def note(history, keyframe, *rest):
+        noted.append(keyframe)
+        add(history, keyframe, *rest)
 
-    monkeypatch.setattr(History, 'see', note)
+    monkeypatch.setattr(History, 'add', note)
     settings = Settings(observation_model='stereo', reorder_window=0.0)
     settings = replace(settings, angular_velocity_noise=(0.3,) * 3)
     estimator = Estimator(settings)
@@ -341,7 +336,7 @@ def test_looking_back_takes_the_noise_of_where_a_landmark_was_found_to_be(monkey
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_in_hindsight_a_gross_outlier_counts_for_nothing(two_d_mode):
+def test_in_smoothing_a_gross_outlier_counts_for_nothing(two_d_mode):
     settings = Settings(two_d_mode=two_d_mode)
     world = drive(settings, 10.0)
 
@@ -360,9 +355,9 @@ def test_in_hindsight_a_gross_outlier_counts_for_nothing(two_d_mode):
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_hindsight_beats_the_online_estimate(two_d_mode):
+def test_the_smoothed_estimate_beats_the_online_one(two_d_mode):
     settings = Settings(two_d_mode=two_d_mode)
-    online, smoothed = [], []
+    online_m, smoothed_m = [], []
     for seed in range(4):
         world = drive(settings, 20.0, seed)
         poses = {}
@@ -371,19 +366,19 @@ def test_hindsight_beats_the_online_estimate(two_d_mode):
             settings,
             lambda update, poses=poses: poses.update({update.stamp_ns: update.pose}),
         )
-        hindsight = estimator.smooth()
+        smoothed = estimator.smooth()
         stamps_ns = START_NS + STEP_NS * np.arange(len(world.poses))
         truth = Trajectory(stamps_ns, world.poses)
         online_run = Trajectory(np.array(list(poses)), np.array(list(poses.values())))
-        smoothed_run = Trajectory(hindsight.stamps_ns, hindsight.poses)
-        online.append(trajectory_errors(online_run, truth).ate_rmse_m)
-        smoothed.append(trajectory_errors(smoothed_run, truth).ate_rmse_m)
-    assert np.mean(smoothed) < 0.8 * np.mean(online)
+        smoothed_run = Trajectory(smoothed.stamps_ns, smoothed.poses)
+        online_m.append(trajectory_errors(online_run, truth).ate_rmse_m)
+        smoothed_m.append(trajectory_errors(smoothed_run, truth).ate_rmse_m)
+    assert np.mean(smoothed_m) < 0.8 * np.mean(online_m)
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
 @pytest.mark.parametrize('calibrated', [False, True])
-def test_looking_back_a_piece_at_a_time_comes_to_what_all_of_it_tells(two_d_mode, calibrated):
+def test_relinearising_a_piece_at_a_time_comes_to_what_all_of_it_says(two_d_mode, calibrated):
     settings = Settings(
         two_d_mode=two_d_mode,
         relinearization_interval=5,
@@ -402,7 +397,7 @@ def test_looking_back_a_piece_at_a_time_comes_to_what_all_of_it_tells(two_d_mode
 
 @pytest.mark.parametrize('max_landmarks', [0, 7])
 @pytest.mark.parametrize('two_d_mode', [False, True])
-def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode, max_landmarks):
+def test_where_all_is_linear_relinearising_changes_nothing(two_d_mode, max_landmarks):
     exact = Settings(
         two_d_mode=two_d_mode,
         angular_velocity_noise=(3e-4,) * 3,
@@ -437,32 +432,33 @@ def test_where_all_is_linear_looking_back_changes_nothing(two_d_mode, max_landma
         ([0.25] + [0.0] * 39, 2),  # all that follows would be linearised in the wrong place
     ],
 )
-def test_it_looks_back_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
+def test_it_relinearises_after_turning_far_and_soon_after_one_large_turn(turns_rad, due_after):
     settings = Settings(relinearization_interval=20, relinearization_angle=0.2)
-    calibration = Calibration(settings, SPATIAL)
-    joint = JointCovariance(SPATIAL, calibration, 0.0)
-    hindsight, observer = Hindsight(SPATIAL, settings, calibration, joint), Observer(np.eye(4))
-    nothing = FrameObservation(
-        0, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), None, np.empty(0)
+    riccati, before = RiccatiFilter(settings, np.eye(4)), se3.exp(np.arange(6.0))
+    riccati.add_known(np.eye(3), np.tile(np.eye(3), (3, 1, 1)))
+    relinearisation = Relinearisation(
+        riccati.observer, riccati.calibration, riccati.joint, settings
     )
-    looked_back_at = []
+    one_point = np.array([0]), np.eye(3)[:1], np.eye(3)[:1], np.eye(3)[None], np.array([np.inf])
+    summarised = []
     for turn_rad in turns_rad:
-        hindsight.note_correction(np.array([0.0, 0.0, turn_rad]))
-        hindsight.look_back(observer, nothing, in_doubt=False)
-        looked_back_at.append(hindsight.history.summarised)
-    assert max(looked_back_at) == (due_after or 0)
+        turned = se3.exp(np.array([0.0, 0.0, turn_rad, 0.0, 0.0, 0.0])) @ before
+        relinearisation.note_correction(before, turned)
+        relinearisation.add(Keyframe(0, *one_point), in_doubt=False)
+        summarised.append(relinearisation.history.summarised)
+    assert max(summarised) == (due_after or 0)
 
 
-def test_what_observations_leave_open_is_told_once_with_what_to_do(caplog, monkeypatch):
+def test_what_observations_leave_open_is_said_once_with_what_to_do(caplog, monkeypatch):
     monkeypatch.setattr(Smoother, 'smooth', Mock(side_effect=np.linalg.LinAlgError))
     settings = Settings(relinearization_angle=0.0)
     estimate(drive(settings, 10.0), settings)
-    (warning,) = [text for text in caplog.messages if 'look back' in text]
-    assert warning.startswith('Could not look back')
+    (warning,) = [text for text in caplog.messages if 'relinearise' in text]
+    assert warning.startswith('Could not relinearise')
     assert warning.endswith('set two_d_mode: true for a robot on a floor.')
 
 
-def test_odometry_that_knows_nothing_of_height_roll_and_pitch_can_be_looked_back_at(caplog):
+def test_odometry_that_knows_nothing_of_height_roll_and_pitch_can_be_relinearised(caplog):
     world = drive(Settings(two_d_mode=True), 10.0, seen=1)
     covariance = np.diag([1e12, 1e12, 1e-3, 1e-3, 1e-3, 1e12])
     estimator = Estimator(Settings(relinearization_angle=0.01))
@@ -473,7 +469,7 @@ def test_odometry_that_knows_nothing_of_height_roll_and_pitch_can_be_looked_back
     assert np.isfinite(estimator.pose_covariance).all()
 
 
-def test_observations_of_nothing_take_no_room_in_the_window_and_tell_nothing():
+def test_observations_of_nothing_take_no_room_in_the_window_and_say_nothing():
     settings = Settings(relinearization_interval=10, relinearization_angle=0.0, smoothing_window=0)
     world = drive(settings, 15.0)
     nothing = np.empty(0, dtype=np.int64), np.empty((0, 3))
@@ -528,7 +524,7 @@ def test_a_landmark_that_moves_as_the_window_closes_stays_where_it_went(window):
     world = drive(settings, 15.0, landmarks=4)
 
     def move(index, event):
-        """The landmark moves 6 m at frame 40 and is out of view from frame 46 on."""
+        """The landmark moves 6 m at observation 40 and is out of view from 46 on."""
         if index < 40:
             return event
         is_mover = event.ids == 2
@@ -545,9 +541,9 @@ def test_a_landmark_that_moves_as_the_window_closes_stays_where_it_went(window):
 
 
 def test_an_estimator_that_has_seen_nothing_has_nothing_to_smooth():
-    hindsight = Estimator(Settings()).smooth()
-    assert hindsight.poses.shape == (0, 4, 4)
-    assert hindsight.world_points.shape == (0, 3)
+    smoothed = Estimator(Settings()).smooth()
+    assert smoothed.poses.shape == (0, 4, 4)
+    assert smoothed.world_points.shape == (0, 3)
 
 
 @pytest.mark.parametrize(

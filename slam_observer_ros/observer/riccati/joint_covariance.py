@@ -57,7 +57,7 @@ class JointCovariance:
         covariances[:, :k, :k] = own
         return covariances
 
-    def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray:
+    def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and ã_i, for estimates (m, 3)."""
         columns = np.append(np.arange(self._p), self._columns(rows))
         P: FloatArray = self.P[np.ix_(columns, columns)]
@@ -224,6 +224,10 @@ class ExactMapCovariance(JointCovariance):
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
         """Return the covariances (n, 3, 3) of the landmarks, as the map has them."""
         return self._covariances
+
+    def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray | None:
+        """Return None: how far the map is off, nobody knows."""
+        return None
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
         """Add a motion's noise to that of the pose."""

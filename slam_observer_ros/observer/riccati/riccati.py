@@ -145,8 +145,8 @@ class RiccatiFilter(Filter):
         points = self.observer.points + duration_s * self.observer.u
         return self.joint.landmarks(points, duration_s)
 
-    def joint_covariance(self, rows: IntArray) -> FloatArray:
-        """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks."""
+    def joint_covariance(self, rows: IntArray) -> FloatArray | None:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
         return self.joint.with_pose(rows, self.observer.points[rows])
 
     def _move(self, x: FloatArray) -> None:

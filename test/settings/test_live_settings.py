@@ -1,0 +1,191 @@
+"""Settings that may change while running: from the next observation on they are in force."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+from gain_worlds import drive
+import numpy as np
+import pytest
+
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.live_settings import LiveSettings
+from slam_observer_ros.settings.parameter_table import table
+
+LIVE = [row for row in table(Settings) if not row.read_only]
+
+AFFECTED_BY = {
+    'constant': {'gain_k', 'gain_l', 'step_mode', 'max_innovation_time'},
+    'scheduled': {'gain_k', 'huber_threshold', 'rejection_threshold'},
+    'riccati': {'gain_k', 'huber_threshold', 'rejection_threshold'},
+}
+"""What a setting changes; ``gain_k`` is in the Lyapunov value of all."""
+
+rows_and_gains = pytest.mark.parametrize(
+    ('row', 'gains'),
+    [pytest.param(row, gains, id=f'{row.name}-{gains}') for row in LIVE for gains in AFFECTED_BY],
+)
+
+
+def other_value(row):
+    """A value of a parameter that is not its default."""
+    if row.choices:
+        return next(choice for choice in row.choices if choice != row.default)
+    return row.default / 4.0
+
+
+def settings_and_other(row, gains, **more):
+    """Settings with the default of a parameter, and the same with another value."""
+    relinearised_often = {'relinearization_interval': 3, 'relinearization_angle': 0.0}
+    settings = Settings(gains=gains, reorder_window=0.0, **relinearised_often, **more)
+    return settings, replace(settings, **{row.name: other_value(row)})
+
+
+def events_of(settings, with_ids=True):
+    """Events of a noisy run, in which every seventh point or so is far off, but at first none."""
+    world = drive(settings, 10.0, noise=1.5, landmarks=8, seen=5)
+    rng = np.random.default_rng(1)
+
+    def disturb(index, event):
+        is_off = (rng.random(len(event.ids)) < 0.15) & (index > 0)
+        points = event.points + is_off[:, None] * rng.normal(scale=5.0, size=event.points.shape)
+        ids = event.ids if with_ids else np.full(len(event.ids), UNKNOWN_ID)
+        return replace(event, points=points, ids=ids)
+
+    return world.with_observations(disturb).events
+
+
+def bits_of(estimator):
+    """All that an estimator knows, in each of the states that it follows."""
+    found = [estimator.pose, estimator.world_points, estimator.landmark_ids, estimator.counts]
+    if estimator.last_update is not None:
+        found += [getattr(estimator.last_update, f.name) for f in fields(estimator.last_update)]
+    for hypothesis in estimator._hypotheses._all:
+        known = hypothesis.state.filter
+        found += [hypothesis.cost, known.observer.A, known.points, known.observer.u]
+        has_joint, rows = known.has_joint_covariance, np.arange(len(known.points))
+        found.append(known.joint.P if has_joint else known.joint_covariance(rows))
+    return found
+
+
+def have_same_bits(one, other):
+    try:
+        np.testing.assert_equal(bits_of(one), bits_of(other))
+    except AssertionError:
+        return False
+    return True
+
+
+def add_all(events, *estimators):
+    for event in events:
+        for estimator in estimators:
+            assert estimator.add(event)
+
+
+def agree_to_the_end(events, one, other):
+    """Hold two estimators together, observation by observation."""
+    observations = 0
+    for event in events:
+        add_all([event], one, other)
+        if isinstance(event, ObservationEvent):
+            np.testing.assert_equal(bits_of(one), bits_of(other))
+            observations += 1
+    assert observations > 20
+
+
+def split_before_observation(events, number):
+    """The events before the observation of that number, and the rest."""
+    seen = [i for i, event in enumerate(events) if isinstance(event, ObservationEvent)]
+    return events[: seen[number]], events[seen[number] :]
+
+
+def test_every_live_setting_affects_some_filter():
+    assert {row.name for row in LIVE} == set().union(*AFFECTED_BY.values())
+
+
+@rows_and_gains
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_a_changed_setting_is_in_force_from_the_next_observation_on(row, gains, two_d_mode):
+    """As in an estimator that was made with it, and that no observation has corrected so far."""
+    settings, other = settings_and_other(row, gains, two_d_mode=two_d_mode)
+    before, after = split_before_observation(events_of(settings), 1)
+    unchanged, changed, made = Estimator(settings), Estimator(settings), Estimator(other)
+    add_all(before, unchanged, changed, made)
+    np.testing.assert_equal(bits_of(changed)[:3], bits_of(made)[:3])
+    changed.change_settings(other)
+    agree_to_the_end(after, changed, made)
+    add_all(after, unchanged)
+    assert have_same_bits(unchanged, changed) == (row.name not in AFFECTED_BY[gains])
+
+
+@pytest.mark.parametrize('row', LIVE, ids=lambda row: row.name)
+def test_a_changed_setting_is_in_force_where_points_have_no_ids(row):
+    settings, other = settings_and_other(row, 'riccati', min_support=2)
+    before, after = split_before_observation(events_of(settings, with_ids=False), 1)
+    changed, made = Estimator(settings), Estimator(other)
+    add_all(before, changed, made)
+    changed.change_settings(other)
+    agree_to_the_end(after, changed, made)
+
+
+@rows_and_gains
+@pytest.mark.parametrize('mode', ['uncertain', 'fixed'])
+def test_a_changed_setting_is_in_force_in_a_loaded_map(row, gains, mode):
+    settings, other = settings_and_other(row, gains, localization_mode=mode)
+    points = drive(settings, 1.0, landmarks=8, seen=5).world_points
+    known = LandmarkMap(
+        np.arange(8), points, np.tile(1e-4 * np.eye(3), (8, 1, 1)), np.ones(8, int)
+    )
+    changed, made = Estimator(settings), Estimator(other)
+    for estimator in (changed, made):
+        estimator.load_map(known, np.eye(4), 1e-2 * np.eye(6))
+    changed.change_settings(other)
+    agree_to_the_end(events_of(settings), changed, made)
+
+
+@rows_and_gains
+@pytest.mark.parametrize('with_ids', [True, False])
+def test_what_an_estimator_was_made_with_does_not_matter_after_a_change(row, gains, with_ids):
+    """Nor how often it has changed: in the middle of a run, whatever has been estimated."""
+    settings, other = settings_and_other(row, gains)
+    before, after = split_before_observation(events_of(settings, with_ids), 15)
+    changed, changed_twice = Estimator(settings), Estimator(other)
+    changed_twice.change_settings(settings)
+    add_all(before, changed, changed_twice)
+    np.testing.assert_equal(bits_of(changed), bits_of(changed_twice))
+    for estimator in (changed, changed_twice):
+        estimator.change_settings(other)
+    agree_to_the_end(after, changed, changed_twice)
+
+
+def test_all_hypotheses_follow_a_change():
+    settings = Settings(two_d_mode=True, unknown_linear_motion=1.0, reorder_window=0.0)
+    estimator = Estimator(settings)
+    posts = np.array([[2.0, 1.0, 0.0], [2.0, -1.0, 0.0], [6.0, 3.0, 0.0]])
+    for step in range(10):
+        estimator.add(VelocityEvent(step * 10**8, np.zeros(6)))
+        estimator.add(ObservationEvent(step * 10**8, np.arange(2), posts[:2]))
+    after_blind_stretch_ns = 9 * 10**9
+    estimator.add(VelocityEvent(after_blind_stretch_ns, np.zeros(6)))
+    wrong = np.array([0]), posts[2:] - [4.0, 0.0, 0.0]
+    estimator.add(ObservationEvent(after_blind_stretch_ns, *wrong))
+    estimator.flush()
+    assert len(estimator._hypotheses) == 2
+    estimator.change_settings(replace(settings, huber_threshold=0.5, rejection_threshold=3.0))
+    for hypothesis in estimator._hypotheses._all:
+        state = hypothesis.state
+        for owner in (state.filter, state.relinearisation):
+            assert owner._settings.huber_threshold == 0.5
+            assert owner._settings.rejection_threshold == 3.0
+        assert state.settings.rejection_threshold == 3.0
+
+
+def test_live_settings_are_a_copy_that_follows():
+    settings = Settings(gain_k=2.0)
+    live = LiveSettings.of(settings)
+    assert vars(live) == vars(settings)
+    live.follow(replace(settings, gain_k=3.0))
+    assert (live.gain_k, settings.gain_k) == (3.0, 2.0)
