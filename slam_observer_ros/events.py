@@ -16,6 +16,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.matrices import limited
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
@@ -28,6 +29,13 @@ FIRST_AUTOMATIC_ID = 10_000_000
 
 LAST_AUTOMATIC_ID = 2**24 - 1
 """They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
+
+
+MAX_DEVIATION = 1e6
+"""Standard deviation (m, rad, m/s, rad/s) beyond which a message only says 'unknown'.
+
+The largest number there is, which drivers write for it, can't be turned without overflow.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +68,7 @@ class VelocityEvent:
         covariance = self.covariance
         if covariance is not None:
             is_linear_known = covariance[3:, 3:].any()
-            covariance = Ad @ covariance @ Ad.T
+            covariance = _turned(covariance, Ad)
             if not is_linear_known:  # what the lever arm adds to it would pass for all of it
                 covariance[3:] = covariance[:, 3:] = 0.0
         return replace(self, body_velocity=Ad @ self.body_velocity, covariance=covariance)
@@ -85,7 +93,7 @@ class AngularVelocityEvent:
         return replace(
             self,
             angular_velocity=R @ self.angular_velocity,
-            covariance=None if covariance is None else R @ covariance @ R.T,
+            covariance=None if covariance is None else _turned(covariance, R),
         )
 
 
@@ -109,7 +117,7 @@ class ObservationEvent:
         return replace(
             self,
             points=se3.transform(pose, self.points),
-            covariances=None if self.covariances is None else R @ self.covariances @ R.T,
+            covariances=None if self.covariances is None else _turned(self.covariances, R),
             velocities=None if self.velocities is None else se3.rotate(pose, self.velocities),
             sensor=se3.transform(pose, sensor),
         )
@@ -162,6 +170,13 @@ def flatten_velocities(body_velocities: FloatArray) -> FloatArray:
     """Return velocities (…, 6) in the plane z = 0."""
     flat: FloatArray = body_velocities * _PLANAR_VELOCITY
     return flat
+
+
+def _turned(covariances: FloatArray, R: FloatArray) -> FloatArray:
+    """Return R C Rᵀ of covariances (…, d, d), none of which is larger than unknown."""
+    largest = np.full(len(R), MAX_DEVIATION)
+    turned: FloatArray = R @ limited(covariances, largest) @ R.T
+    return turned
 
 
 _PLANAR_VELOCITY = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
