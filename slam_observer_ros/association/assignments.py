@@ -1,12 +1,12 @@
 """Which landmarks the points of an observation are, where the sensor gave no ids.
 
-An *assignment* takes each such point for a landmark, or for a new one. What matters about it is
-where it puts the robot: among those that agree on that, within what the sensor can tell, the most
-likely one is taken. Those that don't agree are all returned, for later observations to decide
+An *assignment* takes each such point for a landmark, or for a new one. What matters is where it
+puts the robot: of those that agree on that, within the sensor's noise, the most likely one is
+taken. Those that disagree are all returned, for later observations to decide
 (:mod:`slam_observer_ros.association.hypotheses`).
 
-A point whose id is new may be of a landmark that had none so far. Only where the state foretells
-that landmark as well as the sensor can tell: an id that is new speaks for one that is.
+A point with a new id may be of a landmark that had none so far, but only where the state predicts
+that landmark as well as the sensor measures it: a new id suggests a new landmark.
 """
 
 from __future__ import annotations
@@ -39,36 +39,21 @@ MAX_CANDIDATES = 10
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """What the points of an observation are taken for.
+    """What the points of an observation are taken for."""
 
-    Attributes
-    ----------
-    rows : IntArray
-        (m,) row of the landmark that each point is, −1 for a new one.
-    cost : float
-        −2 ln of its likelihood, up to what all assignments share.
-
-    """
-
-    rows: IntArray
-    cost: float
+    rows: IntArray  # (m,) row of the landmark that each point is, −1 for a new one
+    cost: float  # −2 ln of its likelihood, up to what all assignments share
 
 
 def find_assignments(
     state: State, index: LandmarkIndex, event: ObservationEvent, budget: float
 ) -> list[Assignment]:
-    """Return all assignments that put the robot at different places, the most likely first.
+    """Return all assignments that put the robot at different poses, the most likely first.
 
-    Parameters
-    ----------
-    state, index : State, LandmarkIndex
-        The state at the observation's instant, and the index of its landmarks.
-    event : ObservationEvent
-        The observation, of m points.
-    budget : float
-        What an assignment may cost at most.
-
+    ``state`` is that at the instant of ``event``, an observation of m points, ``index`` that of
+    its landmarks. None costs more than ``budget``.
     """
+    # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
     axes, m = state.axes, len(event.ids)
     seen = _Points(state, event)
     at, rows = _candidates(state, index, seen)
@@ -76,13 +61,15 @@ def find_assignments(
     PC, CPC = state.filter.predicted(residuals)
     r, noise = residuals.on(axes)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
+    # What it costs that a point is of no landmark, and which are of one in any case.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
     unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), gate_cost)
-    # Beyond what is searched; a point of no landmark costs the same whatever it might have been.
+    # Points outside the search; one of no landmark costs the same whatever it might have been.
     fixed_cost = m * gate_cost - float(unpaired_costs[np.unique(at)].sum())
     margin = 0.0 if certain.all() else PRUNING_COST
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
+    # Of the pairings that put the robot at one pose, the cheapest, which comes first.
     scale = np.linalg.inv(np.linalg.cholesky(seen.noise[:, : axes.point, : axes.point]))
     J = scale @ axes.output_matrix(seen.points)  # how a pose error moves the points, in σ
     assignments: list[Assignment] = []
@@ -98,37 +85,24 @@ def find_assignments(
 
 
 class _Points:
-    """The points of an observation in the reference frame, and what their ids say.
-
-    Attributes
-    ----------
-    points : FloatArray
-        (m, 3) Â y_i, metres.
-    noise : FloatArray
-        (m, 3, 3) their covariances, m².
-    known_rows : IntArray
-        (m,) rows of the landmarks whose ids they have, −1 for none.
-    is_new_id : BoolArray
-        (m,) whether a point has an id that no landmark has.
-
-    """
+    """The points of an observation in the reference frame, and what their ids say."""
 
     def __init__(self, state: State, event: ObservationEvent) -> None:
-        self.points = se3.transform(state.observer.A, event.points)
+        self.points = se3.transform(state.observer.A, event.points)  # (m, 3) Â y_i, metres
+        # (m, 3, 3) their covariances, m²
         self.noise = state.observer.turned(state.observation_noise.covariances(event))
+        # (m,) rows of the landmarks whose ids they have, −1 for none; whether an id is new
         self.known_rows = state.landmarks.rows_of(event.ids)
         self.is_new_id = (event.ids != UNKNOWN_ID) & (self.known_rows < 0)
 
 
 def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:
-    """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate.
-
-    Each passes it alone: those of one point are the :data:`MAX_CANDIDATES` nearest at most.
-    """
+    """Return pairs (q,), (q,) of a point and a landmark that ids allow and that pass the gate."""
     at, rows = _pairs_near(state, index, seen)
     allowed = _may_be(state, seen, at, rows)
     at, rows = at[allowed], rows[allowed]
     distances = state.filter.distances(_as_residuals(state.observer, seen, at, rows))
+    # Each pair passes the gate alone; a point keeps its nearest landmarks.
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
     passes = distances[order] <= state.settings.rejection_threshold

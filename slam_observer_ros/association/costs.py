@@ -28,11 +28,11 @@ SAME_CAUSE_COST = 3.0
 """What it costs to reject another point for the reason for which one was rejected already."""
 
 MAX_OF_ONE_CAUSE = 3
-"""Points that cost this, at most: one garbled message is one, however much it tells."""
+"""Points that cost this, at most: one garbled message is one, however many points it has."""
 
 
 def outlier_cost(state: State) -> float:
-    """Return what it costs that a point is of no landmark that is known."""
+    """Return what it costs that a point is of no known landmark."""
     return unpaired_cost(state.settings.rejection_threshold)
 
 
@@ -49,11 +49,12 @@ def rejection_cost(
 ) -> tuple[float, bool]:
     """Return what it costs to reject landmarks, and whether there is a new cause for it.
 
-    At first one cause is enough: the observation is garbled. The next time it is not, and each
-    landmark has moved for a cause of its own. From then on there is nothing new in it but how
-    well it is seen where it was: landmarks that have moved must not throw the pose, however often
+    The first time one cause is enough: the observation is garbled. The next time it is not, and
+    each landmark has moved for a cause of its own. From then on only how well it is seen at its
+    old position costs anything: landmarks that have moved must not throw the pose, however often
     they are seen.
     """
+    # Which were rejected before at this position, and which have a new cause.
     again, staying = cost_of_staying(state, matched)
     again &= rejected
     is_second = again & (state.landmarks.rejections[matched.residuals.rows] == 1)
@@ -70,9 +71,9 @@ def rejection_cost(
 def cost_of_staying(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
     """Return which landmarks (m,) were rejected where they are seen now, and what that costs (m,).
 
-    Where they were rejected last is known as well as the sensor tells: compared with the first
-    place, one that goes on moving would pay for one and the same shift each time. No landmark
-    costs more than another outlier.
+    The last rejected position is known as well as the sensor measures: compared with the first
+    one, a landmark that goes on moving would pay for the same shift each time. No landmark costs
+    more than another outlier.
     """
     k, known = state.axes.point, matched.known
     noise = 2.0 * state.observer.turned(state.observation_noise.covariances(known))

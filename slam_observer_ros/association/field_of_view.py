@@ -15,27 +15,16 @@ Points are noisy, and without it each exact one at the sensor's full range would
 
 
 class FieldOfView:
-    """The convex hull of the base and of all points that were ever seen, in the body frame.
+    """The convex hull, in the body frame, of the base and of all points that were ever seen.
 
-    So no sensor has to be described. If anything it takes more for seen than was looked at: one
-    wrong point behind a camera, and that sees all around. Until the hull has an inside, which it
-    never has where all points lie in one plane with the base, everything counts as in view, and
-    of the points seen the latest are kept.
-
-    Parameters
-    ----------
-    k : int
-        Leading coordinates that matter: 2 in the plane, 3 in space.
-
-    Attributes
-    ----------
-    corners : FloatArray
-        (q, k) the base and the points seen that span the hull, metres, body frame.
-
+    So no sensor has to be described. The hull is rather too large than too small: one wrong point
+    behind a camera, and it sees all around. Until it has an inside, which it never has where all
+    points lie in one plane with the base, everything counts as in view, and the latest points are
+    kept. Of points, the first ``k`` coordinates matter: 2 in the plane, 3 in space.
     """
 
     def __init__(self, k: int) -> None:
-        self.corners = np.zeros((1, k))
+        self.corners = np.zeros((1, k))  # (q, k) the base and points that span the hull, metres
         self._faces: FloatArray = np.empty((0, k + 1))
         self._margin_m = 0.0
 
@@ -45,7 +34,7 @@ class FieldOfView:
         return len(self._faces) > 0
 
     def include(self, points: FloatArray) -> None:
-        """Take in points (m, 3) that were seen, metres, body frame."""
+        """Add points (m, 3) that were seen, metres, body frame."""
         k = self.corners.shape[1]
         known = self.contains(points) & self.is_known
         if known.all():

@@ -1,10 +1,10 @@
 """Hypotheses: states that take what was seen for different things (:mod:`.interpretations`).
 
-Where two interpretations of an observation put the robot at different places, both are followed,
+Where two interpretations of an observation put the robot at different poses, both are followed,
 each with a state of its own, until later observations have made one much more likely than the
-other (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states that have the
-robot at one place but take what it sees there for different landmarks, as their maps differ. Where
-landmarks have ids or are well apart there is nearly always one.
+other (D. B. Reid, *An algorithm for tracking multiple targets*, 1979). So are states with the same
+pose that take what is seen there for different landmarks, as their maps differ. Where landmarks
+have ids or are well separated there is nearly always one.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from slam_observer_ros.state.step import disbelieve, Outcome, step
 
 @dataclass(frozen=True, slots=True)
 class _Child:
-    """A hypothesis after an observation, what it took that for, and what came of it."""
+    """A hypothesis after an observation, what it took that for, and the outcome."""
 
     hypothesis: Hypothesis
     event: ObservationEvent
@@ -49,14 +49,14 @@ class _Child:
 
 
 class Hypotheses:
-    """Hypotheses of where everything is, the most likely first; at first there is one."""
+    """Hypotheses about pose and map, the most likely first; at the start there is one."""
 
     def __init__(self, state: State) -> None:
         self._earlier_counts: Counter[str] = Counter()
         self._start(state)
 
     def reset(self, state: State) -> None:
-        """Give up all hypotheses for a new one."""
+        """Replace all hypotheses by a new one."""
         self._earlier_counts += self.best.counts
         self._start(state)
 
@@ -68,7 +68,7 @@ class Hypotheses:
 
     @property
     def counts(self) -> Counter[str]:
-        """What became of landmarks, in the most likely state and those given up by resets."""
+        """Outcomes for landmarks, in the most likely state and those given up by resets."""
         return self._earlier_counts + self.best.counts
 
     def count(self, name: str) -> int:
@@ -92,11 +92,11 @@ class Hypotheses:
     def pose_covariance_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
     ) -> FloatArray | None:
-        """Return the covariance (6, 6) of the most likely pose at ``end_ns``, which may be wrong.
+        """Return the covariance (6, 6) of the most likely pose at ``end_ns``; None if unknown.
 
-        Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the hypotheses, moved on from
-        ``start_ns``, and d_i how far their poses are then from that of the first. Coordinates are
-        those of :meth:`.State.pose_after`. None if unknown.
+        It is Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the hypotheses, moved on from
+        ``start_ns``, and d_i how far their poses are from that of the first, which may be wrong.
+        Coordinates are those of :meth:`.State.pose_after`.
         """
         pose, own = self.best.pose_after(velocities, start_ns, end_ns)
         likelihoods = np.exp(-0.5 * np.array([hypothesis.cost for hypothesis in self._all]))
@@ -130,7 +130,8 @@ class Hypotheses:
         return bool(rows[0][0] >= 0)
 
     def observe(self, event: ObservationEvent) -> Outcome:
-        """Use an observation made at their instant; return what comes of it for the best one."""
+        """Use an observation made at their instant; return its outcome for the best one."""
+        # Nearly always there is one hypothesis, and one meaning: the step, and no more.
         is_unknown = event.ids == UNKNOWN_ID
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
         matches = [match(hypothesis.state, event) for hypothesis in self._all]
@@ -138,20 +139,19 @@ class Hypotheses:
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
             if is_clear and not may_relabel(self.best, matches[0]):
                 return step(self.best, matches[0])
-        children = self._children(event, self._possible(event, matches))
+        # All hypotheses with all meanings; costs are over that of the most likely one.
+        children = self._follow(event, self._interpret(event, matches))
         least_cost = children[0].hypothesis.cost
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
         return children[0].outcome
 
-    def _children(
+    def _follow(
         self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
     ) -> list[_Child]:
-        """Let hypotheses use an observation as what it may be; return what they become.
-
-        The most likely comes first. Of those that become one, the first stands for all.
-        """
+        """Let hypotheses use an observation as interpreted; return them, the cheapest first."""
+        # A state is copied for each use of it but the last.
         uses = Counter(number for number, taken in possible if taken.slipped is None)
         children: list[_Child] = []
         for number, taken in possible:
@@ -162,6 +162,7 @@ class Hypotheses:
                 uses[number] -= 1
                 if uses[number]:
                     hypothesis = deepcopy(hypothesis)
+            # Of hypotheses that become one, the first stands for all.
             child = self._child(hypothesis, taken, event)
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
@@ -184,17 +185,17 @@ class Hypotheses:
         state.counts['rejected_landmark'] += len(event.ids) - len(taken.event.ids)
         return _Child(hypothesis, taken.event, outcome)
 
-    def _possible(
+    def _interpret(
         self, event: ObservationEvent, matches: list[MatchedObservation]
     ) -> list[tuple[int, Interpretation]]:
-        """Return what each hypothesis may take an observation for, by its number.
+        """Return the interpretations by each hypothesis, by its number, the cheapest first.
 
-        The cheapest comes first; the cost is that of the hypothesis as well. A point has the same
-        id in all of them that take it for a new landmark.
+        The cost is that of the hypothesis as well. A point has the same id in all of them that
+        take it for a new landmark.
         """
         new_ids = self._new_ids(len(event.ids))
         possible: list[tuple[int, Interpretation]] = []
-        worst = math.inf
+        worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             for taken in interpretations(state, index, event, matched, new_ids, worst - cost):
@@ -225,13 +226,14 @@ def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
 def are_one(
     state: State, event: ObservationEvent, other: State, other_event: ObservationEvent
 ) -> bool:
-    """Return whether two hypotheses, by the points seen, are at one place with one map there.
+    """Return whether two hypotheses, by the points seen, have one pose and one map there.
 
-    That is so if they have the points, and each landmark that either takes one of them for, at
-    the same places: which was which this once does not matter then.
+    They have if the points, and each landmark that either takes one of them for, have the same
+    positions: which was which in this observation does not matter then.
     """
-    if not np.array_equal(event.points, other_event.points):  # one leaves some out
+    if not np.array_equal(event.points, other_event.points):  # one takes some for outliers
         return False
+    # How far the points seen are from each other, and the landmarks they are taken for.
     here, there = state.observer.pose, other.observer.pose
     noise = here[:3, :3] @ state.observation_noise.covariances(event) @ here[:3, :3].T
     shifts = [se3.transform(here, event.points) - se3.transform(there, event.points)]

@@ -1,4 +1,4 @@
-"""One of several ideas of where everything is."""
+"""One of several hypotheses about pose and map."""
 
 from __future__ import annotations
 
@@ -12,25 +12,12 @@ from slam_observer_ros.state.state import State
 
 @dataclass(slots=True, eq=False)
 class Hypothesis:
-    """A state, and what only points without an id need of it.
-
-    Attributes
-    ----------
-    state : State
-        Pose and map.
-    visibility : Visibility
-        What is in view of a sensor that gives no ids.
-    index : LandmarkIndex
-        For landmarks near a point.
-    cost : float
-        −2 ln of its likelihood, over that of the most likely one.
-
-    """
+    """A state, and what only points without an id need of it."""
 
     state: State
-    visibility: Visibility
+    visibility: Visibility  # what is in view of a sensor that gives no ids
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
-    cost: float = 0.0
+    cost: float = 0.0  # −2 ln of its likelihood, over that of the most likely one
 
     @classmethod
     def of(cls, state: State) -> Hypothesis:
@@ -38,5 +25,5 @@ class Hypothesis:
         return cls(state, Visibility(state.axes.point))
 
     def with_state(self, state: State) -> Hypothesis:
-        """Return another hypothesis, which has had the same in view."""
+        """Return another hypothesis, which has had the same landmarks in view."""
         return Hypothesis(state, deepcopy(self.visibility), deepcopy(self.index), self.cost)

@@ -3,11 +3,11 @@
 After a long blind stretch the gate is wide, and a wrong id passes it. Taken for the landmark that
 it names, such a point would close a loop where there is none and throw the pose. So there are two
 interpretations, that it is what its id says and that it is an outlier, and later observations
-decide. It may also be the landmark that is wrong, if it was placed by such a point itself.
+decide. It may also be the landmark that is wrong, if such a point has put it there.
 
-So there are of an observation most of which the gate rejects. It may be garbled, or of landmarks
-that have moved; or the robot is not where odometry has it, since its wheels slipped or someone
-carried it, and would be lost if it went on without what it sees.
+The same holds for an observation most of which the gate rejects. It may be garbled, or of
+landmarks that have moved; or the robot is not where odometry has it, since its wheels slipped or
+someone carried it, and would be lost if it went on without what it sees.
 """
 
 from __future__ import annotations
@@ -42,28 +42,15 @@ def _none() -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Interpretation:
-    """What an observation is taken for.
+    """What an observation is taken for."""
 
-    Attributes
-    ----------
-    event : ObservationEvent
-        The observation with all ids filled in, without points that are taken for outliers.
-    cost : float
-        −2 ln of its likelihood, up to what all interpretations of the observation share.
-    slipped : State or None
-        The state if the robot may have moved in any way since the last observation.
-    disbelieved : ObservationEvent or None
-        Of the points that were left out though the gate lets them pass, those of landmarks that
-        were seen so seldom that these may be the outliers; None or empty if there are none.
-    relabelled_rows, relabelled_ids : IntArray
-        (j,) landmarks that had no id of their own so far, and the ids that they have now.
-
-    """
-
-    event: ObservationEvent
-    cost: float
-    slipped: State | None = None
+    event: ObservationEvent  # with all ids filled in, without points taken for outliers
+    cost: float  # −2 ln of its likelihood, up to what all interpretations share
+    slipped: State | None = None  # where the robot may have moved in any way since the last one
+    # Points left out though the gate lets them pass, of landmarks that were seen so seldom that
+    # these may be the outliers.
     disbelieved: ObservationEvent | None = None
+    # (j,) landmarks that had no id of their own so far, and the ids that they have now.
     relabelled_rows: IntArray = field(default_factory=_none)
     relabelled_ids: IntArray = field(default_factory=_none)
 
@@ -78,24 +65,14 @@ def interpretations(
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
-    As it came and at no cost, where there is no joint covariance to judge it by.
-
-    Parameters
-    ----------
-    state, index : State, LandmarkIndex
-        That of the observation's instant, and the index of its landmarks.
-    event : ObservationEvent
-        The observation, of m points.
-    matched : MatchedObservation
-        The same, with the landmarks that it is of by its ids.
-    new_ids : IntArray
-        (m,) ids of points that are taken for landmarks not seen before.
-    budget : float
-        Cost beyond which interpretations need not be returned.
-
+    It is taken as it came, at no cost, where there is no joint covariance to judge it by.
+    ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
+    with the landmarks that its ids name. Points taken for landmarks not seen before get
+    ``new_ids`` (m,). Interpretations that cost more than ``budget`` need not be returned.
     """
     if not state.filter.has_joint_covariance:
         return [Interpretation(event, 0.0)]
+    # Which known landmarks are rejected, and which only pass as the state is uncertain.
     residuals, m = matched.residuals, len(event.ids)
     some_are_unknown = bool((event.ids == UNKNOWN_ID).any())
     rejected = _are_rejected(state, residuals)
@@ -103,8 +80,10 @@ def interpretations(
     sensor_distances = _sensor_distances(state, residuals)
     is_suspect = _suspects(state, residuals, sensor_distances)
     suspects = state.landmarks.ids[residuals.rows[is_suspect]]
+    # Points that may be of several landmarks.
     if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
         return _by_assignments(state, index, event, new_ids, suspects, budget)
+    # All ids are right, or those of one or all suspects are wrong, or the robot slipped.
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
     else:
@@ -120,14 +99,13 @@ def _without(
     matched: MatchedObservation,
     trusting: Interpretation,
 ) -> Interpretation:
-    """Return what it is if points with some ids are outliers: no cheaper than trusting them.
-
-    But for what is seen once more at one place, in place of a landmark that was seen so seldom
-    that it may itself be the outlier.
-    """
+    """Return the interpretation that points with some ids are outliers."""
     event, residuals = trusting.event, matched.residuals
+    # It is no cheaper than trusting them …
     out = np.isin(state.landmarks.ids[residuals.rows], ids)
     cost = max(trusting.cost, pairing_cost(state, len(event.ids), residuals.select(~out)))
+    # … but for what is seen once more at one position, where the landmark was seen so seldom that
+    # it may itself be the outlier.
     unconfirmed = out & (state.landmarks.counts[residuals.rows] < state.settings.confirmations)
     again, staying = cost_of_staying(state, matched)
     saved = float(np.sum(outlier_cost(state) - staying[again & unconfirmed]))
@@ -167,19 +145,19 @@ def _rejected_or_slipped(
 ) -> list[Interpretation]:
     """Interpret an observation most of whose known landmarks are rejected.
 
-    If a single motion would have put all where they are seen, that is as unlikely of a garbled
-    message as of a robot that has made this motion.
+    If a single motion explains all that is seen, this is as unlikely of a garbled message as of a
+    robot that has made this motion.
     """
     residuals, m = matched.residuals, len(event.ids)
-    cost, is_news = rejection_cost(state, matched, rejected)
-    as_told = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
-    after_slip = _after_slip(state, matched, event) if is_news else None
+    cost, is_new_cause = rejection_cost(state, matched, rejected)
+    accepted_cost = pairing_cost(state, m - int(np.sum(rejected)), residuals.select(~rejected))
+    after_slip = _after_slip(state, matched, event) if is_new_cause else None
     if after_slip is None:
-        return [Interpretation(event, as_told + cost)]
+        return [Interpretation(event, accepted_cost + cost)]
     if state.was_contradicted:
-        return [Interpretation(event, as_told + cost), after_slip]
-    as_outliers = as_told + float(np.sum(rejected)) * outlier_cost(state)
-    # A garbled message explains what happens to be where it should be, too.
+        return [Interpretation(event, accepted_cost + cost), after_slip]
+    as_outliers = accepted_cost + float(np.sum(rejected)) * outlier_cost(state)
+    # A garbled message also explains points that happen to be where they should be.
     garbled = max(cost, min(after_slip.cost - SLIP_COST, as_outliers))
     return [Interpretation(event, garbled), after_slip]
 
@@ -201,7 +179,7 @@ def _after_slip(
 
 
 def _sensor_distances(state: State, residuals: Residuals) -> FloatArray:
-    """Return how far off points are by the sensor's noise alone (m,): this is quickly told."""
+    """Return how far off points (m,) are by the sensor's noise alone, quick to compute."""
     return mahalanobis(*residuals.on(state.axes))
 
 
@@ -211,10 +189,7 @@ def _are_rejected(state: State, residuals: Residuals) -> BoolArray:
 
 
 def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) -> BoolArray:
-    """Return which points (m,) only pass the gate since the state is so uncertain.
-
-    ``sensor_distances`` (m,) are their :func:`_sensor_distances`.
-    """
+    """Return which points (m,) only pass the gate as the state is so uncertain."""
     far = are_far(sensor_distances, state.settings)
     if far.any():
         r, noise = residuals.on(state.axes)
@@ -230,11 +205,9 @@ def _by_assignments(
     suspects: IntArray,
     budget: float,
 ) -> list[Interpretation]:
-    """Interpret points that may be of landmarks without an id.
-
-    An id is believed here, too, until something contradicts it: an interpretation without a
-    suspect costs no less than one with all of them.
-    """
+    """Interpret points that may be of landmarks without an id."""
+    # An id is believed until something contradicts it: an interpretation without a suspect costs
+    # no less than one with all of them.
     found = find_assignments(state, index, event, budget)
     outliers = [np.isin(event.ids, suspects) & (assignment.rows < 0) for assignment in found]
     pairs = list(zip(found, outliers, strict=True))

@@ -2,15 +2,17 @@
 
 After Neira and Tardós, *Data association in stochastic mapping using the joint compatibility
 test*, 2001. All points of an observation share the error of the pose, so pairs that each pass a
-gate alone may contradict each other, and a pair that is sure tells which of the others are right.
+gate alone may contradict each other, and a certain pair shows which of the others are right.
 A pairing takes each point for one landmark, or for none that is known. It costs
 
     Σ over its pairs  h(d) + ln(|S| / |R|)    and    h(gate) for each point without a landmark,
 
-where a pair's d is the Mahalanobis distance of its residual as the pairs before it foretell it,
-S its covariance and R the sensor's: the less the state foretells where a landmark is seen, the
-less it says that something is seen there. h is Huber's loss: where wheels slip a true pair may be
-at 6 σ, and by d² it would outweigh much that speaks for it.
+where d is the Mahalanobis distance of a pair's residual as the pairs before it predict it, S its
+covariance and R the sensor's: the less certain the prediction of a landmark, the less it says that
+something is seen there. h is Huber's loss: where wheels slip a true pair may be at 6 σ, and by d²
+it would outweigh much that speaks for it.
+
+Here q pairs have points and landmarks (q,), residuals (q, k) in metres and covariances in m².
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, transpose
 
 MAX_PARTIAL = 16
-"""Pairings of the points so far, the cheapest, that are gone on with at the next point.
+"""Pairings of the points so far, the cheapest, that are extended by the next point.
 
 A search in depth would spend its time below the first pair, and never see that it is wrong.
 """
@@ -35,7 +37,7 @@ PRUNING_COST = 35.0
 """How much more than the cheapest something may cost: at odds of e^17.5 it is given up."""
 
 RESOLUTION = 2.0
-"""Two places are one if the sensor can't tell them apart by this many standard deviations."""
+"""Standard deviations of the sensor within which two poses can't be distinguished."""
 
 HEAVY_TAIL = 2.0
 """Standard deviations from which on the cost of a pair grows in proportion to its distance."""
@@ -43,73 +45,34 @@ HEAVY_TAIL = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Pairs of a point and a landmark that may be one.
-
-    Attributes
-    ----------
-    points, landmarks : IntArray
-        (q,) what may be what.
-    residuals : FloatArray
-        (q, k) residual of each, metres.
-    covariances : FloatArray
-        (q k, q k) joint covariance S of the residuals, m².
-    noise : FloatArray
-        (q, k, k) what of it is the sensor's noise R, m².
-
-    """
+    """Pairs of a point and a landmark that may be one."""
 
     points: IntArray
     landmarks: IntArray
     residuals: FloatArray
-    covariances: FloatArray
-    noise: FloatArray
+    covariances: FloatArray  # (q k, q k) joint covariance S of the residuals
+    noise: FloatArray  # (q, k, k) the part R of it that is the sensor's noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairing:
-    """Some of the pairs, none with a point or landmark of another.
+    """Some of the pairs, none with a point or landmark of another."""
 
-    Attributes
-    ----------
-    cost : float
-        What it costs; see the module's text.
-    chosen : list of int
-        Which q pairs.
-    L : FloatArray
-        (q k, q k) inverse Cholesky factor of their S, 1/m.
-    z : FloatArray
-        (q k,) L r, their residuals in standard deviations.
-
-    """
-
-    cost: float
-    chosen: list[int]
-    L: FloatArray
-    z: FloatArray
+    cost: float  # see the module's docstring
+    chosen: list[int]  # the q pairs
+    L: FloatArray  # (q k, q k) inverse Cholesky factor of their S, 1/m
+    z: FloatArray  # (q k,) L r, their residuals in standard deviations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Extensions:
-    """Pairings of one size, each with any of the o pairs of one more point, and without any.
+    """Pairings of one size, each with any of the o pairs of one more point, and without any."""
 
-    Attributes
-    ----------
-    pairings : list of Pairing
-        The b pairings.
-    options : IntArray
-        (o,) the pairs.
-    costs : FloatArray
-        (b, o + 1) what it costs then, the last without any; infinite where it can't be.
-    rows, tails : FloatArray
-        (b, o, k, q k + k) and (b, o, k) what is appended to L and z.
-
-    """
-
-    pairings: list[Pairing]
-    options: IntArray
-    costs: FloatArray
-    rows: FloatArray
-    tails: FloatArray
+    pairings: list[Pairing]  # b of them
+    options: IntArray  # (o,) the pairs
+    costs: FloatArray  # (b, o + 1) the cost then, last without any; infinite where it can't be
+    rows: FloatArray  # (b, o, k, q k + k) what is appended to L
+    tails: FloatArray  # (b, o, k) what is appended to z
 
     def extended(self, i: int, j: int) -> Pairing:
         """Return pairing i with pair j, or without any."""
@@ -126,17 +89,9 @@ class _Extensions:
 class JointSearch:
     """The pairings that cost little more than the cheapest.
 
-    Parameters
-    ----------
-    pairs : Pairs
-        The pairs to choose from.
-    certain : BoolArray
-        (q,) pairs whose point is of a known landmark in any case, if not of this then of another.
-    unpaired_costs : FloatArray
-        (q,) what the pair's point costs if it is of no known landmark.
-    margin, budget : float
-        How much more than the cheapest a pairing may cost, and how much at all.
-
+    ``certain`` (q,) are the pairs whose point is of some known landmark in any case, and
+    ``unpaired_costs`` (q,) what the pair's point costs if it is of none. A pairing may cost
+    ``margin`` more than the cheapest, and ``budget`` in all.
     """
 
     def __init__(
@@ -158,9 +113,10 @@ class JointSearch:
         self._noise_log_dets = np.linalg.slogdet(pairs.noise)[1]
 
     def pairings(self) -> list[Pairing]:
-        """Return the pairings, the cheapest first; what no pair belongs to is left out of it."""
+        """Return the pairings, the cheapest first; points without a landmark are in no pair."""
         partial = [Pairing(0.0, [], np.empty((0, 0)), np.empty(0))]
-        for options in self._options:
+        for options in self._options:  # the pairs of one more point
+            # Pairings of one size are extended together.
             sizes = dict.fromkeys(len(pairing.chosen) for pairing in partial)
             groups = [
                 [pairing for pairing in partial if len(pairing.chosen) == size] for size in sizes
@@ -169,21 +125,20 @@ class JointSearch:
         return partial
 
     def _cheapest(self, extensions: list[_Extensions]) -> list[Pairing]:
-        """Return the cheapest pairings, if they don't cost too much.
-
-        No point makes a pairing cheaper, so one that costs too much can be given up at once.
-        """
+        """Return the cheapest pairings within margin and budget."""
         if not extensions:
             return []
+        # No point makes a pairing cheaper, so one that costs too much can be given up at once.
         costs = np.concatenate([extension.costs.ravel() for extension in extensions])
         order = np.argsort(costs, kind='stable')[:MAX_PARTIAL]
         worst = min(self._budget, costs[order[0]] + self._margin)
         kept = order[np.isfinite(costs[order]) & (costs[order] <= worst)]
+        # Back from positions in all costs to a group, its pairing i and option j.
         starts = list(accumulate((extension.costs.size for extension in extensions), initial=0))
         pairings = []
-        for place in kept.tolist():
-            group = bisect_right(starts, place) - 1
-            i, j = divmod(place - starts[group], extensions[group].costs.shape[1])
+        for position in kept.tolist():
+            group = bisect_right(starts, position) - 1
+            i, j = divmod(position - starts[group], extensions[group].costs.shape[1])
             pairings.append(extensions[group].extended(i, j))
         return pairings
 
@@ -192,6 +147,7 @@ class JointSearch:
         S, r, k = self._pairs.covariances, self._pairs.residuals, self._pairs.residuals.shape[1]
         L = np.array([pairing.L for pairing in pairings])
         z = np.array([pairing.z for pairing in pairings])
+        # The next rows of the inverse Cholesky factor, and the residuals they predict.
         columns = np.array([columns_of(pairing.chosen, k) for pairing in pairings])
         own = k * options[:, None] + np.arange(k)
         W = L[:, None] @ S[columns[:, None, :, None], own[:, None, :]]  # (b, o, q k, k)
@@ -199,6 +155,7 @@ class JointSearch:
         corners = np.linalg.inv(np.linalg.cholesky(left))
         ahead = r[options] - (z[:, None, None] @ W)[:, :, 0]
         tails = (corners @ ahead[..., None])[..., 0]
+        # By how much the cost rises with each option, and without any.
         log_dets = np.log(np.diagonal(corners, axis1=2, axis2=3)).sum(axis=2)
         rises = huber_loss(np.sqrt((tails * tails).sum(axis=2))) - 2.0 * log_dets
         rises[self._are_taken(pairings, options)] = np.inf
@@ -218,10 +175,10 @@ class JointSearch:
 
 
 def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
-    """Return what a pairing costs, of residuals r (m, k) with S (m k, m k) and R (m, k, k).
+    """Return the cost of a pairing, of residuals r (m, k) with S (m k, m k) and R (m, k, k).
 
-    The pairs are taken in the order of their distances, so that one which is wrong is judged by
-    the others, and not they by it.
+    Pairs are taken in the order of their distances, so that a wrong one is judged by the others,
+    and not they by it.
     """
     order = np.argsort(mahalanobis(r, diagonal_blocks(S, r.shape[1])), kind='stable')
     columns = columns_of(order.tolist(), r.shape[1])
@@ -232,7 +189,7 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
 
 
 def unpaired_cost(gate: float) -> float:
-    """Return what a point costs of no known landmark, as likely as a pair at ``gate`` σ is."""
+    """Return the cost of a point of no known landmark: as likely as a pair at ``gate`` σ."""
     return float(huber_loss(gate))
 
 

@@ -1,4 +1,4 @@
-"""Which landmarks lie near a point, without a look at the whole map for each."""
+"""Which landmarks lie near a point, without searching the whole map for each."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from slam_observer_ros.common.types import FloatArray, IntArray
 
 MAX_LOOSE = 256
-"""Landmarks newer than the tree that are looked at one by one before it is built anew."""
+"""Landmarks newer than the tree that are searched one by one before it is built again."""
 
 
 class LandmarkIndex:
@@ -27,17 +27,8 @@ class LandmarkIndex:
     ) -> tuple[IntArray, IntArray]:
         """Return pairs (q,), (q,) of a point and a landmark, by point.
 
-        All pairs closer than the point's radius are among them, and some that aren't.
-
-        Parameters
-        ----------
-        landmarks : FloatArray
-            (n, 3) landmarks as they are now, metres.
-        points : FloatArray
-            (m, 3) where to look, metres, same frame.
-        radii_m : FloatArray
-            (m,) how far, metres.
-
+        All pairs closer than the point's radius (m,) are among them, and some that aren't.
+        Landmarks (n, 3), as they are now, and points (m, 3) are in one frame, metres.
         """
         shift_m = self._refresh(landmarks, np.min(radii_m, initial=np.inf))
         near = self._tree.query_ball_point(points, radii_m + shift_m, return_sorted=True)
@@ -47,7 +38,7 @@ class LandmarkIndex:
         return i, np.concatenate([np.empty(0, dtype=np.int64), *rows])
 
     def _refresh(self, landmarks: FloatArray, tolerance_m: float) -> float:
-        """Build the tree anew if it is too old; return the largest shift since it was built."""
+        """Build the tree again if it is too old; return the largest shift since it was built."""
         shift_m = self._shift_m(landmarks)
         if shift_m <= tolerance_m:
             return shift_m

@@ -17,7 +17,7 @@ from slam_observer_ros.state.matching import MatchedObservation
 from slam_observer_ros.state.state import State
 
 MAX_DURATION_S = 4.0
-"""Time, seconds, for which odometry is taken to have told nothing, at most."""
+"""Time, seconds, for which odometry is taken to have been wrong, at most."""
 
 LARGE_TURN_RAD = 0.3
 """Turn, radians, that a correction, which is linear in it, does not find well."""
@@ -30,16 +30,18 @@ MIN_VARIANCE = 1e-6
 
 
 def slip(state: State, matched: MatchedObservation) -> float:
-    """Let the robot have slipped in a way that explains what it sees.
+    """Let the robot have slipped so that it sees what it does; return the cost of that motion.
 
-    It is then known as badly as if odometry had told nothing for as long as that takes, and what
-    it sees is yet to be used. Return what it costs that it went where it was put.
+    Its pose is then known as badly as if there had been no odometry for as long as that takes, and
+    the observation is yet to be used.
     """
+    # The noise of a motion without odometry, for as long as it takes.
     observer, start = state.observer, state.observer.A
     needed_s = min(_duration_s(state, matched), MAX_DURATION_S)
     stray = HeldVelocities.unknown(np.array([0.0, needed_s]))
     noise = state.motion_noise.covariances(stray)
     variances = np.maximum(np.diagonal(noise[1])[state.axes.pose], MIN_VARIANCE)
+    # That motion, to where the landmarks put the robot.
     after = _pose_after(state, matched, variances)
     motion = Motion(
         path=np.array([start, after, after]),
@@ -67,10 +69,8 @@ def _duration_s(state: State, matched: MatchedObservation) -> float:
 
 
 def _pose_after(state: State, matched: MatchedObservation, variances: FloatArray) -> FloatArray:
-    """Return the likeliest Â (4, 4) after a motion of ``variances`` (p,), if it is far from here.
-
-    If it is not, the correction that follows, which is linear, finds it as well.
-    """
+    """Return the likeliest Â (4, 4) after a motion of ``variances`` (p,), if it is far off."""
+    # If it is not far, the correction that follows, which is linear, finds it as well.
     A, found = state.observer.A, _likeliest_pose(state, matched, variances)
     turn_rad = np.linalg.norm(so3.log(found[:3, :3] @ A[:3, :3].T))
     shift_m = np.linalg.norm(found[:3, 3] - A[:3, 3])
@@ -85,11 +85,13 @@ def _likeliest_pose(
     A, axes = state.observer.A, state.axes
     landmarks = state.observer.points[matched.residuals.rows]
     points = matched.known.points
+    # First aligned by the landmarks alone, if they suffice.
     W = np.linalg.inv(matched.covariances[matched.rows >= 0][:, : axes.point, : axes.point])
     found = A
     if len(points) >= axes.point:
         weights = np.trace(W, axis1=1, axis2=2)
         found = rigid_alignment(se3.transform(A, points), landmarks, weights) @ A
+    # Then by landmarks and motion together.
     for _ in range(ITERATIONS):
         expected = se3.transform(se3.inverse(found), landmarks)
         C = axes.output_matrix(expected)

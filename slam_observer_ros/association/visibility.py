@@ -25,18 +25,11 @@ MAX_EVIDENCE = 2.0
 
 
 class Visibility:
-    """What a sensor that gives no ids sees of the landmarks around it.
-
-    Parameters
-    ----------
-    k : int
-        Leading coordinates that matter: 2 in the plane, 3 in space.
-
-    """
+    """What a sensor without ids sees of the landmarks around it, in ``k`` = 2 or 3 dimensions."""
 
     def __init__(self, k: int) -> None:
         self._field_of_view = FieldOfView(k)
-        # −ln of the probability that none is seen for so long of the landmarks known before: those
+        # −ln of the probability that for so long none is seen of the landmarks known before: those
         # without an id that were numbered up to here.
         self._evidence = 0.0
         self._newest_number = 0
@@ -44,25 +37,26 @@ class Visibility:
     def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
         """Count which landmarks were in view of an observation, already used, and which were seen.
 
-        Some of its points came without an id. If others come with one (``some_have_ids``), these
-        show better where the robot is. Else, if points were seen for so long, and of the landmarks
-        that should have been among them not one, that it is no chance any more, the position is
-        counted as unexpected. Landmarks that were seen too seldom while they were in view are
-        forgotten; out of view none is: it may be the only tie to what was mapped before.
-
-        Return −2 ln of the probability that confirmed landmarks in view were not seen, those that
-        were not.
+        Some of its points came without an id. Unless others have one (``some_have_ids``), which
+        show better where the robot is, the pose is counted as unexpected if for so long none of
+        the landmarks in view was seen that it is no chance any more. Landmarks that were seen too
+        seldom while in view are forgotten; those out of view never: one may be the only tie to
+        what was mapped before. Return −2 ln of the probability that confirmed landmarks in view
+        were missed.
         """
+        # What should have been seen, and was.
         landmarks = state.landmarks
         is_numbered, everything = is_automatic(landmarks.ids), np.arange(len(landmarks))
         seen = landmarks.last_seen_ns == event.stamp_ns
         in_view = seen | self._field_of_view.contains(state.observer.body_points(everything))
         if not some_have_ids and self._add_evidence(landmarks, event, in_view, seen):
             state.counts['unexpected_place'] += 1
+        # Those without an id of their own: what it costs to have missed them, and their counts.
         rows = np.flatnonzero(is_numbered & in_view)
         cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
         landmarks.note_in_view(rows, seen[rows])
         self._field_of_view.include(event.points)
+        # Those that were seen too seldom.
         unsupported = landmarks.unsupported(state.settings.min_support)
         state.forget(unsupported, 'unsupported_landmark')
         return cost
@@ -70,10 +64,9 @@ class Visibility:
     def _cost(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
         """Return what it costs that confirmed landmarks (u,) in view were not seen once more.
 
-        The rate at which one in view is seen differs from one to the other and from one position
-        to another. Where it is exponentially distributed about its mean p, one is not seen k
-        times in a row with the probability 1/(1 + k p): one that is hidden soon costs little
-        more.
+        The rate at which one in view is seen differs between landmarks and poses. Where it is
+        exponentially distributed about its mean p, one is missed k times in a row with the
+        probability 1/(1 + k p): one that is hidden soon costs little more.
         """
         if not self._field_of_view.is_known:
             return 0.0
@@ -87,7 +80,7 @@ class Visibility:
         in_view: BoolArray,
         seen: BoolArray,
     ) -> bool:
-        """Count those in view and not seen (n,); return whether they are too many, too long."""
+        """Count those (n,) in view and not seen; return whether they are too many, too long."""
         numbers = np.where(is_automatic(landmarks.ids), landmarks.ids, 0)
         old = in_view & ~landmarks.tentative & (numbers <= self._newest_number)
         if (old & seen).any():

@@ -1,4 +1,4 @@
-"""Refuses events, points and poses that can't be used, before they touch the state."""
+"""Refuses events, points and poses that can't be used, before they reach the state."""
 
 from __future__ import annotations
 
@@ -60,13 +60,9 @@ def check_event(event: Event) -> None:
 
 
 def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
-    """Check that ``pose`` is a rigid motion (4, 4), and its ``covariance`` (6, 6) is one.
+    """Check that ``pose`` (4, 4) is a rigid motion, and ``covariance`` (6, 6) a covariance.
 
-    Raises
-    ------
-    ParameterError
-        If one of them is not.
-
+    Raise :exc:`ParameterError` if one of them is not.
     """
     try:
         _check_array('pose', pose, (4, 4))
@@ -84,15 +80,11 @@ def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
 def check_map(landmark_map: LandmarkMap) -> None:
     """Check a map's shapes and values.
 
-    Raises
-    ------
-    MapError
-        If an array does not fit, a value can't be right, or an id is there twice.
-
+    Raise :exc:`MapError` if an array does not fit, a value can't be right, or an id is repeated.
     """
     if not isinstance(landmark_map, LandmarkMap):
         kind = type(landmark_map).__name__
-        raise MapError(f'a {kind} is no LandmarkMap; maps.map_file.read_map makes one of a file')
+        raise MapError(f'a {kind} is no LandmarkMap; known_map.map_file.read_map reads one')
     try:
         ids, n = landmark_map.ids, len(landmark_map.ids)
         _check_array('map ids', ids, (n,))
@@ -156,7 +148,7 @@ def _check_observation(event: ObservationEvent) -> None:
 
 def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
     if type(array) is np.ndarray and array.shape == shape and array.dtype == np.float64:
-        # Nothing wrong passes this one product, and it costs a fifth of looking at each entry.
+        # Nothing wrong passes this one product, at a fifth of the cost of checking each entry.
         entries = array.ravel()
         if entries.dot(entries) <= MAX_MEASURED**2:
             return

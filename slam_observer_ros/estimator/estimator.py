@@ -17,12 +17,7 @@ from slam_observer_ros.estimator.checks import check_event, check_map, check_pos
 from slam_observer_ros.estimator.event_queue import EventQueue
 from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
-from slam_observer_ros.events import (
-    AngularVelocityEvent,
-    Event,
-    ObservationEvent,
-    VelocityEvent,
-)
+from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -47,40 +42,15 @@ class Estimator:
     The state advances only at event stamps, in stamp order, so its bits don't depend on when
     anybody asks for them: a live run and a replay of what it received agree exactly.
 
-    Parameters
-    ----------
-    settings : Settings
-        All settings.
-    initial_pose : FloatArray, optional
-        (4, 4) pose at the first event, body to world; also the reference P°. Default: that of
-        the settings, or identity.
-    on_update : callable, optional
-        Called with an :class:`Update` after each observation that was used.
-    on_stamp : callable, optional
-        Called when all events of a stamp have been used: before the first one of a later stamp
-        or after a jump of the clock that holds the pose, and by :meth:`flush`.
-    on_motion : callable, optional
-        Called with the velocities and two stamps, nanoseconds, before the state is moved on along
-        them from one to the other.
-    on_jump : callable, optional
-        Called when the clock has jumped, and the estimate goes on as ``on_time_jump`` says.
+    ``initial_pose`` (4, 4), body to world, is that at the first event, and the reference P°; by
+    default that of the settings, or identity. :exc:`ParameterError` is raised if it is no rigid
+    motion, or if one of the ``settings`` does not fit its table.
 
-    Attributes
-    ----------
-    settings : Settings
-        The settings in force.
-    dropped : Counter
-        Events refused, by reason.
-    jumps : int
-        How often the clock has jumped.
-    last_update : Update or None
-        The latest update; None before the first observation.
-
-    Raises
-    ------
-    ParameterError
-        If a setting does not fit its table, or the pose is none.
-
+    ``on_update`` is called with an :class:`Update` after each observation that was used;
+    ``on_stamp`` when all events of a stamp have been used: before the first one of a later stamp
+    or after a jump of the clock that holds the pose, and by :meth:`flush`; ``on_motion`` with
+    velocities and two stamps, nanoseconds, before the state is moved on between these; and
+    ``on_jump`` when the estimate has gone on after a jump of the clock.
     """
 
     def __init__(
@@ -92,17 +62,17 @@ class Estimator:
         on_motion: OnMotion | None = None,
         on_jump: Callable[[], None] | None = None,
     ) -> None:
-        self.settings = settings = checked(settings)
+        self.settings = settings = checked(settings)  # those in force
         self._live = LiveSettings.of(settings)
         self._counts: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()
-        self.jumps = 0
+        self.dropped: Counter[str] = Counter()  # events refused, by reason
+        self.jumps = 0  # how often the clock has jumped
         self._warnings = EventWarnings()
-        self.last_update: Update | None = None
+        self.last_update: Update | None = None  # None before the first observation
         self._on_update, self._on_stamp = on_update, on_stamp
         self._on_motion, self._on_jump = on_motion, on_jump
         self._start_pose: FloatArray | None = None
-        self._is_placed = False  # by somebody: the settings don't say any more where it is
+        self._was_placed = False  # by somebody, so the pose of the settings is not its start
         self._hypotheses = Hypotheses(self._state_at(np.eye(4)))
         self._localiser = Localiser()
         self.reset(initial_pose)
@@ -111,22 +81,13 @@ class Estimator:
     def reset(self, pose: FloatArray | None = None) -> None:
         """Forget the motion, what was mapped and events held back, and start again.
 
-        Parameters
-        ----------
-        pose : FloatArray, optional
-            (4, 4) body to world. By default the one of the settings, if there is one; otherwise
-            identity, or unknown in a map that was loaded.
-
-        Raises
-        ------
-        ParameterError
-            If the pose is no rigid motion.
-
+        At ``pose`` (4, 4), body to world; by default at that of the settings, or else at identity,
+        in a loaded map anywhere. Raise :exc:`ParameterError` if it is no rigid motion.
         """
         if pose is not None:
             check_pose(pose)
         self._start_pose = pose
-        self._is_placed = pose is not None
+        self._was_placed = pose is not None
         if pose is None and self.settings.set_initial_pose:
             self._start_where_settings_say()
         else:
@@ -137,10 +98,10 @@ class Estimator:
     def handle_clock_jump(self) -> None:
         """Go on after a jump of the clock, as ``on_time_jump`` says.
 
-        What is held back for late events is used before. ``reset`` starts again where the run
-        began; in a loaded map where the settings say, or anywhere. ``hold`` keeps pose and map,
-        and goes on from there.
+        ``reset`` starts again where the run began; in a loaded map where the settings say, or
+        anywhere. ``hold`` keeps pose and map, and goes on from there.
         """
+        # Events of before the jump that are held back are used first.
         newest_ns = self.newest_stamp_ns
         after = '' if newest_ns is None else f' after {to_s(newest_ns):.3f} s'
         self.release()
@@ -155,7 +116,7 @@ class Estimator:
             self._timeline.catch_up()
             self._report_stamp()
             self._hypotheses.clear_time()
-            self._is_placed = True
+            self._was_placed = True
             self._clear_time()
         self.jumps += 1
         if self._on_jump is not None:
@@ -169,74 +130,50 @@ class Estimator:
     ) -> None:
         """Estimate in the frame of a map from now on, as ``localization_mode`` says.
 
-        Parameters
-        ----------
-        landmark_map : LandmarkMap
-            What is known. It takes the place of a map loaded before.
-        pose : FloatArray, optional
-            (4, 4) pose in the map's frame; what was mapped until now is forgotten. By default
-            the pose is that of the settings if they have one and the robot is still there.
-            Otherwise it is unknown: it follows from landmarks of the map that are seen, three in
-            space or two in a plane, if they have ids, and what was mapped until then is carried
-            into the map's frame. See :attr:`is_localised`.
-        pose_covariance : FloatArray, optional
-            (6, 6) covariance of ``pose`` as :attr:`pose_covariance` has it; default exact.
-
-        Raises
-        ------
-        MapError, ParameterError
-            If the map, or the pose or its covariance, can't be right; nothing is changed then.
-
+        With a ``pose`` (4, 4) in that frame and its ``pose_covariance`` (6, 6; default exact),
+        what was mapped is forgotten. By default the pose is that of the settings, if the robot is
+        still there, or unknown: then it follows from landmarks of the map that are seen, three in
+        space or two in a plane, if they have ids, and what was mapped is carried into the map's
+        frame. Raise MapError or ParameterError if one of them can't be right; nothing is changed
+        then.
         """
         check_map(landmark_map)
         if pose is not None:
             check_pose(pose, pose_covariance)
             self._timeline.catch_up()
         self._localiser.load(landmark_map, self.settings.two_d_mode)
-        is_at_start = self.stamp_ns is None and not self._is_placed
+        # The pose in it: the given one, the one of the settings, or the one that landmarks show.
+        is_at_start = self.stamp_ns is None and not self._was_placed
         if pose is not None:
-            self._place(pose, pose_covariance)
+            self._move_robot(pose, pose_covariance)
         elif self.settings.set_initial_pose and is_at_start:
             self._start_where_settings_say()
         elif self._state.is_mapping:
-            self._enter_map()
+            if self._localiser.enter(self._state):
+                self._hypotheses.prune_to_best()
         else:  # in a map that does not grow there is nothing to carry into another one
             self._start(None)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
-        """Move the robot as of ``stamp_ns``; the map stays.
+        """Move the robot to ``pose`` (4, 4), body to world, as of ``stamp_ns``; the map stays.
 
-        Parameters
-        ----------
-        pose : FloatArray
-            (4, 4) body to world. If the place in a loaded map was not known, it is now.
-        covariance : FloatArray, optional
-            (6, 6) its covariance, as :attr:`pose_covariance` has it; default exact.
-
-        Raises
-        ------
-        ParameterError
-            If one of them can't be right; nothing is changed then.
-
+        If the pose in a loaded map was unknown, it is known now. ``covariance`` (6, 6) is as in
+        :attr:`pose_covariance`; default exact. Raise :exc:`ParameterError` if one of them can't be
+        right; nothing is changed then.
         """
         check_pose(pose, covariance)
         self._timeline.catch_up()
-        self._place(pose, covariance)
+        self._move_robot(pose, covariance)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.
 
-        Raises
-        ------
-        ParameterError
-            If another setting differs, or one does not fit its table.
-
+        Raise :exc:`ParameterError` if another setting differs, or one does not fit its table.
         """
         settings = checked(settings)
         fixed = [row.name for row in table(Settings) if row.read_only]
-        changed = [
-            name for name in fixed if getattr(settings, name) != getattr(self.settings, name)
-        ]
+        old = self.settings
+        changed = [name for name in fixed if getattr(settings, name) != getattr(old, name)]
         if changed:
             raise ParameterError(f'{", ".join(changed)} can only be set before the start')
         self.settings = settings
@@ -277,18 +214,10 @@ class Estimator:
         self._report_stamp()
 
     def smooth(self) -> Smoothed:
-        """Return trajectory and map in hindsight; the state is not changed.
+        """Return the smoothed trajectory and map since the history began; the state is kept.
 
-        They cover the observations since the history began, all of them with the setting
-        ``smoothing_window`` 0, as far as a point of them was believed.
-
-        Raises
-        ------
-        ParameterError
-            If the gain design keeps no history.
-        SmoothingError
-            If the observations don't determine the whole trajectory.
-
+        The history is that of the whole run with ``smoothing_window`` 0. Raise ParameterError if
+        none is kept, and SmoothingError if the observations don't determine everything.
         """
         return self._state.smooth()
 
@@ -300,32 +229,27 @@ class Estimator:
     def counts(self) -> Counter[str]:
         """How many events were used, by kind, and the outcome for the landmarks in them.
 
-        Events used (``'velocity'``, ``'observation'``), those of them that came late
-        (``'late_velocity'``, ``'late_observation'``), points in observations
-        (``'observed_point'``), observations made before the place in a loaded map was found
-        (``'not_localised'``), how often it was lost again (``'lost'``), how often the robot was
-        not where odometry had it (``'slip'``) or nothing in view, without ids, where the map has
-        it (``'unexpected_place'``), and what became of landmarks
-        (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, and ``'unknown_id'``,
-        ``'repeated_id'`` and ``'reserved_id'``, which are not used).
+        Events used (``'velocity'``, ``'observation'``), late ones among them
+        (``'late_velocity'``, ``'late_observation'``), points (``'observed_point'``), observations
+        made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
+        (``'lost'``), the robot not where odometry had it (``'slip'``) or nothing in view where the
+        map has it (``'unexpected_place'``), landmarks (``'rejected_landmark'``,
+        ``'moved_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
+        ``'unsupported_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
+        ``'reserved_id'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
     @property
     def is_localised(self) -> bool:
-        """Whether the estimate is in its final frame: always, unless a map was loaded.
-
-        Until the place in a loaded map is found, the estimate is in a frame of its own.
-        """
+        """Whether the estimate is in its final frame, that of a map if one was loaded."""
         return self._localiser.is_localised
 
     @property
     def landmark_map(self) -> LandmarkMap:
         """The present map, as it can be saved and loaded: without landmarks that move.
 
-        Its covariances are those in its own frame: without the error of how it lies to where
-        the robot started, unless the frame is that of a map that was loaded.
+        Unless its frame is that of a loaded map, its covariances are those of its shape alone.
         """
         is_own_frame = self._localiser.loaded is None or not self.is_localised
         return map_of(self._state, is_own_frame)
@@ -354,10 +278,10 @@ class Estimator:
 
     @property
     def pose_covariance(self) -> FloatArray | None:
-        """(6, 6) covariance of the pose at ``stamp_ns``: rotation vector, then position.
+        """(6, 6) covariance of the pose at ``stamp_ns``: rotation vector, position; rad², m².
 
-        Both along the world's axes, rad² and m². Where it is in doubt what was seen, it holds
-        that the most likely place may be the wrong one. None where the gains know none.
+        Along the world's axes; it includes that the most likely hypothesis may be wrong. None
+        where the filter knows no covariance.
         """
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
@@ -365,11 +289,8 @@ class Estimator:
 
     @property
     def body_velocity(self) -> FloatArray:
-        """(6,) newest velocity (Ω, v), calibrated, rad/s and m/s; zero when it has timed out.
-
-        It is that of ``stamp_ns``, unless a delay is calibrated: then a little before or after.
-        """
-        velocity = self._timeline.body_velocity
+        """(6,) newest velocity (Ω, v), calibrated, rad/s and m/s; zero when it has timed out."""
+        velocity = self._timeline.body_velocity  # with a calibrated delay: of a little before
         return np.zeros(6) if velocity is None else self._state.filter.calibration.apply(velocity)
 
     @property
@@ -402,10 +323,9 @@ class Estimator:
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m².
 
-        In the body frame, of the first k coordinates: 2 in ``two_d_mode``, else 3. It is that of
-        the state, which is moved on at observations: ask for it in ``on_update``. ``rows`` (m,)
-        are places in ``landmark_ids``. None where the gains know none, and for landmarks that are
-        fixed, whose errors nobody knows.
+        In the body frame, of k coordinates (2 in ``two_d_mode``, else 3), as of the last
+        observation: ask for it in ``on_update``. ``rows`` (m,) are indices into ``landmark_ids``.
+        None where the filter knows none, or landmarks are fixed, whose errors nobody knows.
         """
         state = self._state
         if state.is_fixed:
@@ -480,20 +400,16 @@ class Estimator:
         """Look for the pose in a loaded map if it is not known, or not any more."""
         if self._localiser.loaded is None:
             return
-        reason = self._localiser.reason_to_restart(self._state, outcome)
+        reason = self._localiser.reason_to_reset(self._state, outcome)
         if reason is not None:
             logger.warning('%s; localising again.', reason)
             self._start(None)
         if self._localiser.search(self._state):
             self._hypotheses.prune_to_best()
 
-    def _enter_map(self) -> None:
-        if self._localiser.enter(self._state):
-            self._hypotheses.prune_to_best()
-
-    def _place(self, pose: FloatArray, covariance: FloatArray | None) -> None:
+    def _move_robot(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the pose in a loaded map was not known, it is now."""
-        self._is_placed = True
+        self._was_placed = True
         if self.is_localised:
             self._hypotheses.prune_to_best().set_pose(self._allowed(pose), covariance)
             self._localiser.doubt_pose()
@@ -506,11 +422,7 @@ class Estimator:
         self._start(pose, np.diag(GIVEN_POSE_STD**2))
 
     def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
-        """Start again with an empty map, or with the one that was loaded.
-
-        At ``pose`` (4, 4); by default identity, or unknown in a map that was loaded.
-        ``covariance`` (6, 6) is that of a pose in a loaded map; default exact.
-        """
+        """Start again with an empty map, or the loaded one, at ``pose`` (4, 4) if it is known."""
         state = self._state_at(np.eye(4) if pose is None else self._allowed(pose))
         self._hypotheses.reset(state)
         self._localiser.start(state, pose is not None, covariance)

@@ -28,7 +28,7 @@ MIN_KNOWN = 1024
 
 
 class EventQueue:
-    """Holds events back for a reorder window, then gives them out in stamp order.
+    """Holds events back for a reorder window, then returns them in stamp order.
 
     Of two events with one stamp the velocity comes first, and two observations are ordered by
     a digest of their ids and points, so the order does not depend on which arrived first. A
@@ -46,20 +46,8 @@ class EventQueue:
     late goes on from its own last stamp, and not right after an event that is in time: then they
     were held up on the way, and come in a burst.
 
-    Parameters
-    ----------
-    window_ns : int
-        How far behind the newest stamp an event is given out, nanoseconds.
-    max_jump_ns : int
-        How long a pause may be, nanoseconds: what is further ahead is refused.
-    late_limit_ns : int
-        How far behind the window an event may be, nanoseconds.
-
-    Attributes
-    ----------
-    newest_ns : int or None
-        Newest stamp that is believed, nanoseconds.
-
+    An event is returned ``window_ns`` behind the newest stamp, and may be ``late_limit_ns`` behind
+    that; ``max_jump_ns`` is the longest pause, beyond which stamps are refused.
     """
 
     def __init__(self, window_ns: int, max_jump_ns: int, late_limit_ns: int) -> None:
@@ -76,20 +64,17 @@ class EventQueue:
         self._newest_of_kind_ns: dict[type, int] = {}
         # The newest stamp that is taken, believed or not.
         self._lead_ns = 0
-        self.newest_ns: int | None = None
+        self.newest_ns: int | None = None  # newest stamp that is believed
 
     def push(self, event: Event) -> bool:
         """Take an event; return whether it shows that the clock has jumped.
 
-        Raises
-        ------
-        InvalidEventError
-            If the stamp is far from all others (``'stamp_jump'``, ``'too_late'``), or the event
-            is already known (``'duplicate'``).
-
+        Raise :exc:`InvalidEventError` if the stamp is far from all others (``'stamp_jump'``,
+        ``'too_late'``), or the event is already known (``'duplicate'``).
         """
         if self.newest_ns is None:
             self.newest_ns = self._lead_ns = event.stamp_ns
+        # In time, or little ahead: believed at once.
         ahead_ns = event.stamp_ns - self.newest_ns
         too_late = ahead_ns < -self._reach_ns
         if -self._near_ns <= ahead_ns <= self._usual_ns:
@@ -98,24 +83,25 @@ class EventQueue:
             self._take_in_time(event, self.newest_ns)
             return False
         if too_late or self._is_too_early(event):
-            # One that is no sign of a jump is not counted.
+            # Far away: refused, and counted if it is a sign of a jump.
             is_no_jump = too_late and (self._is_newest_of_kind(event) or self._is_held_up(event))
             if not is_no_jump and self._count_stray(event.stamp_ns, self.newest_ns):
                 return True
             raise _refusal(ahead_ns)
+        # Ahead, within a pause: kept, not yet believed.
         self._take_ahead(event, self.newest_ns)
         return False
 
     def pop_ready(self) -> list[Event]:
-        """Give out, in order, the events that have left the window."""
+        """Return, in order, the events that have left the window."""
         return self._events.pop_until((self.newest_ns or 0) - self._window_ns)
 
     def pop_believed(self) -> list[Event]:
-        """Give out, in order, all events but those with a stamp that waits for others."""
+        """Return, in order, all events but those with a stamp that waits for others."""
         return self._events.pop_until(self.newest_ns or 0)
 
     def pop_all(self) -> list[Event]:
-        """Give out all events that are left, in order."""
+        """Return all events that are left, in order."""
         return self._events.pop_all()
 
     def _take_in_time(self, event: Event, newest_ns: int) -> None:
@@ -188,14 +174,12 @@ class _SortedEvents:
             self._most_known = max(2 * len(self.known), MIN_KNOWN)
 
     def pop_until(self, stamp_ns: int) -> list[Event]:
-        """Give out the events up to a stamp."""
         events = []
         while self._heap and self._heap[0][0][0] <= stamp_ns:
             events.append(heapq.heappop(self._heap)[1])
         return events
 
     def pop_all(self) -> list[Event]:
-        """Give out all events."""
         return [heapq.heappop(self._heap)[1] for _ in range(len(self._heap))]
 
 

@@ -1,4 +1,4 @@
-"""What the log is told of events, at the 1st, the 10th, the 100th time that it happens."""
+"""What the log says of events, at the 1st, the 10th, the 100th time that it happens."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UNEXPECTED_POSES = {
     'unexpected_place': 'Nothing that is seen is where the map has it: if the robot slipped or '
     'was carried, it is not found again, as the points have no ids',
 }
-"""What is wrong with the robot's place when these counts grow."""
+"""What is wrong with the robot's pose when these counts grow."""
 
 
 class EventWarnings:
@@ -42,21 +42,21 @@ class EventWarnings:
         self._moved_ns: dict[int, int] = {}
 
     def dropped(self, error: InvalidEventError) -> None:
-        """Tell that an event is not used, and why."""
+        """Warn that an event is not used, and why."""
         self._warn(error.reason, f'Dropped an event, {error.reason}: {error}')
 
     def late_velocity(self) -> None:
-        """Tell that a velocity came too late to be put in order."""
+        """Warn that a velocity came too late to be put in order."""
         text = 'A velocity came later than reorder_window allows and counts only from then on'
         self._warn('late_velocity', text)
 
     def repeated_ids(self, ids: Sequence[int]) -> None:
-        """Tell that an observation has several points of each of these ids."""
+        """Warn that an observation has several points of each of these ids."""
         text = f'Not used: an observation has several points of the ids {_list(ids)}'
         self._warn('repeated_id', text)
 
     def reserved_ids(self, ids: Sequence[int]) -> None:
-        """Tell that a sensor has ids which landmarks without one are given."""
+        """Warn that a sensor has ids which landmarks without one are given."""
         text = (
             f'Not used: points with the ids {_list(ids)}; those from {FIRST_AUTOMATIC_ID} to '
             f'{LAST_AUTOMATIC_ID} number landmarks without an id: give these others'
@@ -64,12 +64,12 @@ class EventWarnings:
         self._warn('reserved_id', text)
 
     def unknown_ids(self, gains: str) -> None:
-        """Tell that these gains can't use points without an id."""
+        """Warn that these gains can't use points without an id."""
         text = f'Points without an id are not used by {gains} gains, only by riccati'
         self._warn('unknown_id', text)
 
     def large_map(self, count: int) -> None:
-        """Tell once that Riccati gains are slow if a map has so many landmarks."""
+        """Warn once that Riccati gains are slow if a map has so many landmarks."""
         if count >= MANY_LANDMARKS and not self._counts['large_map']:
             self._counts['large_map'] = 1
             logger.warning(
@@ -80,12 +80,12 @@ class EventWarnings:
             )
 
     def more_than_max(self, count: int, limit: int) -> None:
-        """Tell that one observation has more landmarks than may be kept."""
+        """Warn that one observation has more landmarks than may be kept."""
         text = f'{count} points in one message, and max_landmarks is {limit}: some are always new'
         self._warn('more_than_max', text)
 
     def moved_landmarks(self, ids: IntArray, stamp_ns: int) -> None:
-        """Tell that landmarks are not any more where they were, and if many are so at a time."""
+        """Warn that landmarks have moved, and, if many have lately, that odometry may be wrong."""
         self._warn('moved_landmark', f'Landmarks {ids.tolist()} have moved')
         moved_ns = self._moved_ns | dict.fromkeys(ids.tolist(), stamp_ns)
         # Those after this stamp are from before a jump of the clock.
@@ -102,7 +102,7 @@ class EventWarnings:
             self._warn('many_moved', text)
 
     def unexpected_poses(self, count: Callable[[str], int]) -> None:
-        """Tell that the robot is not where it was taken to be, if ``count`` says so again."""
+        """Warn that the robot is not where it was taken to be, if ``count`` says so again."""
         for name, text in UNEXPECTED_POSES.items():
             if count(name) > self._reported[name]:
                 self._warn(name, text)

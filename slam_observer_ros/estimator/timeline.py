@@ -38,24 +38,8 @@ class Moved(Protocol):
 class Timeline:
     """Velocities of the recent past, and how far the hypotheses have been moved along them.
 
-    Parameters
-    ----------
-    hypotheses : Moved
-        What is moved along them; no event has been used yet.
-    settings : Settings
-        ``velocity_timeout``, ``late_limit`` and ``two_d_mode``.
-    on_motion : callable, optional
-        Called each time before the hypotheses are moved on.
-
-    Attributes
-    ----------
-    velocities : VelocityHistory
-        The velocities.
-    stamp_ns : int or None
-        Stamp of the last event that was used, nanoseconds; None before the first.
-    state_ns : int or None
-        Instant that the hypotheses are of: velocities since then wait for an observation.
-
+    ``velocity_timeout``, ``late_limit`` and ``two_d_mode`` are read from the settings, and
+    ``on_motion`` is called each time before the hypotheses are moved on.
     """
 
     def __init__(
@@ -64,8 +48,8 @@ class Timeline:
         self._hypotheses = hypotheses
         timeout_ns = to_ns(settings.velocity_timeout)
         self.velocities = VelocityHistory(timeout_ns, settings.two_d_mode)
-        self.stamp_ns: int | None = None
-        self.state_ns: int | None = None
+        self.stamp_ns: int | None = None  # of the last event used; None before the first
+        self.state_ns: int | None = None  # of the hypotheses: velocities since are pending
         # A delay, and beyond it half of what velocities are averaged over to estimate it.
         self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
@@ -87,15 +71,11 @@ class Timeline:
     def append(self, event: VelocityEvent | AngularVelocityEvent) -> bool:
         """Add a velocity; return whether it is in force: an angular one waits for a linear one.
 
-        If it is late, it leads on from where velocities can still be changed. After many of them
-        the hypotheses are moved on without an observation.
-
-        Raises
-        ------
-        InvalidEventError
-            If a newer velocity of its kind was used before it (``'too_late'``).
-
+        A late one leads on from where velocities can still be changed. After many of them the
+        hypotheses are moved on without an observation. Raise :exc:`InvalidEventError` if a newer
+        velocity of its kind was used before it (``'too_late'``).
         """
+        # Each kind in stamp order, and none before what is already in force.
         kind = type(event)
         if event.stamp_ns < self._newest_ns.get(kind, 0):
             raise InvalidEventError('too_late', 'a newer velocity was already used')
@@ -104,6 +84,7 @@ class Timeline:
             event = replace(event, stamp_ns=self._in_force_ns)
         if not self.velocities.append(event):
             return False
+        # In force from now on; the state follows at the next observation, or after many.
         self._in_force_ns = event.stamp_ns
         self._note_stamp(event.stamp_ns)
         self._pending += 1

@@ -11,27 +11,12 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
-    """n landmarks in one frame; their errors are taken to be independent of each other.
+    """n landmarks in one frame; their errors are taken to be independent of each other."""
 
-    Attributes
-    ----------
-    ids : IntArray
-        (n,) landmark ids, each one once.
-    world_points : FloatArray
-        (n, 3) positions, metres, in ``frame_id``.
-    covariances : FloatArray or None
-        (n, 3, 3) covariances of the positions, m²; None if unknown.
-    counts : IntArray
-        (n,) in how many observations each was seen; zero for surveyed ones.
-    frame_id : str
-        Frame of the positions.
-
-    """
-
-    ids: IntArray
-    world_points: FloatArray
-    covariances: FloatArray | None
-    counts: IntArray
+    ids: IntArray  # (n,) landmark ids, each one once
+    world_points: FloatArray  # (n, 3) positions, metres, in frame_id
+    covariances: FloatArray | None  # (n, 3, 3) of the positions, m²; None if unknown
+    counts: IntArray  # (n,) in how many observations each was seen; zero for surveyed ones
     frame_id: str = 'map'
 
     def select(self, rows: IntArray | BoolArray) -> LandmarkMap:

@@ -1,4 +1,4 @@
-"""Where the estimate is in a loaded map: when it enters it, and when it is lost there."""
+"""Decides when the estimate enters a loaded map, and when it is lost there."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.merging import enter_map, is_lost, start_in_map
+from slam_observer_ros.known_map.merging import enter_map, start_in_map
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import Outcome
 
@@ -25,28 +25,17 @@ CONFIRMING_VOTES = 10
 
 
 class Localiser:
-    """Follows whether the estimate is in the frame of a map that was loaded.
-
-    Attributes
-    ----------
-    loaded : LandmarkMap or None
-        The map.
-    is_localised : bool
-        Whether the estimate is in its final frame: always, unless a map was loaded.
-    counts : Counter
-        ``not_localised`` observations, and how often the pose in the map was ``lost``.
-
-    """
+    """Follows whether the estimate is in the frame of a map that was loaded."""
 
     def __init__(self) -> None:
         self.loaded: LandmarkMap | None = None
-        self.is_localised = True
-        self.counts: Counter[str] = Counter()
+        self.is_localised = True  # in the final frame: always, unless a map was loaded
+        self.counts: Counter[str] = Counter()  # 'not_localised' observations, poses 'lost'
         self._trial: PoseTrial | None = None
         self._comparisons = Comparisons()
 
     def load(self, landmark_map: LandmarkMap, two_d_mode: bool) -> None:
-        """Take a map in the place of one loaded before; the pose in it is yet to be found."""
+        """Take a map instead of one loaded before; the pose in it is yet to be found."""
         self.loaded = landmark_map.flattened() if two_d_mode else landmark_map
         if landmark_map.is_planar and not two_d_mode:
             logger.warning(
@@ -57,15 +46,15 @@ class Localiser:
         self._trial = None
         self._comparisons = Comparisons()
 
-    def start(self, state: State, is_placed: bool, covariance: FloatArray | None) -> None:
-        """Begin with an estimate at its start, in the loaded map if its pose there is given.
+    def start(self, state: State, pose_is_given: bool, covariance: FloatArray | None) -> None:
+        """Take a state at its start, in the loaded map if its pose there is given.
 
         ``covariance`` (6, 6) is that of the given pose; None for an exact one.
         """
         self._comparisons = Comparisons()
-        self.is_localised = self.loaded is None or is_placed
+        self.is_localised = self.loaded is None or pose_is_given
         self._trial = None
-        if self.loaded is not None and is_placed:
+        if self.loaded is not None and pose_is_given:
             start_in_map(state, self.loaded, covariance)
             self._trial = PoseTrial(self.loaded)
 
@@ -73,11 +62,8 @@ class Localiser:
         """Put a pose that was given on trial."""
         self._trial = None if self.loaded is None else PoseTrial(self.loaded)
 
-    def reason_to_restart(self, state: State, outcome: Outcome) -> str | None:
-        """Return why the pose in the map must be wrong, after an observation; None if it need not.
-
-        Of a restart for such a reason it is counted.
-        """
+    def reason_to_reset(self, state: State, outcome: Outcome) -> str | None:
+        """Return why the pose in the map must be wrong after an observation, or None."""
         if self.loaded is None:
             return None
         reason = None
@@ -102,12 +88,24 @@ class Localiser:
         """Move an estimate into the frame of the loaded map, if the landmarks suffice."""
         if self.loaded is not None and enter_map(state, self.loaded):
             self.is_localised = True
-            logger.info('Found the place in the map of %d landmarks.', len(self.loaded.ids))
+            logger.info('Found the pose in the map of %d landmarks.', len(self.loaded.ids))
         return self.is_localised
 
 
+def is_lost(state: State) -> bool:
+    """Return whether the pose in a map has been wrong for some time, or the robot was carried.
+
+    All landmarks seen of late were rejected then, and as many as would do to find the pose again
+    so often that elsewhere they would be taken to have moved.
+    """
+    often = state.settings.max_rejections
+    moved = np.sum(state.landmarks.rejections >= often)
+    needed = state.axes.point
+    return bool(not state.is_mapping and state.rejected_in_a_row >= often and moved >= needed)
+
+
 class Comparisons:
-    """When a map is worth comparing with what was seen: it takes long, and seldom says more."""
+    """When a map is worth comparing with what was seen: that takes long, and seldom says more."""
 
     def __init__(self) -> None:
         self._observations = self._compared_at = self._shared = 0
@@ -126,7 +124,7 @@ class PoseTrial:
 
     With a wrong one the map's landmarks would be rejected, and where mapping goes on be taken to
     have moved, all of them. Observations vote: against it, if more of the map's landmarks in them
-    were rejected than believed. One alone may be garbled, and some landmarks have moved.
+    were rejected than accepted. One alone may be garbled, and some landmarks have moved.
     """
 
     def __init__(self, known: LandmarkMap) -> None:
@@ -138,7 +136,7 @@ class PoseTrial:
         if self._for >= CONFIRMING_VOTES and self._for > self._against:
             return False
         rejected = int(np.isin(outcome.ids[outcome.rejected], self._ids).sum())
-        believed = int(np.isin(outcome.ids, self._ids).sum()) - rejected
-        self._for += int(believed > 0 and believed >= rejected)
-        self._against += int(rejected > believed)
+        accepted = int(np.isin(outcome.ids, self._ids).sum()) - rejected
+        self._for += int(accepted > 0 and accepted >= rejected)
+        self._against += int(rejected > accepted)
         return self._against >= often and self._against > self._for

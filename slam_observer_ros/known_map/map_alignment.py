@@ -1,4 +1,4 @@
-"""How the frames of two maps lie to each other, told by the landmarks that both have."""
+"""The transform between the frames of two maps, from the landmarks that both have."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.gauge import anchor, JITTER_M2
 
 MAX_TURN_STD_RAD = 0.2
-"""Standard deviation about any axis beyond which landmarks don't tell how the robot is turned.
+"""Standard deviation about any axis beyond which landmarks don't determine the attitude.
 
 Three of them in a line leave the roll about it open; two that are close together, the heading.
 """
@@ -29,29 +29,25 @@ def find_transform(
     target_covariances: FloatArray,
     axes: EstimatedAxes,
 ) -> tuple[FloatArray, BoolArray] | None:
-    """Find how the frames of two maps lie to each other, even if some landmarks are wrong.
-
-    Landmarks are left out, the worst one first, until the others don't contradict each other.
+    """Find the transform between the frames of two maps, even if some landmarks are wrong.
 
     Parameters
     ----------
-    source : FloatArray
-        (m, 3) landmarks in the robot's own frame, metres.
+    source, target : FloatArray
+        (m, 3) landmarks in the robot's own frame, and the same in the other one, metres.
     source_covariance : FloatArray
         (p + m k, p + m k) covariance of the pose's error and theirs together, rad² and m².
-    target : FloatArray
-        (m, 3) the same landmarks in the other frame, metres.
     target_covariances : FloatArray
-        (m, 3, 3) covariance of each of them in that frame, m².
+        (m, 3, 3) covariance of each of them in the other frame, m².
     axes : EstimatedAxes
         Whether they lie in space (k = 3) or in a plane (k = 2).
 
     Returns
     -------
     tuple or None
-        Transform (4, 4) from the robot's frame to the other one, and by which landmarks (m,) it
-        was found. None unless at least k of them agree, and half of them all, and tell how the
-        robot is turned: of many landmarks some few fit by chance.
+        Transform (4, 4) from the robot's frame to the other one, and the landmarks (m,) that
+        agree on it. None unless these are at least k and half of all, as of many landmarks some
+        few fit by chance, and determine the attitude.
 
     """
     p, k = axes.p, axes.point
@@ -59,9 +55,11 @@ def find_transform(
     G = np.vstack([np.eye(p), J])
     agree = np.ones(len(source), dtype=np.bool_)
     while agree.sum() >= max(k, 0.5 * len(source)):
+        # Align the landmarks that are left.
         rows = np.flatnonzero(np.append(np.ones(p, dtype=np.bool_), np.repeat(agree, k)))
         P = source_covariance[np.ix_(rows, rows)]
         T = _aligned(source[agree], P[p:, p:], target[agree], target_covariances[agree])
+        # Compare them in the robot's frame: do they determine the attitude, do they agree?
         R = T[:3, :3]
         there = block_diagonal((R.T @ target_covariances[agree] @ R)[:, :k, :k])
         r = (source[agree] - se3.transform(se3.inverse(T), target[agree]))[:, :k]
@@ -70,6 +68,7 @@ def find_transform(
         misfit, doubts = _contradictions(G[rows[p:]], P[p:, p:] + there, r)
         if misfit <= _improbable(r.size - p):
             return T, agree
+        # Leave out the worst one.
         agree[np.flatnonzero(agree)[np.argmax(doubts)]] = False
     return None
 
@@ -93,8 +92,7 @@ def _aligned(
 def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:
     """Return the standard deviation of the robot's attitude in a map, about the worst axis.
 
-    Parameters are those of :func:`slam_observer_ros.observer.gauge.anchor`, for the pose and the
-    landmarks that the map has.
+    Parameters are those of :func:`slam_observer_ros.observer.gauge.anchor`.
     """
     turns, rows = axes.p - axes.point, np.arange(axes.p, len(P))
     try:
@@ -109,7 +107,7 @@ def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: Estimat
 def _contradictions(J: FloatArray, S: FloatArray, r: FloatArray) -> tuple[float, FloatArray]:
     """Return how badly differences (m, k) fit together, squared, and each by itself (m,).
 
-    Each one is judged as in Baarda's data snooping: by what the others leave of it, Q r with
+    Each is judged as in Baarda's data snooping, by what the others leave of it: Q r, with
     Q = S⁻¹ − S⁻¹ J (Jᵀ S⁻¹ J)⁻¹ Jᵀ S⁻¹, in units of its standard deviation.
     """
     weights = np.linalg.inv(S + JITTER_M2 * np.eye(len(S)))

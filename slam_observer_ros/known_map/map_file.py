@@ -9,8 +9,8 @@ The same format serves saved maps and surveyed ones. A surveyor writes no more t
     - {id: 7, position: [1.5, -2.0, 0.3], sigma: 0.01}
 
 ``sigma`` is the standard deviation of each coordinate, metres; a saved map has the whole
-``covariance`` (m²) in its place, ``observations`` (how often each landmark was seen), and tells
-in its head with which ``package_version`` and ``settings`` it was made.
+``covariance`` (m²) instead, ``observations`` (how often each landmark was seen), and in its head
+the ``package_version`` and ``settings`` with which it was made.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _MAX_NUMBER = 1e12
 """Metres; nothing larger is meant seriously, and its square still has all digits."""
 
 _ROUNDING = 1e-6
-"""Part of a covariance's largest entry by which it may miss being one."""
+"""Share of a covariance's largest entry by which it may be asymmetric or negative."""
 
 # Faster by far, where libyaml is.
 _FastLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
@@ -77,22 +77,9 @@ _StrictLoader.add_implicit_resolver(
 
 
 def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
-    """Write a map; the file appears whole or not at all.
+    """Write a map, and with which settings it was made; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    path : Path
-        File to create or replace.
-    landmark_map : LandmarkMap
-        What to write.
-    settings : Settings
-        With what the map was made, to be told in the file.
-
-    Raises
-    ------
-    MapError
-        If the map is empty, or the file can't be written.
-
+    Raise :exc:`MapError` if the map is empty, or the file can't be written.
     """
     if not len(landmark_map.ids):
         raise MapError(f'the map is empty: nothing is written to {path}')
@@ -119,13 +106,9 @@ def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None
 
 
 def check_writable(path: Path) -> None:
-    """Check that a map could be written, as long before there is one as may be.
+    """Check that a map could be written, before there is one.
 
-    Raises
-    ------
-    MapError
-        If the directory that its name leads to takes no file, or it is there and no file.
-
+    Raise :exc:`MapError` if its directory takes no file, or the path is a directory.
     """
     try:
         if path.is_dir():
@@ -144,13 +127,9 @@ def check_writable(path: Path) -> None:
 def read_map(path: Path) -> LandmarkMap:
     """Read a map, strictly.
 
-    Raises
-    ------
-    MapError
-        If the file can't be read, is no map of a version that is known, lacks a field or has one
-        too many, or holds a value that can't be right; the message names the file, the landmark
-        and the reason.
-
+    Raise :exc:`MapError` if the file can't be read, is no map of a known version, has a field too
+    few or too many, or a value that can't be right; the message names the file, the landmark and
+    the reason.
     """
     try:
         content = yaml.load(path.read_text(encoding='utf-8'), _StrictLoader)
@@ -199,7 +178,7 @@ def _parse(content: Any) -> LandmarkMap:
     _expect(isinstance(frame_id, str) and frame_id != '', f"'frame' is {frame_id!r}, not a name")
     _expect(isinstance(rows, list), "'landmarks' is not a list")
     _expect(len(rows) > 0, 'it has no landmarks')
-    ids = [_landmark_id(row, place) for place, row in enumerate(rows)]
+    ids = [_landmark_id(row, index) for index, row in enumerate(rows)]
     for landmark_id, times in Counter(ids).items():
         _expect(times == 1, f'landmark {landmark_id} is there {times} times')
     return LandmarkMap(
@@ -211,8 +190,8 @@ def _parse(content: Any) -> LandmarkMap:
     )
 
 
-def _landmark_id(row: Any, place: int) -> int:
-    who = f'entry {place} of landmarks'
+def _landmark_id(row: Any, index: int) -> int:
+    who = f'entry {index} of landmarks'
     _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
     _check_names(who, row, ('id', 'position'), ('sigma', 'covariance', 'observations'))
     landmark_id = _natural(row['id'], f"{who}: 'id'")
@@ -244,6 +223,7 @@ def _covariance(row: Mapping[str, Any]) -> FloatArray:
         (sigma_m,) = _numbers([row['sigma']], 1, f"{who}: 'sigma'")
         _expect(sigma_m >= 0.0, f"{who}: 'sigma' is negative")
         return sigma_m**2 * np.eye(3)
+    # A full covariance, symmetric and positive but for rounding.
     lines = row['covariance']
     _expect(isinstance(lines, list) and len(lines) == 3, f"{who}: 'covariance' is not 3 × 3")
     covariance = np.array([_numbers(line, 3, f"{who}: a row of 'covariance'") for line in lines])
@@ -260,7 +240,7 @@ def _check_names(
     who: str, mapping: Mapping[Any, Any], required: Sequence[str], optional: Sequence[str]
 ) -> None:
     for name in required:
-        _expect(name in mapping, f"{who} lacks '{name}'")
+        _expect(name in mapping, f"{who} has no '{name}'")
     for name in mapping:
         _expect(name in (*required, *optional), f"{who} has '{name}', which is not known here")
 

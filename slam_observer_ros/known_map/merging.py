@@ -1,4 +1,4 @@
-"""Places an estimate in the frame of a map that is known in advance.
+"""Moves an estimate into the frame of a map that is known in advance.
 
 Where the start is unknown the robot maps in a frame of its own at first. Once enough landmarks of
 the known map are among its own, well enough spread, the whole estimate is moved into the known
@@ -25,22 +25,14 @@ from slam_observer_ros.observer.gauge import gauge_information, JITTER_M2
 from slam_observer_ros.state.state import State
 
 ROUNDING = 1e-14
-"""Least variance that can be told from zero, as a share of the sum of all variances."""
+"""Least variance that is distinguished from zero, as a share of the sum of all variances."""
 
 
 def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
-    """Take a map into an estimate that has none yet, at a pose that is given in the map's frame.
+    """Add a map to a state at its start, whose pose is given in the map's frame.
 
-    Parameters
-    ----------
-    state : State
-        At its start.
-    known : LandmarkMap
-        The map.
-    pose_covariance : FloatArray or None
-        (6, 6) covariance of rotation vector and position along the map's axes, rad² and m²;
-        None for an exact pose.
-
+    ``pose_covariance`` (6, 6) is that of rotation vector and position along the map's axes, rad²
+    and m²; None for an exact pose.
     """
     state.set_pose(state.observer.pose, pose_covariance)
     _complete(state, known)
@@ -49,51 +41,38 @@ def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray |
 def enter_map(state: State, known: LandmarkMap) -> bool:
     """Move an estimate into the frame of a map, if enough of its landmarks have been seen.
 
-    Landmarks that both have are merged. Those that contradict the others are taken as the map has
-    them, and those that only the estimate has are kept where mapping goes on.
-
-    Returns
-    -------
-    bool
-        Whether the estimate is now in the map's frame.
-
+    Return whether it is in that frame now. Landmarks that both have are merged. Those that
+    contradict the others are taken as the map has them, and those that only the estimate has are
+    kept where mapping goes on.
     """
+    # The transform, by the landmarks that both have.
     rows = state.landmarks.rows_of(known.ids)
     shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
     found = _find_frame(state, rows[shared], known.select(shared))
     if found is None:
         return False
     state.observer.reference_pose, agree = found
+    # Landmarks that agree are merged, …
     merged = shared[agree]
     _merge(state, rows[merged], known.select(merged))
+    # … others removed, as are all that the map does not have where it does not grow, …
     if state.settings.localization_mode == 'off':
         state.remove(rows[shared[~agree]])
     else:
         state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[merged]))
+    # … and those that only the map has are added.
     _renumber(state, known)
     _complete(state, known)
     return True
 
 
-def is_lost(state: State) -> bool:
-    """Return whether a place in a map has been wrong for some time, or the robot was carried.
-
-    All landmarks seen of late were rejected then, and as many as would do to find the place again
-    were rejected so often that elsewhere they would be taken to have moved.
-    """
-    often = state.settings.max_rejections
-    moved = np.sum(state.landmarks.rejections >= often)
-    needed = state.axes.point
-    return bool(not state.is_mapping and state.rejected_in_a_row >= often and moved >= needed)
-
-
 def shape_covariances(state: State) -> FloatArray | None:
-    """Return covariances (n, 3, 3) of the landmarks in a frame that is their own, world axes, m².
+    """Return covariances (n, 3, 3) of the landmarks in a frame of their own, world axes, m².
 
-    A map's frame starts where the robot did, and all landmarks share the error of how they lie to
-    that pose. Who loads the map knows it by its landmarks alone: what remains is the error of
-    its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None
-    where the gains know no covariances.
+    A map's frame starts where the robot did, and all landmarks share the error of that pose. Who
+    loads the map knows it by its landmarks alone: what remains is the error of its shape,
+    P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None where the
+    filter knows no covariances.
     """
     n, axes, points = len(state.landmarks), state.axes, state.observer.points
     k, R = axes.point, state.observer.reference_pose[:3, :3]
@@ -127,10 +106,8 @@ def _find_frame(
 
 
 def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
-    """Return a covariance (p + m k, p + m k) of ε and m landmarks for gains that know none.
-
-    The pose is exact; a landmark is as uncertain as it would be if it was seen from here once.
-    """
+    """Return a covariance (p + m k, p + m k) of ε and m landmarks for gains that know none."""
+    # The pose is exact, and each landmark as uncertain as if it was seen from here once.
     p, k = state.axes.p, state.axes.point
     noise = state.observation_noise.at(state.observer.body_points(rows))
     covariance = np.zeros((p + k * len(rows),) * 2)
@@ -147,7 +124,7 @@ def _merge(state: State, rows: IntArray, known: LandmarkMap) -> None:
 
 
 def _counts(known: LandmarkMap, state: State) -> IntArray:
-    """Return how often landmarks of a map count as seen: a surveyed one is believed at once."""
+    """Return how often landmarks of a map count as seen: a surveyed one is confirmed at once."""
     return np.asarray(np.maximum(known.counts, state.settings.confirmations))
 
 
@@ -170,7 +147,7 @@ def _complete(state: State, known: LandmarkMap) -> None:
         _fix(state, known)
     else:
         state.filter.add_known(*_in_reference_frame(state, new))
-    state.forget_past('the place in the loaded map was found')
+    state.forget_past('the pose in the loaded map was found')
 
 
 def _fix(state: State, known: LandmarkMap) -> None:

@@ -1,14 +1,13 @@
 """The paper's gains: constant k_i and l_i; (28)–(31) integrated so that any step is stable.
 
-The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²/2). Here
-the pose is moved by an exponential integrator of the linearised flow. With J_i = [−[e_i]×, I],
-g = Σ k_i J_iᵀ r_i and the Gauss–Newton matrix H = Σ k_i J_iᵀ J_i, that is
+The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²/2). Here the pose
+is moved by an exponential integrator of the linearised flow. With gains k_i (m,), J_i = [−[e_i]×,
+I] for errors e_i (m, 3), residuals r_i (m, 3), g = Σ k_i J_iᵀ r_i and H = Σ k_i J_iᵀ J_i, that is
 
     ξ = −U diag((1 − e^{−λ dt})/λ) Uᵀ g,      H = U diag(λ) Uᵀ,
 
-and the landmarks close the share 1 − e^{−(l/k) dt} of what remains. For dt → ∞ it is one
-Gauss–Newton step. For dt → 0 it is −g dt about the centroid of the e_i, down the same L as the
-paper's Δ dt in another metric; with `step_mode: paper` it is Δ dt.
+and the landmarks close the share 1 − e^{−(l/k) dt} of what remains: for dt → ∞ one Gauss–Newton
+step, for dt → 0 a step down the same L as the paper's Δ dt (docs/theory.md, Discrete time).
 """
 
 from __future__ import annotations
@@ -32,12 +31,11 @@ PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 
 
 class ConstantFilter(Filter):
-    """Constant gains k and l, the same for every landmark.
+    """Constant gains k (30) and l (31), the same for every landmark.
 
-    ``gain_k`` is k of (30), ``gain_l`` is l of (31). The ``step_mode`` 'paper' turns about the
-    reference's origin with the metric of (10), and so converges to the paper's differential
-    equation (:mod:`.innovation`) for dt → 0; 'exponential' turns about the centroid of the e_i,
-    where rotation and translation do not compete. In ``two_d_mode`` all turns are about z.
+    The ``step_mode`` 'paper' turns about the reference's origin with the metric of (10), and so
+    converges to the paper's equation (:mod:`.innovation`) for dt → 0; 'exponential' turns about
+    the centroid of the e_i, where rotation and translation do not compete.
     """
 
     ignores = (
@@ -58,6 +56,7 @@ class ConstantFilter(Filter):
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Integrate the innovation (30), (31) over the time since landmarks were seen before."""
+        # The gains, and how long they act.
         settings, e, r = self._settings, residuals.e, residuals.r
         gain_l = 0.0 if self._is_fixed else settings.gain_l
         k = np.full(len(r), settings.gain_k)
@@ -65,6 +64,7 @@ class ConstantFilter(Filter):
         dt_s = np.minimum(residuals.dt_s, settings.max_innovation_time)
         # One time for the pose: were the r_i to act for different ones, L (34) might grow.
         D = safe_step(partial(step, axes=self.axes), k, e, r, float(np.mean(dt_s)))  # (30)
+        # What the pose's step leaves of each residual is closed in part by its landmark.
         remaining = se3.transform(D, e) - e + r
         shares = -np.expm1(-gain_l / settings.gain_k * dt_s)
         d = shares[:, None] * remaining  # (31) but for Δ â_i, which moving by D brings with it
@@ -84,10 +84,7 @@ class ConstantFilter(Filter):
 def centroid_step(
     k: FloatArray, e: FloatArray, r: FloatArray, dt_s: float, axes: EstimatedAxes = SPATIAL
 ) -> FloatArray:
-    """Return the pose's step D (4, 4), turning about the gain-weighted centroid of the e_i.
-
-    Gains k_i (m,), errors e_i and residuals r_i (m, 3) in metres, and the time step in seconds.
-    """
+    """Return the pose's step D (4, 4), turning about the gain-weighted centroid of the e_i."""
     total = np.sum(k)
     centre = k @ e / total if total > 0.0 else np.zeros(3)
     return _step_about(centre, np.ones(6), k, e, r, dt_s, axes)
@@ -107,11 +104,9 @@ def safe_step(
     r: FloatArray,
     dt_s: float,
 ) -> FloatArray:
-    """Return ``step``'s D for the longest dt / 2^j at which L does not grow.
-
-    The flow itself never raises L (35), so a short enough step doesn't either. Only large
-    turns of few landmarks ever need j > 0.
-    """
+    """Return ``step``'s D for the longest dt / 2^j at which L does not grow."""
+    # The flow itself never raises L (35), so a short enough step does not either: only large turns
+    # of few landmarks ever need j > 0.
     rounding = np.finfo(float).eps * (np.max(np.abs(e), initial=0.0) + 1.0)
     bound = lyapunov(k, r) * (1.0 + 1e-12) + lyapunov(k, np.full_like(r, rounding))
     D = step(k, e, r, dt_s)
@@ -131,10 +126,12 @@ def _step_about(
     axes: EstimatedAxes,
 ) -> FloatArray:
     """Return the exponential step D (4, 4) about ``centre`` with the diagonal ``metric``."""
+    # Gradient and Gauss–Newton matrix, in the coordinates in which the metric is I.
     J = axes.output_matrix(e - centre)
     root, r = np.sqrt(metric[axes.pose]), r[:, : axes.point]
     g = root * np.einsum('i,ijk,ij->k', k, J, r)
     H = root[:, None] * np.einsum('i,ijk,ijl->kl', k, J, J) * root
+    # The flow along each eigenvector for dt, as a turn about the centre.
     rates, U = np.linalg.eigh(H)
     xi = axes.full_pose(-root * (U @ (_held_time(rates, dt_s) * (U.T @ g))))
     R = so3.exp(xi[:3])

@@ -2,7 +2,8 @@
 
 Both live and change together. What a filter does not override is right for one that knows no
 noise. Covariances are those of errors in the reference frame, m² and rad²; None where a filter
-knows none.
+knows none. Landmarks are given by rows (m,), points (m, 3) in the body frame, metres, with
+covariances (m, 3, 3), m².
 """
 
 from __future__ import annotations
@@ -26,41 +27,19 @@ OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 
 
 class Filter:
-    """X̂ and what is known of its errors; a subclass sets the gains of the innovation.
+    """X̂, starting at ``reference_pose`` P° (4, 4), and its errors; a subclass sets gains."""
 
-    Parameters
-    ----------
-    settings : Settings
-        The settings in force.
-    reference_pose : FloatArray
-        (4, 4) P°, body to world.
-
-    Attributes
-    ----------
-    observer : Observer
-        X̂ and its reference ξ°.
-    calibration : Calibration
-        Scale, bias and delay of the velocity, as far as they are known.
-    axes : EstimatedAxes
-        What of the pose and of points is estimated.
-    joint : JointCovariance or None
-        The covariance of the errors of pose and landmarks together, where it is kept.
-    has_joint_covariance : bool
-        Whether it is, so that observations can be judged by it, as association does.
-    ignores : tuple of str
-        Settings without effect on the filter.
-
-    """
-
+    # The covariance of the errors of pose and landmarks together, where it is kept, and whether
+    # it is: only by that can association judge observations.
     joint: JointCovariance | None = None
     has_joint_covariance: ClassVar[bool] = False
-    ignores: ClassVar[tuple[str, ...]] = ()
+    ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect on the filter
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
-        self.axes = axes_of(settings.two_d_mode)
-        self.observer = Observer(reference_pose)
-        self.calibration = Calibration(settings, self.axes)
+        self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
+        self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
+        self.calibration = Calibration(settings, self.axes)  # scale, bias, delay of velocities
 
     # The step (27)-(31)
 
@@ -75,9 +54,9 @@ class Filter:
         """Return what landmarks ``rows`` (m,) seen at ``points`` (m, 3) say against X̂ (29).
 
         Points and their ``covariances`` (m, 3, 3) are in the body frame, m and m²; ``dt_s`` (m,)
-        are the seconds since each was seen before. :meth:`expected_points` has been asked for
-        them: a filter that postpones moves of landmarks moves them there.
+        is the time since each was last seen.
         """
+        # A filter that postpones moves of landmarks has made them for :meth:`expected_points`.
         observer = self.observer
         e, r = observer.errors(rows, points)
         return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s)
@@ -89,7 +68,7 @@ class Filter:
     # Landmarks
 
     def add(self, points: FloatArray, covariances: FloatArray) -> None:
-        """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
+        """Append landmarks seen for the first time at ``points``."""
         self.observer.add_landmarks(points)
 
     def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
@@ -97,7 +76,7 @@ class Filter:
         self.observer.add_reference_landmarks(y_ref)
 
     def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
-        """Take landmarks for new ones, seen for the first time at ``points``, body frame."""
+        """Take landmarks for new ones, seen for the first time at ``points``."""
         self.observer.relocate_landmarks(rows, points)
 
     def remove(self, rows: IntArray) -> None:
@@ -105,10 +84,7 @@ class Filter:
         self.observer.remove_landmarks(rows)
 
     def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Take all landmarks for exact and at rest at ``y_ref`` (n, 3), and never move them.
-
-        ``covariances`` (n, 3, 3) are what the map says of them, which is only passed on.
-        """
+        """Take all landmarks for exact and at rest at ``y_ref`` (n, 3), and never move them."""
         self.observer.fix_landmarks(y_ref)
 
     def expected_points(self, rows: IntArray) -> FloatArray:
@@ -124,8 +100,7 @@ class Filter:
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate to where m of its landmarks are known to be.
 
-        ``r`` (m, 3) are estimated minus known positions, metres, reference frame; ``covariances``
-        (m, 3, 3) those of the known positions, m².
+        ``r`` (m, 3) is estimated minus known, reference frame; covariances are of the known ones.
         """
         raise NotImplementedError
 
@@ -147,7 +122,7 @@ class Filter:
         return np.empty(0)
 
     def pose_covariance(self, motion: Motion | None = None) -> FloatArray | None:
-        """Return the covariance (6, 6) of ε in Â = exp(ε) A; after a motion that is yet to be."""
+        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come."""
         return None
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:
@@ -159,14 +134,11 @@ class Filter:
         return None
 
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
-        """Return the covariance (m k, m k) of where m landmarks are seen from the robot, m².
-
-        Joint, along the axes of the body that are estimated. The choice of the world's frame has
-        no part in it.
-        """
+        """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m²."""
         P, axes = self.joint_covariance(rows), self.axes
         if P is None:
             return None
+        # Along the axes of the body: the choice of the world's frame has no part in it.
         m, k, p = len(rows), axes.point, axes.p
         C = axes.output_matrix(self.points[rows]).reshape(-1, p)
         CP = C @ P[:p] - P[p:]
@@ -180,8 +152,5 @@ class Filter:
         return np.zeros(len(residuals.r))
 
     def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
-        """Return what a joint covariance predicts of m residuals, but for the points' noise.
-
-        Their covariances (p, m k) with ε, and their own, (m k, m k).
-        """
+        """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
         raise NotImplementedError

@@ -1,14 +1,11 @@
-"""How landmarks that are known in another frame tell where a whole estimate lies in it.
+"""How landmarks that are known in another frame determine where a whole estimate lies in it.
 
-Pose and landmarks of an estimate may be moved together by any rigid motion exp(γ) without
-changing what is observed: that is the gauge of SLAM. If nothing is known of γ beforehand, the
-error of an estimate, seen from the other frame, is x + G γ, with x ~ N(0, P) as before. Landmarks
-known there, up to noise of covariance R, show the differences
-
-    r = H (x + G γ) + noise,        S = H P Hᵀ + R,        J = H G.
-
-Generalised least squares give γ = Λ Jᵀ S⁻¹ r with Λ = (Jᵀ S⁻¹ J)⁻¹, and then x follows as in a
-Kalman filter from what γ leaves of r. No large number has to stand for 'unknown'.
+Pose and landmarks may be moved together by any rigid motion exp(γ) without changing what is
+observed: the gauge of SLAM. If nothing is known of γ beforehand, the error of an estimate, seen
+from the other frame, is x + G γ, with x ~ N(0, P) as before. Landmarks known there, up to noise of
+covariance R, differ by r = H (x + G γ) + noise. With S = H P Hᵀ + R and J = H G, generalised least
+squares give γ = Λ Jᵀ S⁻¹ r, Λ = (Jᵀ S⁻¹ J)⁻¹, and x follows as in a Kalman filter from what γ
+leaves of r. No large number has to stand for 'unknown'.
 """
 
 from __future__ import annotations
@@ -32,32 +29,17 @@ def gauge_information(J: FloatArray, S: FloatArray) -> FloatArray:
 def anchor(
     P: FloatArray, G: FloatArray, PH: FloatArray, S: FloatArray, J: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Bring an estimate of unknown gauge to where known landmarks show it to be.
+    """Return the error x + G γ (N,) of an estimate, and the covariance (N, N) after it.
 
-    Parameters
-    ----------
-    P : FloatArray
-        (N, N) covariance of the error x.
-    G : FloatArray
-        (N, d) how x changes when the whole estimate is moved.
-    PH, S, J : FloatArray
-        (N, q) P Hᵀ, (q, q) H P Hᵀ + R and (q, d) H G, with H x the errors of the known
-        landmarks' coordinates.
-    r : FloatArray
-        (q,) estimate minus known coordinates.
-
-    Returns
-    -------
-    x : FloatArray
-        (N,) error of the estimate, the gauge's included.
-    P : FloatArray
-        (N, N) its covariance now.
-
+    ``P`` (N, N), ``G`` (N, d), ``PH`` = P Hᵀ (N, q), ``S`` (q, q), ``J`` (q, d) are those of the
+    module's docstring, ``r`` (q,) is estimate minus known coordinates.
     """
     S = S + JITTER_M2 * np.eye(len(r))
+    # γ by generalised least squares, then a Kalman filter's gain for what it leaves.
     information = gauge_information(J, S)
     gamma = np.linalg.solve(information, J.T @ _solve(S, r))
     K = _solve(S, PH.T).T
+    # The error of γ adds to what remains of P.
     B = G - K @ J
     after = P - K @ PH.T + B @ np.linalg.solve(information, B.T)
     return G @ gamma + K @ (r - J @ gamma), symmetric(after)

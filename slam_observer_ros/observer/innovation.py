@@ -1,6 +1,6 @@
 """The paper's innovation (28)–(31) in continuous time, and the Lyapunov function that it lowers.
 
-Signs are put right: as printed, (30) lacks a minus and (31) has one too many, and L grows. They
+Signs are put right: as printed, (30) has no minus and (31) has one too many, and L grows. They
 follow from ė_i = Δ e_i + Δ â_i − δ_i, for which (35) holds. Gains k_i, l_i are (m,), errors e_i,
 residuals r_i and translations â_i (m, 3) in metres, in the reference frame.
 """

@@ -2,7 +2,7 @@
 
 X̂ = (Â, â_1 … â_n) lives on the group; with the reference ξ° = [P°, p_i°] it gives the estimate
 P̂ = P° Â and p̂_i = p_i° + R_P° â_i (23). Everything here is in the frame of P°, where the
-reference landmarks are y_i° = P°⁻¹ p_i°.
+reference landmarks are y_i° = P°⁻¹ p_i°, in metres; points y_i (m, 3) seen are in the body frame.
 """
 
 from __future__ import annotations
@@ -14,30 +14,15 @@ from slam_observer_ros.geometry import se3, so3
 
 
 class Observer:
-    """State X̂ on SLAM_n(3) with its reference ξ°.
-
-    Attributes
-    ----------
-    reference_pose : FloatArray
-        (4, 4) P°, body to world.
-    A : FloatArray
-        (4, 4) Â.
-    a, y_ref : FloatArray
-        (n, 3) â_i and y_i° = P°⁻¹ p_i°, metres, reference frame.
-    u : FloatArray
-        (n, 3) velocities R_Â v_i of landmarks that move, m/s, reference frame; else zero.
-    have_moved : bool
-        Whether any landmark has had a velocity so far.
-
-    """
+    """State X̂ on SLAM_n(3) with its reference ξ°."""
 
     def __init__(self, reference_pose: FloatArray) -> None:
-        self.reference_pose = reference_pose
-        self.A: FloatArray = np.eye(4)
-        self.a: FloatArray = np.empty((0, 3))
-        self.y_ref: FloatArray = np.empty((0, 3))
-        self.u: FloatArray = np.empty((0, 3))
-        self.have_moved = False
+        self.reference_pose = reference_pose  # (4, 4) P°, body to world
+        self.A: FloatArray = np.eye(4)  # (4, 4) Â
+        self.a: FloatArray = np.empty((0, 3))  # (n, 3) â_i
+        self.y_ref: FloatArray = np.empty((0, 3))  # (n, 3) y_i°
+        self.u: FloatArray = np.empty((0, 3))  # (n, 3) velocities R_Â v_i, m/s; zero at rest
+        self.have_moved = False  # whether any landmark has had a velocity so far
 
     @property
     def pose(self) -> FloatArray:
@@ -62,13 +47,9 @@ class Observer:
         return turned
 
     def errors(self, rows: IntArray | slice, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the errors e_i (29) and residuals r_i (m, 3) of landmarks seen at ``points``.
-
-        Points y_i (m, 3) are in metres, body frame. The paper prints r_i = e_i − p_i°, which is
-        e_i − y_i° for P° = I.
-        """
+        """Return the errors e_i (29) and residuals r_i (m, 3) of landmarks seen at ``points``."""
         e = se3.transform(self.A, points) - self.a[rows]  # (29)  ρ(X̂⁻¹, y)_i
-        return e, e - self.y_ref[rows]
+        return e, e - self.y_ref[rows]  # the paper prints e_i − p_i°, which it is for P° = I
 
     def propagate(self, path: FloatArray) -> None:
         """Advance Â to the end of a ``path`` (k + 1, 4, 4), along which it is Â exp(V dt) (27)."""
@@ -83,8 +64,7 @@ class Observer:
     def correct(self, D: FloatArray, rows: IntArray | slice, d: FloatArray) -> None:
         """Move the state from the left: X̂ ← (D, d_i) · X̂, d_i (m, 3) for landmarks ``rows``.
 
-        To first order D (4, 4) = exp(Δ dt) and d_i + R_D â_i − â_i = δ_i dt with the paper's Δ
-        and δ_i (28). Other landmarks stay where they are in the world.
+        To first order D (4, 4) = exp(Δ dt), and d_i + R_D â_i − â_i = δ_i dt (28).
         """
         self.A = D @ self.A  # (28), Δ for a finite time
         self.a[rows] = self.a[rows] @ D[:3, :3].T + d  # (28), δ_i

@@ -10,31 +10,14 @@ from slam_observer_ros.geometry.axes import EstimatedAxes
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
-    """What an observation of m known landmarks says against the state.
+    """What an observation of m known landmarks says against the state, in the reference frame."""
 
-    Attributes
-    ----------
-    rows : IntArray
-        (m,) which landmarks are seen.
-    e : FloatArray
-        (m, 3) errors (29), metres, reference frame.
-    r : FloatArray
-        (m, 3) residuals e_i − y_i°, metres.
-    a : FloatArray
-        (m, 3) â_i, metres.
-    covariances : FloatArray
-        (m, 3, 3) covariances of the points seen, rotated into the reference frame, m².
-    dt_s : FloatArray
-        (m,) seconds since each of them was seen before, in this run; else infinite.
-
-    """
-
-    rows: IntArray
-    e: FloatArray
-    r: FloatArray
-    a: FloatArray
-    covariances: FloatArray
-    dt_s: FloatArray
+    rows: IntArray  # (m,) which landmarks are seen
+    e: FloatArray  # (m, 3) errors (29), metres
+    r: FloatArray  # (m, 3) residuals e_i − y_i°, metres
+    a: FloatArray  # (m, 3) â_i, metres
+    covariances: FloatArray  # (m, 3, 3) of the points seen, m²
+    dt_s: FloatArray  # (m,) seconds since each was seen before, in this run; else infinite
 
     @property
     def landmarks(self) -> FloatArray:

@@ -1,7 +1,8 @@
 """How far an observation is trusted: a Mahalanobis gate, then Huber's weight on what passes.
 
 Where the state is uncertain the gate is wide, and outliers pass it; see
-:func:`far_from_the_others`.
+:func:`far_from_the_others`. Residuals r are (m, k), metres; ``predicted`` (m k, m k) is their
+covariance C P Cᵀ without the ``noise`` (m, k, k) of the observations, m².
 """
 
 from __future__ import annotations
@@ -26,25 +27,12 @@ def observation_weights(
 ) -> FloatArray:
     """Return the weight (m,) of each observation, zero where the gate rejects it.
 
-    What passes has Huber's weight of what is left of its residual after the correction, R S⁻¹ r.
-    That is judged by the sensor's noise R, as in an M-estimator, and not by S: where the state is
-    uncertain a large residual says nothing against the observation.
-
-    Parameters
-    ----------
-    r : FloatArray
-        (m, k) residuals, metres.
-    predicted : FloatArray
-        (m k, m k) covariance C P Cᵀ of the predicted residuals, m².
-    noise : FloatArray
-        (m, k, k) covariances of the observations, m².
-    settings : Settings
-        ``rejection_threshold`` and ``huber_threshold``.
-
+    Else Huber's of what the correction leaves of the residual, R S⁻¹ r, judged by the noise R as
+    in an M-estimator: where the state is uncertain, a large residual says nothing against it.
     """
     gate, weights = settings.rejection_threshold, np.ones(len(r))
     S_inv_r = _solve_residuals(r, predicted, noise)
-    # No residual is further out than all of them together are.
+    # The gate. No residual is further out than all of them together are.
     if np.vdot(r, S_inv_r) > gate**2:
         passed, predicted_passed = gated(r, predicted, noise, settings)
         if not passed.all():
@@ -53,6 +41,7 @@ def observation_weights(
                 r[passed], predicted_passed, noise[passed], settings
             )
             return weights
+    # Huber's weights, by reweighted least squares.
     weights = huber_weights(S_inv_r, noise, weights, settings.huber_threshold)
     for _ in range(REWEIGHTINGS - 1):
         if weights.min(initial=1.0) == 1.0:
@@ -63,25 +52,20 @@ def observation_weights(
 
 
 def are_far(sensor_distances: FloatArray, settings: Settings) -> BoolArray:
-    """Return which residuals are too large for a state that was known; see SUSPICION.
-
-    ``sensor_distances`` (m,) are theirs by the sensor's noise alone.
-    """
+    """Return which residuals are suspect by their distances (m,) in the sensor's noise alone."""
     return sensor_distances > SUSPICION * settings.rejection_threshold
 
 
 def far_from_the_others(
     r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
 ) -> BoolArray:
-    """Return which observations (m,) pass the gate, but are far off if all others are true.
-
-    These leave ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i of the residual r_i. Parameters as above.
-    """
+    """Return which observations (m,) pass the gate, but are far off if all others are true."""
     passed, predicted_passed = gated(r, predicted, noise, settings)
     S = with_blocks(predicted_passed, noise[passed])
     information: FloatArray = np.linalg.inv(S).astype(np.float64)
     S_inv_r = (information @ r[passed].ravel()).reshape(*r[passed].shape, 1)
     blocks = diagonal_blocks(information, r.shape[1])
+    # What the others leave of the residual r_i: ((S⁻¹)_ii)⁻¹ (S⁻¹ r)_i.
     left = np.asarray(np.linalg.solve(blocks, S_inv_r)[:, :, 0])
     passed[passed] = are_far(mahalanobis(left, noise[passed]), settings)
     return passed
@@ -90,44 +74,30 @@ def far_from_the_others(
 def gated(
     r: FloatArray, predicted: FloatArray, noise: FloatArray, settings: Settings
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which observations (m,) pass the gate, and the part of ``predicted`` that is theirs.
-
-    Parameters as above.
-    """
+    """Return which observations (m,) pass the gate, and their part of ``predicted``."""
     passed = distances(r, predicted, noise) <= settings.rejection_threshold
     used = np.flatnonzero(np.repeat(passed, r.shape[1]))
     return passed, predicted[used][:, used]
 
 
 def distances(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the Mahalanobis distance (m,) of each residual; parameters as above."""
+    """Return the Mahalanobis distance (m,) of each residual."""
     return mahalanobis(r, diagonal_blocks(predicted, r.shape[1]) + noise)
 
 
 def huber_weights(
     S_inv_r: FloatArray, noise: FloatArray, weights: FloatArray, threshold: float
 ) -> FloatArray:
-    """Return Huber's weights (m,) of what is left of residuals after a correction.
+    """Return Huber's weights (m,) of what a correction leaves of residuals; 1 for ``threshold`` 0.
 
-    Parameters
-    ----------
-    S_inv_r : FloatArray
-        (m, k) S⁻¹ r, with R = Σ/w in S. What is left is R S⁻¹ r, by the sensor's own Σ at the
-        distance √((S⁻¹ r)ᵀ Σ S⁻¹ r)/w from zero.
-    noise : FloatArray
-        (m, k, k) covariances Σ of the observations, m².
-    weights : FloatArray
-        (m,) weights w that were used.
-    threshold : float
-        Distance from which on an observation weighs less; with 0 all weigh the same.
-
+    ``S_inv_r`` (m, k) is S⁻¹ r, in S the R = Σ/w of the old ``weights`` w and ``noise`` Σ.
     """
     if threshold == 0.0:
         return np.ones(len(S_inv_r))
+    # R S⁻¹ r is left, by Σ at the distance √((S⁻¹ r)ᵀ Σ S⁻¹ r)/w from zero.
     left = np.sqrt(np.einsum('ij,ijk,ik->i', S_inv_r, noise, S_inv_r)) / weights
     return np.asarray(threshold / np.maximum(left, threshold))
 
 
 def _solve_residuals(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return S⁻¹ r (m, k)."""
     return solve(with_blocks(predicted, noise), r.ravel()).reshape(r.shape)

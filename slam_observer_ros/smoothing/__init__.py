@@ -1,1 +1,1 @@
-"""Trajectory and map in hindsight: Gauss–Newton on the group, and the equations it solves."""
+"""Smoothed trajectory and map: Gauss–Newton on the group, and the equations it solves."""

@@ -35,57 +35,22 @@ SMALL_BORDER = 100
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """The normal equations, block by block, of S poses and a border of b unknowns.
+    """The normal equations, block by block, of S poses and a border of b unknowns."""
 
-    Attributes
-    ----------
-    diagonal : FloatArray
-        (S, d, d) blocks of T.
-    above : FloatArray
-        (S - 1, d, d) blocks of T that link poses s and s + 1.
-    shared : FloatArray
-        (S, d, c) blocks of B that link poses to the first c unknowns of the border.
-    poses, landmarks : IntArray
-        (M,) which pose saw which landmark; no two are the same.
-    seen : FloatArray
-        (M, d, k) blocks of B that link the two.
-    first : FloatArray
-        (d, b) what else links the first pose to the border.
-    corner : FloatArray
-        (b, b) D.
-    gradient : FloatArray
-        (S, d) g.
-    border_gradient : FloatArray
-        (b,) h.
-
-    """
-
-    diagonal: FloatArray
-    above: FloatArray
-    shared: FloatArray
-    poses: IntArray
-    landmarks: IntArray
-    seen: FloatArray
-    first: FloatArray
-    corner: FloatArray
-    gradient: FloatArray
-    border_gradient: FloatArray
+    diagonal: FloatArray  # (S, d, d) blocks of T
+    above: FloatArray  # (S − 1, d, d) blocks of T that link poses s and s + 1
+    shared: FloatArray  # (S, d, c) blocks of B that link poses to the border's first c unknowns
+    poses: IntArray  # (M,) which pose saw …
+    landmarks: IntArray  # (M,) … which landmark; no two are the same
+    seen: FloatArray  # (M, d, k) blocks of B that link the two
+    first: FloatArray  # (d, b) what else links the first pose to the border
+    corner: FloatArray  # (b, b) D
+    gradient: FloatArray  # (S, d) g
+    border_gradient: FloatArray  # (b,) h
 
 
 class Factors:
-    """Factors of the normal equations.
-
-    Parameters
-    ----------
-    equations : Equations
-        What is to be solved.
-
-    Raises
-    ------
-    LinAlgError
-        If the equations leave something open.
-
-    """
+    """Factors of the normal equations; LinAlgError is raised if these are singular."""
 
     def __init__(self, equations: Equations) -> None:
         self._stretches = _Stretches(equations)
@@ -132,8 +97,8 @@ class _Stretches:
         self._count = 0 if is_small else (S - 1) // STRIDE
         self._inner = STRIDE * np.arange(self._count)[:, None] + np.arange(1, STRIDE)
         self._kept = np.setdiff1d(np.arange(S), self._inner)
-        stretch, place = np.divmod(equations.poses, STRIDE)
-        self._is_inner = (stretch < self._count) & (place > 0)
+        stretch, offset = np.divmod(equations.poses, STRIDE)
+        self._is_inner = (stretch < self._count) & (offset > 0)
         T, X = self._matrices(equations), self._links(equations)
         self._solved = np.linalg.solve(T, X)
         self._lost = transpose(X) @ self._solved
@@ -151,13 +116,15 @@ class _Stretches:
     def _links(self, equations: Equations) -> FloatArray:
         """Return (J, (STRIDE − 1) d, …): links to start, end and columns; then the gradient."""
         J, d, (k, c) = self._count, self._d, (equations.seen.shape[2], equations.shared.shape[2])
-        stretch, place = np.divmod(equations.poses[self._is_inner], STRIDE)
+        # Which landmarks each stretch saw, and the columns they have in it.
+        stretch, offset = np.divmod(equations.poses[self._is_inner], STRIDE)
         beyond = (len(equations.corner) - c) // k
         local, slots = _group(stretch, equations.landmarks[self._is_inner], J, beyond)
         own = landmark_columns(local, c, k).reshape(J, k * local.shape[1])
         self._columns = np.hstack([np.tile(np.arange(c), (J, 1)), own])
         seen = np.zeros((J, STRIDE - 1, d, local.shape[1], k))
-        seen[stretch, place - 1, :, slots] = equations.seen[self._is_inner]
+        seen[stretch, offset - 1, :, slots] = equations.seen[self._is_inner]
+        # The links of its first pose to the start, of its last to the end.
         to_start, to_end = np.zeros((2, J, STRIDE - 1, d, d))
         to_start[:, 0] = transpose(equations.above[self._inner[:, 0] - 1])
         to_end[:, -1] = equations.above[self._inner[:, -1]]
@@ -167,12 +134,13 @@ class _Stretches:
         return X.reshape(J, (STRIDE - 1) * d, X.shape[-1])
 
     def kept_chain(self, equations: Equations) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the blocks (R, d, d) and (R − 1, d, d) of the R poses that are left, and rows.
+        """Return blocks (R, d, d) and (R − 1, d, d) of the R poses left, and rows (b + 1, R, d).
 
-        The rows (b + 1, R, d) are their links to the border, and last their gradient.
+        The rows are their links to the border, and last their gradient.
         """
         J, d, start, end = self._count, self._d, slice(self._d), slice(self._d, 2 * self._d)
         diagonal, gradient = equations.diagonal[self._kept], equations.gradient[self._kept]
+        # Less what the stretches from each pose and to it have taken along.
         diagonal[:J] -= self._lost[:, start, start]
         diagonal[1 : J + 1] -= self._lost[:, end, end]
         gradient[:J] -= self._lost[:, start, -1]
@@ -190,9 +158,9 @@ class _Stretches:
         b, k, c = len(equations.corner), equations.seen.shape[2], equations.shared.shape[2]
         is_kept = ~self._is_inner
         columns = landmark_columns(equations.landmarks[is_kept], c, k)
-        places = np.searchsorted(self._kept, equations.poses[is_kept])
+        positions = np.searchsorted(self._kept, equations.poses[is_kept])
         rows = np.zeros((b + k, len(self._kept), self._d))
-        rows[columns, places[:, None]] = transpose(equations.seen[is_kept])
+        rows[columns, positions[:, None]] = transpose(equations.seen[is_kept])
         rows[:c] += equations.shared[self._kept].transpose(2, 0, 1)
         rows[:b, 0] += equations.first.T
         return rows
@@ -201,8 +169,8 @@ class _Stretches:
         """Return what is left of D (b, b) and of its gradient (b,)."""
         b, columns = len(equations.corner), self._columns
         size, own = b + equations.seen.shape[2], slice(2 * self._d, -1)
-        places = size * columns[:, :, None] + columns[:, None]
-        corner = sum_by(places.ravel(), size**2, self._lost[:, own, own].ravel())
+        entries = size * columns[:, :, None] + columns[:, None]
+        corner = sum_by(entries.ravel(), size**2, self._lost[:, own, own].ravel())
         gradient = sum_by(columns.ravel(), size, self._lost[:, own, -1].ravel())
         return (
             equations.corner - corner.reshape(size, size)[:b, :b],
@@ -238,13 +206,7 @@ def _group(
 ) -> tuple[IntArray, IntArray]:
     """Give the landmarks that each of ``count`` stretches saw numbers of its own.
 
-    Returns
-    -------
-    local : IntArray
-        (count, m) which they are, filled up with ``beyond``.
-    slots : IntArray
-        (M,) the number of each landmark in its stretch.
-
+    Return which they are (count, m), filled up with ``beyond``, and the number of each (M,).
     """
     pairs, inverse = np.unique(stretch * (beyond + 1) + landmarks, return_inverse=True)
     of_stretch, landmark = np.divmod(pairs, beyond + 1)
@@ -255,10 +217,8 @@ def _group(
 
 
 def _forward(chain: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return U⁻ᵀ b for each row b: half of what solving by T = Uᵀ U costs, and all it takes.
-
-    There must be a row: of none, SciPy 1.17 writes beyond the end.
-    """
+    """Return U⁻ᵀ b for each row b: half of solving by T = Uᵀ U, and all that is needed."""
+    # There must be a row: of none, SciPy 1.17 writes beyond the end.
     solved: FloatArray = dtbtrs(chain, rows.T, trans='T')[0].T
     return solved
 

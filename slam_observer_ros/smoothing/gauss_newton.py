@@ -1,4 +1,4 @@
-"""The whole trajectory and map in hindsight: Gauss–Newton on the group over all that was seen.
+"""The smoothed trajectory and map: Gauss–Newton on the group over all that was seen.
 
 The unknowns are a first pose and the S poses at which landmarks were observed, the n landmarks
 and the velocity's calibration c. They are moved by Â_s ← Â_s exp(η_s), p_i ← p_i + dp_i and
@@ -28,39 +28,17 @@ from slam_observer_ros.smoothing.prior import EXACT_M, Prior
 
 @dataclass(frozen=True, slots=True)
 class Keyframes:
-    """S keyframes with M observed points: what happened since the prior.
+    """S keyframes with M observed points since a prior."""
 
-    Attributes
-    ----------
-    motions : FloatArray
-        (S, 4, 4) pose of each keyframe in the one before it; the first in the prior's pose.
-    motion_covariances : FloatArray
-        (S, d, d) covariance of each motion as a right perturbation.
-    sensitivities : FloatArray
-        (S, d, c) derivative of each motion by the calibration, as a right perturbation.
-    calibrations : FloatArray
-        (S, c) calibration with which each motion was computed.
-    keyframes : IntArray
-        (M,) in which keyframe each point was observed.
-    landmarks : IntArray
-        (M,) which landmark it is.
-    points : FloatArray
-        (M, 3) where it was seen, metres, body frame.
-    information : FloatArray
-        (M, k, k) inverse covariance of it, body frame, 1/m².
-    shares : FloatArray
-        (M,) how much of it counts: less than 1 where its error is partly that of a point before.
-
-    """
-
-    motions: FloatArray
-    motion_covariances: FloatArray
-    sensitivities: FloatArray
-    calibrations: FloatArray
-    keyframes: IntArray
-    landmarks: IntArray
-    points: FloatArray
-    information: FloatArray
+    motions: FloatArray  # (S, 4, 4) pose in the one before; the first in the prior's pose
+    motion_covariances: FloatArray  # (S, d, d) of each motion as a right perturbation
+    sensitivities: FloatArray  # (S, d, c) derivative of each motion by the calibration, so too
+    calibrations: FloatArray  # (S, c) with which each motion was computed
+    keyframes: IntArray  # (M,) in which keyframe each point was observed
+    landmarks: IntArray  # (M,) which landmark it is
+    points: FloatArray  # (M, 3) where it was seen, metres, body frame
+    information: FloatArray  # (M, k, k) inverse covariance of it, body frame, 1/m²
+    # (M,) how much of it counts: less than 1 where its error is partly that of a point before
     shares: FloatArray
 
     def only(self, kept: BoolArray) -> Keyframes:
@@ -82,7 +60,7 @@ def joined(parts: list[Keyframes]) -> Keyframes:
 
 
 def no_keyframes(d: int, c: int, k: int) -> Keyframes:
-    """Return what happened while nothing did; d, c and k as in :class:`Smoother`."""
+    """Return no keyframes; d, c and k as in :class:`Smoother`."""
     none = np.empty(0, dtype=np.int64)
     return Keyframes(
         motions=np.empty((0, 4, 4)),
@@ -99,40 +77,20 @@ def no_keyframes(d: int, c: int, k: int) -> Keyframes:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Estimates in hindsight.
+    """Smoothed estimates."""
 
-    Attributes
-    ----------
-    poses : FloatArray
-        (S + 1, 4, 4) pose of the prior, then of each keyframe.
-    calibration : FloatArray
-        (c,) calibration of the velocity.
-    points : FloatArray
-        (n, 3) landmarks, metres.
-
-    """
-
-    poses: FloatArray
-    calibration: FloatArray
-    points: FloatArray
+    poses: FloatArray  # (S + 1, 4, 4) of the prior, then of each keyframe
+    calibration: FloatArray  # (c,) of the velocity
+    points: FloatArray  # (n, 3) landmarks, metres
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One Gauss–Newton step.
+    """One Gauss–Newton step."""
 
-    Attributes
-    ----------
-    start, end : Solution
-        Where all was linearised, and where that led.
-    factors : Factors
-        Of the equations at ``start``.
-
-    """
-
-    start: Solution
+    start: Solution  # where all was linearised
     end: Solution
-    factors: Factors
+    factors: Factors  # of the equations at ``start``
 
     def marginal(self) -> FloatArray:
         """Return the covariance of (η, dc, dp) at ``start``, η being that of the last pose."""
@@ -140,19 +98,10 @@ class Step:
 
 
 class Smoother:
-    """Gauss–Newton iterations over a prior and keyframes.
+    """Gauss–Newton iterations over a prior and the keyframes since.
 
-    Parameters
-    ----------
-    axes : EstimatedAxes
-        Which axes are estimated: d of the pose, k of a point.
-    prior : Prior
-        What was known before the first keyframe.
-    keyframes : Keyframes
-        What happened since.
-    settings : Settings
-        ``huber_threshold`` and ``rejection_threshold``.
-
+    ``axes`` are the d of the pose and k of a point that are estimated; of the settings,
+    ``huber_threshold`` and ``rejection_threshold`` weigh outliers.
     """
 
     def __init__(
@@ -195,6 +144,7 @@ class Smoother:
     def _linearise(self, solution: Solution) -> Equations:
         c, k, keyframes = len(solution.calibration), self._axes.point, self._keyframes
         S, d, b = len(solution.poses), self._axes.p, c + k * len(solution.points)
+        # What the observations say of poses, landmarks, and of both together.
         H, gradient = self._observations(solution)
         poses, landmarks, n = keyframes.keyframes + 1, keyframes.landmarks, len(solution.points)
         columns = landmark_columns(np.arange(n), c, k)
@@ -237,12 +187,14 @@ class Smoother:
         """Add e_s = log((M_s exp(F_s (c − c_s)))⁻¹ Â_{s−1}⁻¹ Â_s) of each motion M_s."""
         keyframes, pose = self._keyframes, self._axes.pose
         d, c = self._axes.p, len(solution.calibration)
+        # The motions, had they been computed with this calibration, and their errors.
         eta = np.zeros((len(keyframes.motions), 6))
         off = solution.calibration - keyframes.calibrations
         eta[:, pose] = (keyframes.sensitivities @ off[:, :, None])[:, :, 0]
         back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
         motions = keyframes.motions @ se3.exp(eta)
         error = se3.log(se3.inverse(back @ motions))
+        # Derivatives by the pose after a motion, by that before, and by the calibration.
         J_to = self._estimated(se3.left_jacobian_inverse(-error))
         J_from = -J_to @ self._estimated(se3.adjoint(back))
         F = keyframes.sensitivities
@@ -251,6 +203,7 @@ class Smoother:
             F = J_off @ F
         J = np.concatenate([J_from, J_to, F], axis=2)
         H, gradient = _normal(J, self._motion_information, error[:, pose])
+        # The blocks of the poses before (:-1) and after (1:), and of the calibration.
         equations.diagonal[:-1] += H[:, :d, :d]
         equations.diagonal[1:] += H[:, d : 2 * d, d : 2 * d]
         equations.above[:] += H[:, :d, d : 2 * d]

@@ -1,4 +1,4 @@
-"""What a filter has seen since its prior, kept so that it can be linearised again."""
+"""What a filter has seen since its prior, kept so that it can be relinearised."""
 
 from __future__ import annotations
 
@@ -20,37 +20,20 @@ from slam_observer_ros.smoothing.prior import Prior
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """All m landmarks of one observation, after the correction and with the new ones.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the observation, nanoseconds.
-    rows : IntArray
-        (m,) which landmarks were seen.
-    points : FloatArray
-        (m, 3) where, metres, body frame.
-    lines_of_sight : FloatArray
-        (m, 3) from the sensor to where they should have been, or, where that is not sure, to where
-        they were seen, metres, body frame.
-    covariances : FloatArray or None
-        (m, 3, 3) covariance of the points, body frame, m²; None where the noise model has it.
-    dt_s : FloatArray
-        (m,) seconds since each of them was seen before; infinite if it was not.
-
-    """
+    """All m landmarks of one observation, after the correction and with the new ones."""
 
     stamp_ns: int
-    rows: IntArray
-    points: FloatArray
+    rows: IntArray  # (m,) which landmarks were seen
+    points: FloatArray  # (m, 3) where, metres, body frame
+    # (m, 3) from the sensor to where they should be, or are measured if that is not sure, metres
     lines_of_sight: FloatArray
-    covariances: FloatArray | None
-    dt_s: FloatArray
+    covariances: FloatArray | None  # (m, 3, 3) of the points, m²; None for the noise model's
+    dt_s: FloatArray  # (m,) seconds since each was seen before; infinite if it was not
 
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """A keyframe and the motion that led to it, as :meth:`History.move` was given it, in all."""
+    """A keyframe and the motion that led to it, the sum of those given to History.move."""
 
     start: FloatArray
     end: FloatArray
@@ -61,55 +44,33 @@ class _Step:
 
 
 class History:
-    """Motions and observations, keyframe by keyframe.
+    """Motions and observations since a prior, keyframe by keyframe.
 
-    Parameters
-    ----------
-    axes : EstimatedAxes
-        Which axes are estimated.
-    noise : ObservationNoise
-        Noise of the observations.
-    prior : Prior
-        What was known before the first keyframe.
-    since : str
-        What happened then, in words.
-
-    Attributes
-    ----------
-    prior, since : Prior, str
-        The same.
-    summary : Prior
-        What was known after the first ``summarised`` keyframes; at first the prior.
-    summarised : int
-        How many keyframes these are.
-    stamps_ns : list of int
-        Stamps of the keyframes, nanoseconds.
-    poses : list of FloatArray
-        Current estimates (4, 4) of the prior's pose and of each keyframe's.
-
+    ``since`` says in words what happened before the first of them.
     """
 
     def __init__(
         self, axes: EstimatedAxes, noise: ObservationNoise, prior: Prior, since: str
     ) -> None:
         self._axes, self._observation_noise = axes, noise
+        # What was known at first, and after the first ``summarised`` keyframes.
         self.prior = self.summary = prior
         self.summarised = 0
         self.since = since
-        self.stamps_ns: list[int] = []
-        self.poses: list[FloatArray] = [prior.pose]
+        self.stamps_ns: list[int] = []  # of the keyframes
+        self.poses: list[FloatArray] = [prior.pose]  # estimates, then those of the keyframes
         self._calibration = prior.calibration
         self._start: FloatArray | None = None
         self._end = prior.pose
         self._motion_noise, self._sensitivity = self._at_rest()
-        # Frames as arrays: those that are summarised, in pieces, and those that are not.
+        # Keyframes as arrays: those that are summarised, in pieces, and those that are not.
         self._none = no_keyframes(axes.p, len(prior.calibration), axes.point)
         self._summarised: list[Keyframes] = []
         self._latest = self._none
         self._new: list[_Step] = []
 
     def __deepcopy__(self, memo: dict[int, object]) -> History:
-        """Return a history that goes its own way from here: no array is ever changed in place."""
+        """Return an independent history: no array is ever changed in place."""
         other = copy(self)
         for name, value in vars(self).items():
             if isinstance(value, list):
@@ -136,7 +97,7 @@ class History:
         self._motion_noise, self._sensitivity = self._at_rest()
 
     def summarise(self, known: Prior) -> None:
-        """Take ``known`` for all that the keyframes up to now say."""
+        """Let ``known`` stand for all that the keyframes up to now say."""
         self._summarised.append(self._gathered())
         self._latest = self._none
         self.summary = known
@@ -196,6 +157,7 @@ class History:
     def _as_arrays(self, steps: list[_Step], first: int) -> Keyframes:
         """Return keyframes as arrays; ``first`` is the number of the first one."""
         pose, k, seen = self._axes.pose, self._axes.point, [step.keyframe for step in steps]
+        # Motions in the frame of the pose that they led to.
         back = se3.inverse(np.array([step.end for step in steps]))
         starts = np.array([step.start for step in steps])
         to_body = se3.adjoint(back)[:, pose, pose]

@@ -20,28 +20,13 @@ EXACT_M = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Estimates with the covariance of their errors: pose exp(η), c + dc and p_i + dp_i.
+    """Estimates with the covariance of their errors: pose exp(η), c + dc and p_i + dp_i."""
 
-    Attributes
-    ----------
-    pose : FloatArray
-        (4, 4) pose P.
-    calibration : FloatArray
-        (c,) estimate of the calibration.
-    points : FloatArray
-        (n, 3) landmarks that were known, metres; the first n of the map.
-    covariance : FloatArray
-        (d + c + k n, d + c + k n) covariance of (η, dc, dp).
-    is_relative : bool
-        Whether it is that of (η, dc, dy) instead, y_i = P⁻¹ p_i being where landmarks lie as seen
-        from the pose.
-
-    """
-
-    pose: FloatArray
-    calibration: FloatArray
-    points: FloatArray
-    covariance: FloatArray
+    pose: FloatArray  # (4, 4) P
+    calibration: FloatArray  # (c,)
+    points: FloatArray  # (n, 3) landmarks that were known, metres; the first n of the map
+    covariance: FloatArray  # (d + c + k n, d + c + k n) of (η, dc, dp)
+    # Whether it is that of (η, dc, dy) instead, of y_i = P⁻¹ p_i as seen from the pose.
     is_relative: bool = False
 
     def relative(self, axes: EstimatedAxes) -> Prior:
@@ -60,18 +45,10 @@ class Prior:
     def least_nonlinear(self, axes: EstimatedAxes) -> tuple[Prior, float]:
         """Return the prior in the coordinates, world's or body's, that heading changes least.
 
-        A map that the robot has made may yet turn as a whole, and the pose with it, by more than
-        the one against the other: in world coordinates that is an error of second order in the
-        angle. In a map that was loaded it is the pose alone that may yet turn. After a blind
-        stretch either may turn far.
-
-        Returns
-        -------
-        prior : Prior
-            The same knowledge.
-        angle_rad : float
-            Standard deviation of the angle by which it may yet turn in these coordinates.
-
+        And the standard deviation, rad, of the angle by which it may yet turn in these. A map that
+        the robot has made may turn as a whole, and the pose with it, by more than one against the
+        other: in world coordinates that is an error of second order in the angle. In a loaded map
+        the pose alone may turn. After a blind stretch either may turn far.
         """
         turns = self._turns(axes)
         together = self._turned_together(axes)
@@ -116,17 +93,11 @@ class Prior:
     ) -> tuple[FloatArray, FloatArray]:
         """Return Jᵀ W J and Jᵀ W e of the error e of estimates, by (η, dc, dp) of these.
 
-        Parameters
-        ----------
-        axes : EstimatedAxes
-            Which axes are estimated: d of the pose, k of a point.
-        information : FloatArray
-            W, the inverse of the covariance.
-        pose, calibration, points : FloatArray
-            (4, 4), (c,) and (n + …, 3) estimates.
-
+        ``information`` is W, the inverse of the covariance; estimates are a pose (4, 4),
+        calibration (c,) and points (n + …, 3).
         """
         d, k, first = axes.p, axes.point, self._first_point(axes)
+        # The error of pose, calibration and landmarks, and its derivatives.
         eta = se3.log(se3.inverse(self.pose) @ pose)
         y = self._seen_from(pose, points[: len(self.points)])
         shifts = (y - self._seen_from(self.pose, self.points))[:, :k].ravel()

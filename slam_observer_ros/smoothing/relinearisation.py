@@ -1,10 +1,10 @@
-"""When what was seen is linearised again, and what the filter takes over from that.
+"""When what was seen is relinearised, and what the filter takes over from that.
 
 Covariances that were computed around a poor early estimate stay wrong, so after a long blind
 stretch a plain filter closes its loop badly. How much its linearisation can have lost shows in
 how far its corrections have turned the robot.
 
-What was linearised again stays as it is: from then on a summary stands for it, in coordinates in
+What was relinearised stays as it is: from then on a summary stands for it, in coordinates in
 which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a blind stretch
 there may be no such summary until landmarks seen before are seen again. Else the cost does not
 grow with the history, of which only :meth:`Relinearisation.smooth` needs all.
@@ -34,7 +34,7 @@ from slam_observer_ros.smoothing.prior import Prior
 logger = logging.getLogger(__name__)
 
 SHARE_OF_HISTORY = 0.1
-"""Share of all observations so far that are linearised again at least, up to ``MAX_INTERVAL``.
+"""Share of all observations so far that are relinearised at least, up to ``MAX_INTERVAL``.
 
 As large maps take many observations, the O(n³) that this costs for n landmarks is shared by so
 many that each of them costs no more than an update, O(n²).
@@ -48,7 +48,7 @@ MAX_TURN_RAD = 0.2
 
 EARLY_SHARE = 0.1
 """Share of the observations otherwise waited for that will do after a single large correction:
-what is linearised before the next time is linearised in the wrong place.
+what is linearised before the next time is linearised at the wrong estimate.
 """
 
 ITERATIONS, TOLERANCE = 2, 2e-2
@@ -59,20 +59,11 @@ SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
 
 
 class Relinearisation:
-    """What a filter has seen since a prior, and when that is linearised again.
+    """What a filter has seen since a prior, and when that is relinearised.
 
-    Parameters
-    ----------
-    observer, calibration, joint : Observer, Calibration, JointCovariance
-        A filter's state and what it knows, at its start; relinearising changes them.
-    settings : Settings
-        ``hindsight_*``, ``huber_threshold``, ``rejection_threshold``, noise of observations.
-
-    Attributes
-    ----------
-    history : History
-        What was seen since the prior.
-
+    ``observer``, ``calibration`` and ``joint`` are a filter's, at its start; relinearising changes
+    them. ``relinearization_*``, ``smoothing_window``, ``huber_threshold``, ``rejection_threshold``
+    and the noise of observations are read from the settings. ``history`` has what was seen.
     """
 
     def __init__(
@@ -92,7 +83,7 @@ class Relinearisation:
 
     @property
     def is_active(self) -> bool:
-        """Whether there is a history, of what the smoother takes for constant."""
+        """Whether there is a history: the smoother takes the calibration for constant."""
         return self._settings.relinearization_interval > 0 and not self._calibration.drifts
 
     def reset(self, since: str) -> None:
@@ -117,7 +108,7 @@ class Relinearisation:
         self._largest_turn = max(self._largest_turn, turn_rad)
 
     def add(self, keyframe: Keyframe, in_doubt: bool) -> None:
-        """Add a keyframe; if it is time, or a landmark ``in_doubt``, linearise the latest again.
+        """Add a keyframe; if it is time, or a landmark ``in_doubt``, relinearise the latest ones.
 
         The smoother's marginal becomes the filter's covariance, and its solution the observer's
         new reference ξ°, with â_i = 0. It sums up all that was seen, for the next time.
@@ -129,7 +120,7 @@ class Relinearisation:
         self._observations += 1
         if in_doubt:
             self._relinearise()
-            # It may be placed again by this very keyframe, which must be kept for that.
+            # The landmark may be relocated by this very keyframe, which must be kept for that.
             self._is_owed = True
         elif self._window_is_full or self._is_due:
             self._sum_up(self._relinearise())
@@ -143,15 +134,10 @@ class Relinearisation:
         self.history.remove(rows)
 
     def smooth(self) -> Solution:
-        """Return all estimates, iterated from the present ones; pose, map, calibration rest.
+        """Return all smoothed estimates, iterated from the present ones, which stay as they are.
 
-        Raises
-        ------
-        ParameterError
-            If what the smoother takes for constant is not, or nothing is kept.
-        SmoothingError
-            If the observations don't determine everything.
-
+        Raise :exc:`ParameterError` if what the smoother takes for constant is not, or no history
+        is kept, :exc:`SmoothingError` if the observations don't determine everything.
         """
         self._check_smoothable()
         history = self.history
@@ -179,9 +165,9 @@ class Relinearisation:
 
     def _start(self, prior: Prior, since: str) -> None:
         self.history = History(self._axes, self._observation_noise, prior, since)
-        self._rest()
+        self._clear_counts()
 
-    def _rest(self) -> None:
+    def _clear_counts(self) -> None:
         self._observations = 0
         self._turn_squared = self._largest_turn = 0.0
         self._is_owed = False
@@ -193,11 +179,8 @@ class Relinearisation:
 
     @property
     def _is_due(self) -> bool:
-        """Whether corrections have turned far, with enough observations since it last was due.
-
-        Or whether what was linearised could not be summed up for a landmark in doubt.
-        """
-        if self._is_owed:
+        """Whether corrections have turned far, with enough observations since it last was due."""
+        if self._is_owed:  # it could not be summed up for a landmark in doubt
             return True
         settings = self._settings
         least = max(
@@ -209,8 +192,8 @@ class Relinearisation:
         return turned_far and self._observations >= least
 
     def _sum_up(self, is_done: bool) -> None:
-        """Let what is known now stand for all keyframes, if they could be linearised again."""
-        self._rest()
+        """Let what is known now stand for all keyframes, if they could be relinearised."""
+        self._clear_counts()
         known, angle_rad = self._known().least_nonlinear(self._axes)
         if self._window_is_full:
             self._start(known, 'the history was cut (smoothing_window=0 keeps all of it)')
@@ -218,11 +201,11 @@ class Relinearisation:
             self.history.summarise(known)
 
     def _relinearise(self) -> bool:
-        """Linearise the keyframes that are not summarised yet at the present estimates.
+        """Relinearise the keyframes that are not summarised at the present estimates, if possible.
 
-        Return whether anything came of it. If they don't determine everything, more may do so
-        later; the first time there is a warning.
+        Return whether it was: if they don't determine everything, more may do so later.
         """
+        # Smooth them, after the summary of those before, …
         history, first = self.history, self.history.summarised
         try:
             smoother = Smoother(
@@ -233,14 +216,15 @@ class Relinearisation:
         except np.linalg.LinAlgError:
             self._warning.give()
             return False
+        # … and let filter and history go on from the result.
         history.poses[first:] = list(step.end.poses)
         self._take_over(step, covariance)
         return True
 
     def _take_over(self, step: Step, covariance: FloatArray) -> None:
-        """Take where all was linearised for the reference; the step from there is a correction.
+        """Take the last step's start for the reference; the step is a correction from there.
 
-        ``covariance`` belongs to the step's start. Taken for that of its end it would say
+        ``covariance`` belongs to that start. Taken for that of the step's end it would say
         something of the gauge, of which nothing is known.
         """
         start, end, observer = step.start, step.end, self._observer
@@ -276,7 +260,7 @@ def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> Fl
 
 
 class _Warning(Immutable):
-    """Says once what may be wrong, for all copies of its owner: hypotheses are copies."""
+    """A warning that is given once by all copies of its owner: hypotheses are copies."""
 
     def __init__(self) -> None:
         self._is_given = False

@@ -1,7 +1,7 @@
 """Covariances as users know them, in the world or as seen from the robot, from the filter's.
 
 The filter knows the error ε of Â = exp(ε) A and the errors ã_i of the landmarks, in the reference
-frame. Functions return None where they know none.
+frame. Functions return None where it knows none.
 """
 
 from __future__ import annotations
@@ -39,10 +39,7 @@ def of_pose(observer: Observer, covariance: FloatArray | None, A: FloatArray) ->
 
 
 def of_pose_error(observer: Observer, world: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of ε, given that of the pose as :func:`of_pose` returns it.
-
-    What is beyond :data:`MAX_POSE_ERRORS` is made less.
-    """
+    """Return the covariance (6, 6) of ε from :func:`of_pose`'s, limited to MAX_POSE_ERRORS."""
     back = np.linalg.inv(_turn_to_world(observer, observer.A))
     covariance: FloatArray = back @ limited(world, MAX_POSE_ERRORS) @ back.T
     return covariance

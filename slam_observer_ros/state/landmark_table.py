@@ -29,46 +29,29 @@ _COLUMNS = (
 
 
 class LandmarkTable:
-    """Book-keeping of n landmarks; row i belongs to the observer's landmark i.
-
-    Attributes
-    ----------
-    ids : IntArray
-        (n,) landmark ids, in the order in which they were first seen.
-    counts : IntArray
-        (n,) in how many observations each was seen and accepted.
-    rejections : IntArray
-        (n,) how many observations in a row were rejected at one place, up to now.
-    rejected_at : FloatArray
-        (n, 3) where each was at the first of these, metres, reference frame.
-    rejected_last : FloatArray
-        (n, 3) where each was at the last of them.
-    last_seen_ns : IntArray
-        (n,) stamp of the latest observation of each, nanoseconds; −1 for before all others.
-    seen_before_ns : IntArray
-        (n,) stamp of the latest one before that, nanoseconds; −1 if there was none.
-    tentative : BoolArray
-        (n,) which have no id of their own, and have yet to be seen often enough to stay.
-    in_view : IntArray
-        (n,) in how many observations without ids each was in view.
-    missed : IntArray
-        (n,) in how many of these since the latest one that saw it.
-
-    """
+    """Book-keeping of n landmarks; row i belongs to the observer's landmark i."""
 
     def __init__(self) -> None:
+        # (n,) ids, in the order in which they were first seen
         self.ids: IntArray = np.empty(0, dtype=np.int64)
+        # (n,) in how many observations each was seen and accepted
         self.counts: IntArray = np.empty(0, dtype=np.int64)
+        # (n,) rejections in a row, all at one position, up to now
         self.rejections: IntArray = np.empty(0, dtype=np.int64)
+        # (n,) stamps of the latest observation and the one before it; −1 for none in this run
         self.last_seen_ns: IntArray = np.empty(0, dtype=np.int64)
         self.seen_before_ns: IntArray = np.empty(0, dtype=np.int64)
+        # (n,) which have no id of their own, and have yet to be seen often enough to stay
         self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
+        # (n,) observations without ids that had it in view, and those since the one that saw it
         self.in_view: IntArray = np.empty(0, dtype=np.int64)
         self.missed: IntArray = np.empty(0, dtype=np.int64)
+        # (n, 3) its position at the first and the last of the rejections, metres, reference frame
         self.rejected_at: FloatArray = np.empty((0, 3))
         self.rejected_last: FloatArray = np.empty((0, 3))
-        self._settled_in_view = 0
-        self._settled_seen = 0
+        # how often those without ids that were confirmed were in view, and were seen
+        self._confirmed_in_view = 0
+        self._confirmed_seen = 0
         self._order: IntArray = np.empty(0, dtype=np.int64)
 
     def __len__(self) -> int:
@@ -79,8 +62,8 @@ class LandmarkTable:
         """Return the row of each id (m,), −1 where it is unknown."""
         if not len(self.ids):
             return np.full(len(ids), -1)
-        place = self.ids.searchsorted(ids, sorter=self._order)
-        rows = self._order[np.minimum(place, len(self.ids) - 1)]
+        position = self.ids.searchsorted(ids, sorter=self._order)
+        rows = self._order[np.minimum(position, len(self.ids) - 1)]
         return np.where(self.ids[rows] == ids, rows, -1)
 
     def add(self, ids: IntArray, stamp_ns: int) -> None:
@@ -123,8 +106,8 @@ class LandmarkTable:
     def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
         """Return how long ``rows`` (m,) have not been seen at a stamp, seconds; maybe infinite.
 
-        What is seen again at the stamp at which it was seen is so by another sensor: that has
-        not seen it for as long as the first one had not.
+        What is seen twice at one stamp is seen by two sensors: the second has not seen it for as
+        long as the first one had not.
         """
         last_ns = self.last_seen_ns[rows]
         since_ns = np.where(last_ns == stamp_ns, self.seen_before_ns[rows], last_ns)
@@ -134,18 +117,18 @@ class LandmarkTable:
     def reject(self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray) -> None:
         """Count one more rejected observation of ``rows`` (m,).
 
-        Only rejections in a row and at one place add up: ``points`` (m, 3) within
+        Only rejections in a row and at one position add up: ``points`` (m, 3) within
         ``tolerances_m`` (m,) of where the first of them was, metres.
         """
-        same_place = self.are_rejected_again(rows, points, tolerances_m)
-        self.rejections[rows] = np.where(same_place, self.rejections[rows] + 1, 1)
-        self.rejected_at[rows[~same_place]] = points[~same_place]
+        again = self.are_rejected_again(rows, points, tolerances_m)
+        self.rejections[rows] = np.where(again, self.rejections[rows] + 1, 1)
+        self.rejected_at[rows[~again]] = points[~again]
         self.rejected_last[rows] = points
 
     def are_rejected_again(
         self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray
     ) -> BoolArray:
-        """Return which rows (m,) were rejected the last time, and at the same place."""
+        """Return which rows (m,) were rejected the last time, and at the same position."""
         shifts_m = np.linalg.norm(points - self.rejected_at[rows], axis=1)
         return np.asarray((self.rejections[rows] > 0) & (shifts_m <= tolerances_m))
 
@@ -163,28 +146,29 @@ class LandmarkTable:
 
     def note_in_view(self, rows: IntArray, seen: BoolArray) -> None:
         """Count one more observation that had rows (m,) in view, and which of them it saw."""
-        settled = ~self.tentative[rows]
-        self._settled_in_view += int(np.sum(settled))
-        self._settled_seen += int(np.sum(settled & seen))
+        confirmed = ~self.tentative[rows]
+        self._confirmed_in_view += int(np.sum(confirmed))
+        self._confirmed_seen += int(np.sum(confirmed & seen))
         self.in_view[rows] += 1
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
 
     @property
     def seen_share(self) -> float:
-        """How often a landmark without an id that has settled is seen while in view; else 0."""
-        return self._settled_seen / self._settled_in_view if self._settled_in_view else 0.0
+        """How often a confirmed landmark without an id is seen while in view; 0 if unknown."""
+        return self._confirmed_seen / self._confirmed_in_view if self._confirmed_in_view else 0.0
 
     def unsupported(self, min_support: int) -> IntArray:
         """Return rows without an id that were seen too seldom to be landmarks.
 
-        That is less than ``min_support`` times by when a settled one, as often in view, would have
-        been seen :data:`PATIENCE` times as often. One that was seen so often has settled.
+        That is less than ``min_support`` times by when a confirmed one, as often in view, would
+        have been seen :data:`PATIENCE` times as often. One that was seen so often is confirmed
+        here.
         """
-        settling = self.tentative & (self.counts >= min_support)
-        self._settled_in_view += int(np.sum(self.in_view[settling]))
-        self._settled_seen += int(np.sum(self.counts[settling]))
-        self.tentative &= ~settling
-        # Before any has settled nobody knows how often one is seen.
+        confirmed_now = self.tentative & (self.counts >= min_support)
+        self._confirmed_in_view += int(np.sum(self.in_view[confirmed_now]))
+        self._confirmed_seen += int(np.sum(self.counts[confirmed_now]))
+        self.tentative &= ~confirmed_now
+        # Before any is confirmed nobody knows how often one is seen.
         expected = self.in_view * self.seen_share
         return np.flatnonzero(self.tentative & (expected >= PATIENCE * min_support))
 

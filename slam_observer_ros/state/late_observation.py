@@ -1,4 +1,4 @@
-"""Observations that come when the state has moved on: what would be seen from where it is."""
+"""Late observations: what would be seen from where the state is now."""
 
 from __future__ import annotations
 
@@ -21,24 +21,13 @@ from slam_observer_ros.state.state import State
 def carried_forward(
     state: State, event: ObservationEvent, velocities: VelocityHistory, state_ns: int
 ) -> ObservationEvent:
-    """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since.
+    """Return what would be seen at ``state_ns``: Φ⁻¹ (y + v τ), Φ the motion since ``event``.
 
     Its points are as uncertain as any seen from there, and as that motion makes them. Its
     error is one and the same for all m, but is given to each as its own: m would average it
     down. Where velocities of landmarks are estimated, v may be anything that they may be.
-
-    Parameters
-    ----------
-    state : State
-        The state at ``state_ns``.
-    event : ObservationEvent
-        The observation, of m points, made before.
-    velocities : VelocityHistory
-        The velocities since then.
-    state_ns : int
-        Stamp of the state, nanoseconds.
-
     """
+    # The motion of the robot since then, and that of the landmarks.
     interval = (event.stamp_ns, state_ns)
     lag_s, calibration = to_s(state_ns - event.stamp_ns), state.filter.calibration
     back = se3.inverse(transition(velocities, calibration, *interval))
@@ -48,6 +37,7 @@ def carried_forward(
     sensor = shifts if event.sensor is None else event.sensor + shifts
     shifted = replace(event, stamp_ns=state_ns, points=points, sensor=sensor)
     moved = shifted.moved(back)
+    # What both add to the noise.
     Q = transition_covariance(velocities, calibration, state.motion_noise, *interval)
     C = back[:3, :3] @ SPATIAL.output_matrix(points)
     shared = len(points) * C @ Q @ transpose(C)
@@ -57,14 +47,11 @@ def carried_forward(
 
 
 def _landmark_velocities(state: State, event: ObservationEvent, A: FloatArray) -> FloatArray:
-    """Return how the landmarks (m, 3) seen move, m/s, along the axes of the body at Â = ``A``.
-
-    As estimated, or else as the observation says, which is made there; zero if neither is.
-    """
+    """Return how the landmarks (m, 3) seen move, m/s, along the axes of the body at Â = ``A``."""
     velocities = np.zeros_like(event.points)
     if state.is_fixed:
         return velocities
-    if not state.landmark_velocity_stddev:
+    if not state.landmark_velocity_stddev:  # not estimated: as the sensor says
         return velocities if event.velocities is None else event.velocities
     rows = state.landmarks.rows_of(event.ids)
     velocities[rows >= 0] = state.observer.u[rows[rows >= 0]]

@@ -20,31 +20,14 @@ SAME_POSITION = 4.0
 
 @dataclass(frozen=True, slots=True)
 class MatchedObservation:
-    """An observation, with the landmarks of a state that its points are of.
+    """An observation, with the landmarks of a state that its points are of."""
 
-    Attributes
-    ----------
-    event : ObservationEvent
-        The observation; where nothing is added to the map, without what is not in it.
-    rows : IntArray
-        (m,) row of the landmark that each of them is, −1 where it is new.
-    covariances : FloatArray
-        (m, 3, 3) their covariances, body frame, m².
-    known : ObservationEvent
-        The part of ``event`` that is of landmarks which are not new.
-    residuals : Residuals
-        Of this part.
-    left_out : int
-        How many points of the observation are not in ``event``.
-
-    """
-
-    event: ObservationEvent
-    rows: IntArray
-    covariances: FloatArray
-    known: ObservationEvent
-    residuals: Residuals
-    left_out: int
+    event: ObservationEvent  # where nothing is added to the map, without what is not in it
+    rows: IntArray  # (m,) row of the landmark that each point is, −1 where it is new
+    covariances: FloatArray  # (m, 3, 3) of the points, body frame, m²
+    known: ObservationEvent  # the part of it whose landmarks are not new
+    residuals: Residuals  # of that part
+    left_out: int  # points of the observation that are not in ``event``
 
 
 def match(state: State, event: ObservationEvent) -> MatchedObservation:
@@ -82,10 +65,9 @@ def keyframe_of(state: State, event: ObservationEvent, rows: IntArray) -> Keyfra
 
 
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
-    """Return where points seem to be (m, 3), and within what they are at one position, metres.
+    """Return where points seem to be (m, 3), metres, reference frame, and the tolerance of that.
 
-    In the reference frame, by their noise there: that of where a landmark should be may be much
-    less.
+    By their own noise: that of where a landmark should be may be much less.
     """
     spread_m = np.sqrt(np.trace(state.observation_noise.covariances(event), axis1=1, axis2=2))
     return se3.transform(state.observer.A, event.points), SAME_POSITION * spread_m
@@ -94,10 +76,10 @@ def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatA
 def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
     """Return the covariances (m, 3, 3) of points of landmarks ``rows``, −1 if new, body frame, m².
 
-    The noise model is given how far off a landmark should be, not how far it was measured: one
-    measured too near would be believed more than one measured too far, and all would be drawn
-    towards the robot. In which direction, the sensor knows better than a state does whose heading
-    is yet to be corrected.
+    The noise model is given the range at which a landmark should be, not the measured one: a range
+    measured short would be trusted more than one measured long, and all would be drawn towards
+    the robot. The bearing is the measured one: the sensor knows it better than a state whose
+    heading is yet to be corrected.
     """
     measured, expected = event.lines_of_sight, _lines_of_sight(state, event, rows)
     measured_m = np.maximum(np.linalg.norm(measured, axis=1), RESOLUTION_M)
@@ -108,8 +90,7 @@ def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> 
 def rejected_before(state: State, matched: MatchedObservation) -> tuple[BoolArray, FloatArray]:
     """Return which known landmarks (m,) in it were rejected before where they are seen now.
 
-    And how far all of them (m, 3) are from where they were rejected last, metres, reference
-    frame.
+    And how far (m, 3) all of them are from their last rejected position, metres, reference frame.
     """
     rows = matched.residuals.rows
     points, tolerances_m = positions(state, matched.known)
@@ -123,14 +104,11 @@ def is_contradiction(rejected: BoolArray) -> bool:
 
 
 def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> FloatArray:
-    """Return where points should be (m, 3), from the sensor, metres, body frame.
-
-    Of a landmark that is new, that is in doubt, or that was seen so seldom that it may itself be
-    an outlier, this is where it was measured.
-    """
+    """Return where points should be (m, 3), from the sensor, metres, body frame."""
     landmarks, settings = state.landmarks, state.settings
     if not len(landmarks):
         return event.lines_of_sight
+    # A landmark that is new, in doubt, or may itself be an outlier is where it was measured.
     is_confirmed = landmarks.counts[rows] >= settings.confirmations
     in_doubt = landmarks.in_doubt(rows, settings.max_rejections)
     is_sure = (rows >= 0) & is_confirmed & ~in_doubt

@@ -1,4 +1,4 @@
-"""One hypothesis of where everything is: a filter, its landmarks, and what it went through."""
+"""One hypothesis of pose and map: a filter, its landmarks, and their history."""
 
 from __future__ import annotations
 
@@ -23,54 +23,22 @@ from slam_observer_ros.state.landmark_table import LandmarkTable
 
 
 class State:
-    """Pose and map as of one instant; :mod:`.step` moves it on.
-
-    Parameters
-    ----------
-    filter_ : Filter
-        At the start.
-    settings : Settings
-        The settings in force.
-
-    Attributes
-    ----------
-    settings : Settings
-        The settings in force.
-    filter : Filter
-        X̂, and what is known of its errors.
-    observer, axes : Observer, EstimatedAxes
-        The filter's.
-    landmarks : LandmarkTable
-        Ids and counts of the n known landmarks.
-    relinearisation : Relinearisation or None
-        What was seen, where that is linearised again; None where the filter does not need it.
-    is_mapping : bool
-        Whether landmarks are added, and taken to have moved if they are rejected too often.
-    motion_noise, observation_noise : MotionNoise, ObservationNoise
-        Noise of velocities and of observed points.
-    counts : Counter
-        How many landmarks were rejected, have moved, were forgotten and so on.
-    rejected_in_a_row : int
-        Observations since the last one of which a known landmark was not rejected.
-    was_contradicted : bool
-        Whether of the latest observation of known landmarks most were rejected.
-
-    """
+    """Pose and map as of one instant; :mod:`.step` moves it on."""
 
     def __init__(self, filter_: Filter, settings: Settings) -> None:
-        self.settings = settings
-        self.is_mapping = True
-        self.filter = filter_
+        self.settings = settings  # those in force
+        self.is_mapping = True  # landmarks are added, and relocated if rejected too often
+        self.filter = filter_  # X̂, and what is known of its errors
         self.observer, self.axes = self.filter.observer, self.filter.axes
         self.landmarks = LandmarkTable()
-        self.relinearisation: Relinearisation | None = None
+        self.relinearisation: Relinearisation | None = None  # where the filter needs it
         if filter_.joint is not None and not self.landmark_velocity_stddev:
             self.relinearisation = Relinearisation(
                 self.observer, filter_.calibration, filter_.joint, settings
             )
-        self.counts: Counter[str] = Counter()
-        self.rejected_in_a_row = 0
-        self.was_contradicted = False
+        self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
+        self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
+        self.was_contradicted = False  # most known landmarks seen last were rejected
         self.motion_noise = MotionNoise(settings)
         self.observation_noise = ObservationNoise(settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
@@ -91,8 +59,8 @@ class State:
     def confirmed(self) -> IntArray:
         """Rows of the landmarks seen often enough to be in the map.
 
-        One that was seen once or twice may still be an outlier, and one without an id may be a
-        false point for longer; it helps to estimate the pose, but is not published.
+        One seen once or twice may still be an outlier, and one without an id a false point for
+        longer; it helps to estimate the pose, but is not published.
         """
         often = self.landmarks.counts >= self.settings.confirmations
         return np.flatnonzero(often & ~self.landmarks.tentative)
@@ -103,10 +71,7 @@ class State:
         return self.filter.world_points
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:
-        """Return the covariances (n, 3, 3) of the landmarks, world, m²; None if unknown.
-
-        As they will be when landmarks that move have moved on for ``duration_s``.
-        """
+        """Return those (n, 3, 3) of landmarks after ``duration_s``, world, m²; or None."""
         return covariances.of_landmarks(
             self.observer, self.filter.landmark_covariances(duration_s)
         )
@@ -144,15 +109,9 @@ class State:
             self._end_velocity = motion.at_ends[1]
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray | None) -> None:
-        """Move the robot and keep the map; what they have to do with each other is forgotten.
+        """Move the robot to ``pose`` (4, 4), body to world, uncorrelated with the map from now on.
 
-        Parameters
-        ----------
-        pose : FloatArray
-            (4, 4) body to world.
-        covariance : FloatArray or None
-            (6, 6) as :meth:`pose_after` has it; None for an exact pose.
-
+        ``covariance`` (6, 6) is that of :meth:`pose_after`; None for an exact pose.
         """
         observer = self.observer
         if not len(self.landmarks):
@@ -165,17 +124,14 @@ class State:
         self.forget_past('the pose was set')
 
     def clear_time(self) -> None:
-        """Go on from here at any other time; what was seen before is not linearised again."""
+        """Go on from here at any other time; what was seen before is not relinearised."""
         self._end_velocity = None
         self.was_contradicted = False
         self.landmarks.clear_time()
         self.forget_past('the clock jumped')
 
     def forget_past(self, since: str) -> None:
-        """Take what is known now for all that is known, when that is linearised again.
-
-        ``since`` is what has happened, in words.
-        """
+        """Relinearise nothing of what was seen until now; ``since`` says what has happened."""
         if self.relinearisation is not None:
             self.relinearisation.reset(since)
 
@@ -215,6 +171,7 @@ class State:
             raise ParameterError(
                 "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
             )
+        # From the reference frame to the world.
         found, rows = self.relinearisation.smooth(), self.confirmed
         history, P = self.relinearisation.history, self.observer.reference_pose
         return Smoothed(

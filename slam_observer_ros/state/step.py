@@ -22,25 +22,12 @@ from slam_observer_ros.state.state import State
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a state made of an observation.
+    """What an observation did to a state."""
 
-    Attributes
-    ----------
-    ids : IntArray
-        (m,) ids of the landmarks seen that were known before.
-    residuals : FloatArray
-        (m, 3) their residuals before the correction, metres, reference frame.
-    rejected : BoolArray
-        (m,) which of them were too far off to be used.
-    moved_ids : IntArray
-        Landmarks that it showed to have moved.
-
-    """
-
-    ids: IntArray
-    residuals: FloatArray
-    rejected: BoolArray
-    moved_ids: IntArray
+    ids: IntArray  # (m,) ids of the landmarks seen that were known before
+    residuals: FloatArray  # (m, 3) before the correction, metres, reference frame
+    rejected: BoolArray  # (m,) which of them were too far off to be used
+    moved_ids: IntArray  # ids of landmarks that it showed to have moved
 
 
 def step(state: State, matched: MatchedObservation) -> Outcome:
@@ -50,9 +37,9 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
     rejected = weights == 0.0
     _count(state, matched, rejected)
-    event, rows = _add_new(state, matched)
+    event, rows = _add_new(state, matched)  # y_i° = Â y_i
     moved_ids = _relinearise(state, event, rows)
-    _note_velocities(state, event, rows)
+    _set_velocities(state, event, rows)  # (19)
     return Outcome(matched.known.ids, residuals.r, rejected, moved_ids)
 
 
@@ -82,11 +69,8 @@ def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> No
 
 
 def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Linearise the past again, if it is time; take landmarks for moved if that explains nothing.
-
-    Now that the state is corrected, it is known better than before from where they were seen.
-    Return the ids of those that have moved.
-    """
+    """Relinearise, if it is time; relocate landmarks in doubt that this does not explain."""
+    # After the correction: their positions are known better than when they were seen.
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     some_are = bool(in_doubt.any())
     past = state.relinearisation
@@ -98,19 +82,13 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
 
 
 def _make_room(state: State, matched: MatchedObservation) -> None:
-    """Choose landmarks out of view to be forgotten for new ones, and stop relying on their past.
-
-    A history without them would lose what they have said of the pose.
-    """
+    """Give up the history before landmarks are forgotten for new ones: it depends on them."""
     if len(_rows_to_forget(state, matched)):
         state.forget_past('landmarks had to make room (max_landmarks)')
 
 
 def _add_new(state: State, matched: MatchedObservation) -> tuple[ObservationEvent, IntArray]:
-    """Add the landmarks of an observation that are new, in the place of others if need be.
-
-    Return the part of it that is of landmarks which are known now, and their rows.
-    """
+    """Add new landmarks; return the part of the observation that is mapped now, and its rows."""
     event, rows = matched.event, matched.rows
     if len(matched.known.ids) == len(rows):
         return event, rows
@@ -132,10 +110,7 @@ def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> Non
 
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
-    """Take landmarks in doubt for new ones if they are still far from where they were expected.
-
-    Return the ids of those that were seen often enough to say that they have moved.
-    """
+    """Relocate landmarks in doubt that are still far off; return ids of those that have moved."""
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
     far = state.filter.distances(residuals) > state.settings.rejection_threshold
@@ -147,7 +122,7 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     return event.ids[moved]
 
 
-def _note_velocities(state: State, event: ObservationEvent, rows: IntArray) -> None:
+def _set_velocities(state: State, event: ObservationEvent, rows: IntArray) -> None:
     """Let landmarks move as the sensor says; by one that says nothing they are static."""
     velocities = event.velocities
     if velocities is None and state.observer.have_moved:
@@ -171,10 +146,7 @@ def disbelieve(state: State, event: ObservationEvent) -> None:
 
 
 def _rows_to_forget(state: State, matched: MatchedObservation) -> IntArray:
-    """Return which landmarks out of view are to make room for the new ones of ``matched``.
-
-    The least often seen go first.
-    """
+    """Return landmarks out of view, the least often seen, to be forgotten for the new ones."""
     limit, new = state.settings.max_landmarks, len(matched.rows) - len(matched.residuals.rows)
     excess = len(state.landmarks) + new - limit
     if limit == 0 or new == 0 or excess <= 0:

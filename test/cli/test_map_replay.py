@@ -284,7 +284,7 @@ def test_smoothing_says_what_cut_the_history_short(slam_observer, tmp_path):
     jumped = slam_observer('replay', path, '--map', saved, *hold)
     assert 'those since the clock jumped' in jumped.errors
     loaded = slam_observer('replay', path, '--load-map', saved, '--smooth', *SETTINGS)
-    assert 'those since the place in the loaded map was found' in loaded.errors
+    assert 'those since the pose in the loaded map was found' in loaded.errors
     assert 'smoothing_window' not in jumped.errors + loaded.errors
 
 

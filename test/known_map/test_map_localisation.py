@@ -24,9 +24,8 @@ from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.known_map import localiser
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import CONFIRMING_VOTES, PoseTrial
+from slam_observer_ros.known_map.localiser import CONFIRMING_VOTES, is_lost, PoseTrial
 from slam_observer_ros.known_map.map_alignment import _contradictions, find_transform
-from slam_observer_ros.known_map.merging import is_lost
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.step import Outcome

@@ -159,7 +159,7 @@ def test_saved_killed_loaded_and_localised(ros, robot, tmp_path):
         assert not robot.odometry  # two landmarks don't determine where it is
         pose, covariance = robot.see_until_published(elsewhere, [7, 31, 44])
         assert nees(pose, covariance, elsewhere) < chi2.ppf(0.9973, 6)
-        node.wait_for_output('Found the place in the map')
+        node.wait_for_output('Found the pose in the map')
 
 
 def test_a_fixed_surveyed_map_is_saved_at_the_end_as_it_was(ros, robot, tmp_path):

@@ -20,21 +20,12 @@ from slam_observer_ros.sensor_models.motion import Motion
 
 
 class JointCovariance:
-    """P, and which of its columns are whose.
-
-    Attributes
-    ----------
-    P : FloatArray
-        (p + c + k n, p + c + k n) covariance of x.
-    first : int
-        p + c, the first column of the landmarks.
-
-    """
+    """P, and which of its columns are whose."""
 
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         self._axes, self._p = axes, axes.p
-        self.P = calibration.initial_covariance()
-        self.first = len(self.P)
+        self.P = calibration.initial_covariance()  # (p + c + k n, p + c + k n) of x
+        self.first = len(self.P)  # p + c, the first column of the landmarks
         self._stride = axes.point  # columns of each landmark
         self._first_columns = self.first + np.arange(axes.point)
 
@@ -70,18 +61,17 @@ class JointCovariance:
     # The step
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
-        """Let x become x + J (F c̃ + w), w the noise of a motion that has led to ``points``.
-
-        Landmarks with velocities ``u`` (n, 3) have moved there; known ones change no ξ_i.
-        """
+        """Let the robot move, and landmarks of velocities ``u`` (n, 3), to ``points`` (n, 3)."""
+        # Known velocities change no ξ_i.
         self._propagate(motion, self._turning(points).reshape(-1, self._p))
 
     def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
-        """Let x become x + J (F c̃ + w), given the rows of J that belong to landmarks."""
+        """Let x become x + J (F c̃ + w), w the noise of a motion, with J's rows of landmarks."""
         P, c = self.P, slice(self._p, self.first)
         J = np.zeros((len(P), self._p))  # how a motion of the robot alone changes x
         J[: self._p] = np.eye(self._p)
         J[self.first :] = J_landmarks
+        # P + J (…) Jᵀ, by halves that keep it symmetric.
         growth = 0.5 * motion.noise @ J.T
         if self._p < self.first:
             F = motion.sensitivity
@@ -91,12 +81,10 @@ class JointCovariance:
         P[c, c] += motion.drift
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
-        """Return C_i (m, k, p) of r_i = C_i ε − ξ_i: [0, I], in these coordinates.
-
-        That is at ŷ_i; ``chord`` is how far on the way from there to R_Â y_i + x_Â. Turning the
-        one to the other, by however much, moves it at right angles to the middle: judged by C at
-        ŷ_i, a robot that has turned further than it knows would reject what it sees.
-        """
+        """Return C_i (m, k, p) of r_i = C_i ε − ξ_i, at ``chord`` from ŷ_i to the point seen."""
+        # [0, I] at ŷ_i. Turning ŷ_i to the point seen, by however much, moves it at right angles
+        # to the middle between them: judged by C at ŷ_i, a robot that has turned further than it
+        # knows would reject what it sees.
         return self._axes.output_matrix(chord * residuals.r)
 
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -122,15 +110,15 @@ class JointCovariance:
 
     def add_seen(self, covariances: FloatArray) -> None:
         """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3)."""
-        self._place(self._make_room(len(covariances)), self._moving(covariances), covariances)
+        self._insert(self._make_room(len(covariances)), self._moving(covariances), covariances)
 
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
-        self._place(self._make_room(len(points)), self._turning(points), covariances)
+        self._insert(self._make_room(len(points)), self._turning(points), covariances)
 
     def relocate(self, rows: IntArray, covariances: FloatArray) -> None:
         """Take landmarks (m,) for newly seen ones, with covariances (m, 3, 3)."""
-        self._place(rows, self._moving(covariances), covariances)
+        self._insert(rows, self._moving(covariances), covariances)
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
@@ -168,8 +156,8 @@ class JointCovariance:
         PC = self.pose @ transpose(C) - transpose(to_pose)
         return PC, C @ PC - to_pose @ transpose(C) + own
 
-    def _place(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
-        """Fill in landmarks with ξ_i = C_i ε + noise of ``covariances``."""
+    def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
+        # ξ_i = C_i ε + noise of these covariances
         k, columns, C = self._axes.point, self._columns(rows), C.reshape(-1, self._p)
         CP = C @ self.P[: self._p]
         self.P[columns], self.P[:, columns] = CP, CP.T
@@ -186,11 +174,9 @@ class JointCovariance:
         return np.arange(first_row, first_row + m)
 
     def _columns(self, rows: IntArray) -> IntArray:
-        """Return the columns (m k,) that belong to landmarks (m,)."""
         return (self._first_columns + self._stride * rows[:, None]).ravel()
 
     def _all_turning(self, points: FloatArray) -> FloatArray:
-        """Return the rows [ŷ_i]× ε_Ω of all landmarks' columns, for ``points`` (n, 3)."""
         return self._turning(points).reshape(-1, self._p)
 
     def _turning(self, points: FloatArray) -> FloatArray:
@@ -203,23 +189,14 @@ class JointCovariance:
 
 
 class ExactMapCovariance(JointCovariance):
-    """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω.
-
-    Parameters
-    ----------
-    joint : JointCovariance
-        What was known so far.
-    covariances : FloatArray
-        (n, 3, 3) what the map says of its landmarks, which is only passed on.
-
-    """
+    """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
 
     def __init__(
         self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray
     ) -> None:
         self._axes, self._p, self.first = axes, axes.p, joint.first
         self.P = joint.P[: self.first, : self.first].copy()
-        self._covariances = covariances
+        self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
         """Return the covariances (n, 3, 3) of the landmarks, as the map has them."""

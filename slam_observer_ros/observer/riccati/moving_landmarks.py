@@ -17,14 +17,7 @@ from slam_observer_ros.sensor_models.motion import Motion
 
 
 class MovingLandmarksCovariance(JointCovariance):
-    """P with two blocks of k columns a landmark: of its position, and of its velocity.
-
-    Parameters
-    ----------
-    velocity_error : float
-        Standard deviation of a new landmark's velocity, m/s.
-
-    """
+    """P with columns for velocities, too, at first of ``velocity_error``, m/s."""
 
     def __init__(
         self, axes: EstimatedAxes, calibration: Calibration, velocity_error: float
@@ -35,6 +28,7 @@ class MovingLandmarksCovariance(JointCovariance):
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
         """Return the covariances (n, 3, 3) of ã_i = ξ_i + t ũ_i − [ŷ_i]× ε_Ω, t from now."""
+        # D of ã_i = D (ε, ξ_i, ũ_i), and the columns of these in P.
         n, k, p, rows = len(points), self._axes.point, self._p, np.arange(len(points))
         eye = np.tile(np.eye(k), (n, 1, 1))
         D = np.concatenate([-self._turning(points), eye, ahead_s * eye], axis=2)
@@ -60,14 +54,13 @@ class MovingLandmarksCovariance(JointCovariance):
         J = np.stack([self._turning(points), self._turning(u)], axis=1)
         self._propagate(motion, J.reshape(-1, self._p))
 
-    def _place(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
-        """Fill in landmarks, of whose velocity nothing is known yet."""
-        super()._place(rows, C, covariances)
+    def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
+        super()._insert(rows, C, covariances)
+        # Of their velocities nothing is known yet.
         columns = self._columns(rows) + self._axes.point
         self.P[columns] = self.P[:, columns] = 0.0
         self.P[columns, columns] = self._velocity_error**2
 
     def _all_turning(self, points: FloatArray) -> FloatArray:
-        """Return the rows [ŷ_i]× ε_Ω of positions, and zero for velocities."""
         blocks = self._turning(points)
-        return np.stack([blocks, np.zeros_like(blocks)], axis=1).reshape(-1, self._p)
+        return np.stack([blocks, np.zeros_like(blocks)], axis=1).reshape(-1, self._p)  # ũ_i: 0

@@ -29,14 +29,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 
 class RiccatiFilter(Filter):
-    """Gains from the full covariance of pose, velocity calibration and landmarks.
-
-    Attributes
-    ----------
-    joint : JointCovariance
-        The covariance P.
-
-    """
+    """Gains from the full covariance P, ``joint``, of pose, velocity calibration and landmarks."""
 
     joint: JointCovariance
     has_joint_covariance: ClassVar[bool] = True
@@ -114,15 +107,15 @@ class RiccatiFilter(Filter):
         self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.observer.points)
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
-        """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be.
-
-        A rigid motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v.
-        """
+        """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
+        # A motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v (G), and the positions
+        # of the known landmarks by J γ.
         k, joint = self.axes.point, self.joint
         G = joint.gauge(len(self.observer.y_ref))
+        J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
+        # What P says of these positions, and the map's noise.
         to_position = -self.axes.turn_matrix(self.observer.points[rows])
         HP, HPH = joint.project(to_position, rows)  # of −ã_i
-        J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
         R = block_diagonal(covariances[:, :k, :k])
         x, joint.P = anchor(joint.P, G, -HP.T, HPH + R, J, r[:, :k].ravel())
         self._move(-x)

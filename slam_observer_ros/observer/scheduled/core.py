@@ -2,11 +2,11 @@
 
 The core z = (ε, c, ã_1 … ã_K) are the errors of the pose, of the velocity's calibration, and of
 the K landmarks seen last; P is their covariance. What they know of each other is all here, and
-how other landmarks hang on them is in :mod:`.postponed_landmarks`.
+how other landmarks depend on them is in :mod:`.postponed_landmarks`.
 
-When the core becomes z' = Φ z + noise, because the robot moves or one landmark takes the place of
-another, z = G z' + ζ with the regression G = P Φᵀ P'⁻¹, and ζ has the covariance
-V = P − G Φ P, here in Joseph's form. The landmarks that hang on the core are told of both.
+When the core becomes z' = Φ z + noise, because the robot moves or one landmark replaces another,
+z = G z' + ζ with the regression G = P Φᵀ P'⁻¹, and ζ has the covariance V = P − G Φ P, here in
+Joseph's form. The postponed landmarks, which depend on the core, follow both.
 """
 
 from __future__ import annotations
@@ -24,44 +24,28 @@ CAPACITY = 8
 """K: three points fix a frame in space, and still do when half of eight have been exchanged."""
 
 NOBODY = -1
-"""In place of a landmark where there is none in the core."""
+"""Row of a slot of the core that has no landmark."""
 
 NEVER = 1 << 62
-"""Age, in observations, of an empty place: older than any landmark's."""
+"""Age, in observations, of an empty slot: older than any landmark's."""
 
 ROUNDING = 1e-12
 """Share of its variances that is added to a covariance that may be singular to invert it."""
 
 
 class Core:
-    """Covariance of the core, and which landmarks are in it.
-
-    Parameters
-    ----------
-    axes : EstimatedAxes
-        Which p axes of the pose and k of a point are estimated.
-    calibration : Calibration
-        The velocity's.
-
-    Attributes
-    ----------
-    P : FloatArray
-        (q, q) covariance of z. The entries of a place where no landmark is are zero.
-    postponed : PostponedLandmarks
-        How all landmarks depend on z.
-    rows : IntArray
-        (K,) the landmarks in the core, or ``NOBODY``.
-
-    """
+    """Covariance of the core, and which landmarks are in its K slots."""
 
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         start = calibration.initial_covariance()
         self._axes, self._calibration = axes, calibration
         self._p = axes.p
-        self._places = len(start) + np.arange(CAPACITY * axes.point).reshape(CAPACITY, axes.point)
+        # (K, k) the entries of z that each slot has
+        self._slots = len(start) + np.arange(CAPACITY * axes.point).reshape(CAPACITY, axes.point)
         self._unseen = np.full(CAPACITY, NEVER)
-        self.rows: IntArray = np.full(CAPACITY, NOBODY)
-        self.P: FloatArray = np.zeros((len(start) + self._places.size,) * 2)
+        self.rows: IntArray = np.full(CAPACITY, NOBODY)  # (K,) the landmarks in the slots
+        # (q, q) covariance of z; the entries of an empty slot are zero
+        self.P: FloatArray = np.zeros((len(start) + self._slots.size,) * 2)
         self.P[: len(start), : len(start)] = start
         self.postponed = PostponedLandmarks(axes, len(self.P))
 
@@ -97,41 +81,43 @@ class Core:
     def turn(self, x: FloatArray) -> None:
         """Let a motion of everything remain one where the step x (q,) has put landmarks."""
         T = np.zeros_like(self.P)
-        shifts = self._axes.full_points(x[self._places].ravel())
-        T[self._places.ravel(), : self._p] = self._axes.turn_matrix(shifts).reshape(-1, self._p)
+        shifts = self._axes.full_points(x[self._slots].ravel())
+        T[self._slots.ravel(), : self._p] = self._axes.turn_matrix(shifts).reshape(-1, self._p)
         eye = np.eye(len(T))
         self.P = _transformed(self.P, eye + T)
-        # (I + T)⁻¹ = I − T: T turns landmarks by the pose, and leaves the pose alone.
+        # (I + T)⁻¹ = I − T: T turns landmarks by the pose, and not the pose.
         self.postponed.change_core(eye - T, np.zeros_like(T))
 
     def admit(self, rows: IntArray) -> None:
-        """Take in landmarks (m,) just seen, for those that have not been seen for longest."""
+        """Put landmarks (m,) just seen into the core, for those that were not seen for longest."""
+        # Which are new, and whose slots they get.
         seen = (self.rows[:, None] == rows).any(axis=1)
         self._unseen = np.where(seen, 0, self._unseen + 1)
         new = rows[~(rows[:, None] == self.rows).any(axis=1)][: np.sum(~seen)]
         if not len(new):
             return
-        places = np.argsort(-self._unseen, kind='stable')[: len(new)]
-        leaving, columns = self.rows[places], self._places[places]
-        self.postponed.release(leaving[leaving != NOBODY])
+        slots = np.argsort(-self._unseen, kind='stable')[: len(new)]
+        replaced, columns = self.rows[slots], self._slots[slots]
+        self.postponed.release(replaced[replaced != NOBODY])
+        # z' has F_i z + η_i in these.
         F, N, _ = self.postponed.now(new)
         before, Phi = self.P, np.eye(len(self.P))
         Phi[columns] = F
         self.P = _transformed(before, Phi)
         self.P[columns[:, :, None], columns[:, None, :]] += N
         self._change_core(before, Phi)
-        self.rows[places], self._unseen[places] = new, 0
+        self.rows[slots], self._unseen[slots] = new, 0
         self.postponed.hold(new, np.eye(len(Phi))[columns])
 
     def dismiss(self, rows: IntArray) -> None:
-        """Let those of the landmarks (m,) that are in the core leave it."""
-        places = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != NOBODY))
-        if not len(places):
+        """Take those of the landmarks (m,) that are in the core out of it."""
+        slots = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != NOBODY))
+        if not len(slots):
             return
-        self.postponed.release(self.rows[places])
-        self.rows[places], self._unseen[places] = NOBODY, NEVER
+        self.postponed.release(self.rows[slots])
+        self.rows[slots], self._unseen[slots] = NOBODY, NEVER
         before, Phi = self.P, np.eye(len(self.P))
-        Phi[self._places[places].ravel()] = 0.0
+        Phi[self._slots[slots].ravel()] = 0.0
         self.P = _transformed(before, Phi)
         self._change_core(before, Phi)
 
@@ -142,7 +128,7 @@ class Core:
         self.rows -= np.searchsorted(np.sort(rows), self.rows)  # by 0 for NOBODY
 
     def _change_core(self, before: FloatArray, Phi: FloatArray) -> None:
-        """Let landmarks hang on z', whose covariance P is already; ``before`` is that of z."""
+        """Let landmarks depend on z', whose covariance P is already; ``before`` is that of z."""
         after = Phi @ before
         G = _times_inverse(after.T, self.P)
         shared = G @ after
@@ -150,16 +136,7 @@ class Core:
 
 
 def regression(P: FloatArray, of: IntArray, on: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return B and the covariance of ζ, for entries ``of`` = B · entries ``on`` + ζ.
-
-    Parameters
-    ----------
-    P : FloatArray
-        (N, N) joint covariance.
-    of, on : IntArray
-        (a,) and (b,) entries; B is (a, b).
-
-    """
+    """Return B (a, b) and the covariance of ζ in x_of = B x_on + ζ, x of covariance P."""
     B = _times_inverse(P[np.ix_(of, on)], P[np.ix_(on, on)])
     return B, P[np.ix_(of, of)] - B @ P[np.ix_(on, of)]
 
@@ -172,5 +149,4 @@ def _times_inverse(cross: FloatArray, P: FloatArray) -> FloatArray:
 
 
 def _transformed(P: FloatArray, Phi: FloatArray) -> FloatArray:
-    """Return Φ P Φᵀ, symmetric to the bit."""
     return symmetric(Phi @ P @ Phi.T)

@@ -1,14 +1,10 @@
-"""Landmarks that hang on a small core, and follow it when they are next needed.
+"""Landmarks that depend on a small core z, and follow it when they are next needed.
 
-The error of landmark i is told by that of the core z, a few numbers that are estimated jointly,
-and by a part of its own that has to do with nothing else:
-
-    ã_i = F_i z + η_i,     η_i ~ N(0, N_i).
-
-What is observed of the core, or of other landmarks, changes neither F_i nor N_i. It moves the
-estimate of z, by x, and with it that of the landmark, by F_i x. When the core itself becomes
-another one, z = G z' + ζ with ζ ~ N(0, V) independent of z', then F_i becomes F_i G and N_i
-becomes N_i + F_i V F_iᵀ. A sequence of such changes is one such change:
+The error of landmark i is ã_i = F_i z + η_i, with η_i ~ N(0, N_i) independent of all else. What is
+observed of the core, or of other landmarks, changes neither F_i nor N_i. It moves the estimate of
+z, by x, and with it that of the landmark, by F_i x. When the core itself becomes another one,
+z = G z' + ζ with ζ ~ N(0, V) independent of z', then F_i becomes F_i G, and N_i becomes
+N_i + F_i V F_iᵀ. A sequence of such changes is one such change:
 
     (G, V, x) then (G', V', x')   =   (G G',  V + G V' Gᵀ,  x + G x')
 
@@ -27,22 +23,13 @@ from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 
 CORE = 0
-"""The group of the landmarks that are in the core. F tells which entries of z they are, and N is
-zero: these never change. Only moves are put off, until the landmark is seen or leaves the core.
+"""The group of the landmarks that are in the core. F picks the entries of z that they are, and N
+is zero: these never change. Only moves are postponed, until one is seen or is not in the core.
 """
 
 
 class PostponedLandmarks:
-    """F_i and N_i of all landmarks, and what each group has yet to follow.
-
-    Parameters
-    ----------
-    axes : EstimatedAxes
-        Which p axes of the pose and k of a point are estimated. ε is the beginning of z.
-    core_size : int
-        q, entries of z.
-
-    """
+    """F_i and N_i of all landmarks, and what each group has yet to follow."""
 
     def __init__(self, axes: EstimatedAxes, core_size: int) -> None:
         self._axes = axes
@@ -50,7 +37,7 @@ class PostponedLandmarks:
         self._N: FloatArray = np.empty((0, axes.point, axes.point))
         self._shifts: FloatArray = np.empty((0, 3))
         self._group: IntArray = np.empty(0, dtype=np.int64)
-        self._members: list[IntArray] = [np.empty(0, dtype=np.int64)]  # and some that have left
+        self._members: list[IntArray] = [np.empty(0, dtype=np.int64)]  # and former ones
         self._sizes: IntArray = np.zeros(1, dtype=np.int64)
         self._G: FloatArray = np.eye(core_size)[None]
         self._V: FloatArray = np.zeros((1, core_size, core_size))
@@ -91,27 +78,21 @@ class PostponedLandmarks:
         return self._followed(self._F, self._group) + self._shifts
 
     def now(self, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return F (m, k, q), N (m, k, k) and how far the landmarks have yet to be moved (m, 3).
-
-        A motion of everything, by which a point p moves along [−[p]×, I], is to remain one when
-        the point has moved. In the core that is seen to when the core moves.
-        """
+        """Return F (m, k, q), N (m, k, k) and the moves (m, 3) that landmarks have yet to make."""
         F, group = self._F[rows], self._group[rows]
         shifts = self._followed(F, group)
+        # A motion of everything, by which a point p moves along [−[p]×, I], is to remain one when
+        # the point has moved. In the core that is done when the core moves.
         turns = self._axes.turn_matrix(shifts)
         F[:, :, : self._axes.p] += turns * (group != CORE)[:, None, None]
         N = self._N[rows] + F @ self._V[group] @ transpose(F)
         return F @ self._G[group], N, shifts + self._shifts[rows]
 
     def _followed(self, F: FloatArray, group: IntArray) -> FloatArray:
-        """Return F x, how far landmarks of these groups (m,) have to follow the core (m, 3)."""
         return self._axes.full_points((F @ self._x[group][:, :, None]).ravel())
 
     def update(self, rows: IntArray, F: FloatArray, N: FloatArray) -> None:
-        """Take F (m, k, q) and N (m, k, k) for those of landmarks that are where they should be.
-
-        Landmarks in the core remain in it.
-        """
+        """Set F (m, k, q) and N (m, k, k) of landmarks up to date; those in the core stay."""
         held = self._group[rows] == CORE
         if held.any():
             self.hold(rows[held], self._F[rows[held]])
@@ -120,15 +101,15 @@ class PostponedLandmarks:
         self._form_group(rows)
 
     def hold(self, rows: IntArray, F: FloatArray) -> None:
-        """Take landmarks that are where they should be into the core, as its entries F z."""
-        self._leave(rows)
+        """Put landmarks that are up to date into the core, as its entries F z."""
+        self._drop_from_groups(rows)
         self._sizes[CORE] += len(rows)
         self._group[rows] = CORE
         self._F[rows], self._N[rows], self._shifts[rows] = F, 0.0, 0.0
-        self._x[CORE, F.any(axis=(0, 1))] = 0.0  # no move of their entries is put off by now
+        self._x[CORE, F.any(axis=(0, 1))] = 0.0  # no move of their entries is postponed now
 
     def release(self, rows: IntArray) -> None:
-        """Let landmarks leave the core; they hang on those entries of z which they were."""
+        """Take landmarks out of the core; they depend on those entries of z which they were."""
         self._shifts[rows] = self.now(rows)[2]
         self._form_group(rows)
 
@@ -148,7 +129,7 @@ class PostponedLandmarks:
         """Let landmarks (m,) follow as one what changes from now on."""
         if not len(rows):
             return
-        self._leave(rows)
+        self._drop_from_groups(rows)
         count = len(self._sizes)
         while count > 1 and not self._sizes[count - 1]:
             count -= 1
@@ -159,5 +140,5 @@ class PostponedLandmarks:
         self._V = np.concatenate([self._V[:count], np.zeros_like(self._V[:1])])
         self._x = np.concatenate([self._x[:count], np.zeros_like(self._x[:1])])
 
-    def _leave(self, rows: IntArray) -> None:
+    def _drop_from_groups(self, rows: IntArray) -> None:
         self._sizes -= np.bincount(self._group[rows], minlength=len(self._sizes))

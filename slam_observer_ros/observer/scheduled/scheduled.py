@@ -1,38 +1,23 @@
 """Variance-scheduled gains: the paper's k_i and l_i, set by what is known, at O(m) for m seen.
 
-Errors of landmarks are correlated, as each was seen from a pose that is not quite known. But two
-landmarks have little to do with each other beyond where the robot and the landmarks about it are.
-So a full covariance P is kept of the errors of a small *core* z = (ε, c, ã_1 … ã_K) alone: pose,
-calibration of the velocity, and the K landmarks seen last. The error of any other landmark is told
-by that of the core, and by a part of its own, which is taken to be independent of all others:
+Landmarks share little beyond the errors of the robot and of the landmarks near it. So a full
+covariance P is kept of the errors of a small *core* z = (ε, c, ã_1 … ã_K) alone: pose, calibration
+of the velocity, and the K landmarks seen last. The error of any other landmark depends on that of
+the core, and has a part of its own, taken to be independent of all others:
 
     ã_i = F_i z + η_i,  η_i ~ N(0, N_i);  when first seen, F_i = [−[y_i°]×, I, 0 …] and N_i = R_i.
 
-The residual is r_i ≈ C_i ε − ã_i = H_i z − η_i with C_i = [−[p̂_i]×, I] and H_i = C_i − F_i: what
-pose and landmark have in common cancels, so seeing it again and again tells nothing of that. With
+The residual is r_i ≈ C_i ε − ã_i = H_i z − η_i with C_i = [−[p̂_i]×, I] and H_i = C_i − F_i. With
 the noise R_i of the observation, the gains of (30) and (31) become matrices
 
     k_i = (N_i + R_i)⁻¹,                 Δ = −P⁺ Σ H_iᵀ k_i r_i,  P⁺ = (P⁻¹ + Σ H_iᵀ k_i H_i)⁻¹
     l_i / k_i · dt = N_i (N_i + R_i)⁻¹,  δ_i = F_i Δ + N_i k_i (r_i + H_i Δ)
 
 where Δ is a step of all of z, and F_i ← F_i + N_i k_i H_i, N_i ← N_i − N_i k_i N_i. A landmark out
-of view keeps F_i and N_i, and moves by F_i Δ. As far as P, F_i and N_i are right, this is what a
-Kalman filter does with the covariance of everything.
-
-They are not quite, because of what happens between observations: where the core becomes another
-one (:mod:`.scheduled.core`), landmarks that hung on the old one have in common what
-the new one does not tell of it. That is added to each N_i as if it were its own. So P is not that
-of an exact filter, and not published.
-
-An observation costs O(m) for the m landmarks seen. The n known ones follow when they are seen
-again (:mod:`.postponed_landmarks`), which makes it O(m log n) in the mean.
-
-To update a part of the state alone, and to compose what the rest has to follow later, is the idea
-of the compressed EKF (J. Guivant and E. Nebot, *Optimization of the simultaneous localization and
-map-building algorithm for real-time implementation*, 2001) and of postponement (J. Knight, A.
-Davison and I. Reid, *Towards constant time SLAM using postponement*, 2001). Both keep the
-covariance of everything, O(n²), and lose nothing; here landmarks have nothing in common but the
-core, so that each follows by itself.
+of view keeps F_i and N_i, and follows by F_i Δ later (:mod:`.postponed_landmarks`). Where the core
+becomes another one (:mod:`.core`), what it no longer explains is added to each N_i as if it were
+its own. So P is not that of an exact filter, and not published. See docs/theory.md, Gain designs,
+which also has the origin: the compressed EKF and postponement.
 """
 
 from __future__ import annotations
@@ -62,28 +47,13 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What m points ask for, a of which have passed the gate; see the module's text.
+    """What m points ask for, a of which have passed the gate; see the module's docstring."""
 
-    Attributes
-    ----------
-    Delta : FloatArray
-        (q, 1) step Δ of the core.
-    gain_k : FloatArray
-        (m, k, k) gains k_i, zero where the gate rejects a point.
-    k_left : FloatArray
-        (m, k, 1) k_i (r_i + H_i Δ), with what the step leaves of the residual.
-    noise : FloatArray
-        (a, k, k) R_i, over the weight and for errors that last.
-    weights : FloatArray
-        (m,) Huber's weights, zero where the gate rejects a point.
-
-    """
-
-    Delta: FloatArray
-    gain_k: FloatArray
-    k_left: FloatArray
-    noise: FloatArray
-    weights: FloatArray
+    Delta: FloatArray  # (q, 1) step Δ of the core
+    gain_k: FloatArray  # (m, k, k) gains k_i, zero where the gate rejects a point
+    k_left: FloatArray  # (m, k, 1) k_i (r_i + H_i Δ), with what the step leaves of the residual
+    noise: FloatArray  # (a, k, k) R_i, over the weight and for errors that last
+    weights: FloatArray  # (m,) Huber's weights, zero where the gate rejects a point
 
 
 class ScheduledFilter(Filter):
@@ -103,19 +73,23 @@ class ScheduledFilter(Filter):
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by the step of all points; return the weight that each was given."""
+        # What the points that pass the gate ask for.
         rows = residuals.rows
         F, N, _ = self._postponed.now(rows)
         H = self._output_matrix(residuals.landmarks) - F
         passed = self._distances(residuals, F, N) <= self._settings.rejection_threshold
         step = self._reweighted_step(residuals, H, N, passed)
+        # (31)  δ_i, and what F_i and N_i are then; a motion of everything remains one.
         Delta, gain_k = step.Delta, step.gain_k
         delta = self.axes.full_points((F @ Delta + N @ step.k_left).ravel())
         F = F + N @ gain_k @ H
         F[:, :, : self.axes.p] += self.axes.turn_matrix(delta)
         N[passed] = symmetric(N[passed] @ gain_k[passed] @ step.noise)  # N − N k N, but positive
+        # P⁺; all other landmarks follow later.
         self._core.measurement_update(H[passed], gain_k[passed])
         self._postponed.shift(Delta[:, 0])
         self._postponed.update(rows, F, N)
+        # The core has the landmarks just seen; X̂ ← (exp Δ, δ_i) · X̂.
         self._core.turn(Delta[:, 0])
         self._core.admit(rows[passed])
         self._move(rows, Delta[:, 0], delta)
@@ -168,22 +142,21 @@ class ScheduledFilter(Filter):
         self._core.set_pose_error_covariance(covariance[self.axes.pose, self.axes.pose])
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
-        """Move pose and known landmarks to where these are known to be.
-
-        The motion γ of everything, see :mod:`.gauge`, is estimated, too. Other landmarks' errors
-        are ã_i = F_i (z − γ) + J_i γ + η_i, the core being the pose alone.
-        """
+        """Move pose and map to where known landmarks are, by γ, see :mod:`.gauge`."""
+        # All are up to date, and z is the pose (and calibration): ã_i = F_i (z − γ) + J_i γ + η_i.
         self._core.dismiss(self._core.rows)
         everything, p = np.arange(len(self._postponed)), self.axes.p
         self._bring_up_to_date(everything)
         m, k, q = len(r), self.axes.point, len(self._core.P)
         F, N, _ = self._postponed.now(everything)
         J = self.axes.output_matrix(self.observer.points)
+        # Joint covariance P of z, the known landmarks and γ; how γ moves them, G.
         z, known, gamma = np.split(np.arange(q + m * k + p), [q, q + m * k])
         P, G = np.zeros((gamma[-1] + 1,) * 2), np.zeros((gamma[-1] + 1, p))
         P[: gamma[0], : gamma[0]] = self._with_landmarks(F[rows], N[rows])
         G[:p] = G[gamma] = np.eye(p)
         G[known] = J[rows].reshape(-1, p)
+        # All of them by what is known of the landmarks.
         S = P[np.ix_(known, known)] + block_diagonal(self._noise(covariances))
         x, P = anchor(P, G, P[:, known], S, G[known], r[:, :k].ravel())
 
@@ -198,6 +171,7 @@ class ScheduledFilter(Filter):
         B, left = regression(P, known, z)
         F[rows] = B.reshape(m, k, q)
         N[rows] = symmetric(diagonal_blocks(left, k))
+        # Landmarks move by their errors; a motion of everything remains one.
         shifts = -self.axes.full_points(errors.ravel())
         F[:, :, :p] += self.axes.turn_matrix(shifts)
         self._postponed.update(everything, F, N)
@@ -224,8 +198,7 @@ class ScheduledFilter(Filter):
         return joint[np.ix_(columns, columns)]
 
     def _bring_up_to_date(self, rows: IntArray) -> None:
-        """Move landmarks that are about to be used, and others whose turn it is."""
-        rows = np.union1d(rows, self._postponed.due())
+        rows = np.union1d(rows, self._postponed.due())  # others, whose turn it is
         F, N, shifts = self._postponed.now(rows)
         self._postponed.update(rows, F, N)
         self.observer.a[rows] += shifts
@@ -254,10 +227,7 @@ class ScheduledFilter(Filter):
         return _Step(Delta, gain_k, k_left, noise, weights)
 
     def _distances(self, residuals: Residuals, F: FloatArray, N: FloatArray) -> FloatArray:
-        """Return the Mahalanobis distances (m,), with C_i at the middle of the chord.
-
-        For the reason that Riccati gains have.
-        """
+        # At the middle of the chord, for the reason that JointCovariance.output_matrix has.
         H = self._output_matrix(residuals.landmarks + 0.5 * residuals.r) - F
         S = H @ self._core.P @ transpose(H) + N + self._noise(residuals.covariances)
         return mahalanobis(residuals.r[:, : self.axes.point], S)
@@ -278,12 +248,10 @@ class ScheduledFilter(Filter):
         return full
 
     def _noise(self, covariances: FloatArray) -> FloatArray:
-        """Return the part (m, k, k) of covariances (m, 3, 3) on the axes that are estimated."""
         k = self.axes.point
         return covariances[:, :k, :k]
 
     def _move(self, rows: IntArray, x: FloatArray, shifts: FloatArray) -> None:
-        """Move the core by x, and landmarks (m,) by ``shifts`` (m, 3) alone."""
         p, a = self.axes.p, self.observer.a[rows]
         self.calibration.shift(x[p : p + self.calibration.count])
         D = se3.exp(self.axes.full_pose(x[:p]))
