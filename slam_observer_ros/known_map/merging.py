@@ -91,6 +91,7 @@ def shape_covariances(state: State) -> FloatArray | None:
     joint = state.filter.joint
     if joint is None or state.is_fixed or n == 0:
         return state.landmark_covariances()
+    # What landmarks, moved together about their centre, have in common.
     P = joint.with_pose(np.arange(n), points)[axes.p :, axes.p :]
     G = axes.output_matrix(points - points.mean(axis=0)).reshape(n * k, -1)
     least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
