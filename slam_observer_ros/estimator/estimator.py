@@ -82,7 +82,7 @@ class Estimator:
         """Forget the motion, what was mapped and events held back, and start again.
 
         At ``pose`` (4, 4), body to world; by default at that of the settings, or else at identity,
-        in a loaded map anywhere. Raise :exc:`ParameterError` if it is no rigid motion.
+        or unknown in a loaded map. Raise :exc:`ParameterError` if it is no rigid motion.
         """
         if pose is not None:
             check_pose(pose)
@@ -99,7 +99,7 @@ class Estimator:
         """Go on after a jump of the clock, as ``on_time_jump`` says.
 
         ``reset`` starts again where the run began; in a loaded map where the settings say, or
-        anywhere. ``hold`` keeps pose and map, and goes on from there.
+        at an unknown pose. ``hold`` keeps pose and map, and goes on from there.
         """
         # Events of before the jump that are held back are used first.
         newest_ns = self.newest_stamp_ns
@@ -290,7 +290,7 @@ class Estimator:
     @property
     def body_velocity(self) -> FloatArray:
         """(6,) newest velocity (Ω, v), calibrated, rad/s and m/s; zero when it has timed out."""
-        velocity = self._timeline.body_velocity  # with a calibrated delay: of a little before
+        velocity = self._timeline.body_velocity  # of a little earlier or later if delayed
         return np.zeros(6) if velocity is None else self._state.filter.calibration.apply(velocity)
 
     @property

@@ -14,7 +14,7 @@ MOVING_SPEED = 0.1
 
 
 def map_of(state: State, is_own_frame: bool) -> LandmarkMap:
-    """Return the confirmed landmarks at rest; in a frame of its own, with covariances of shape."""
+    """Return the confirmed landmarks at rest; in its own frame, with covariances of its shape."""
     rows = state.confirmed
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
     covariances = shape_covariances(state) if is_own_frame else state.landmark_covariances()

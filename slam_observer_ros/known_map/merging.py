@@ -81,6 +81,7 @@ def shape_covariances(state: State) -> FloatArray | None:
     if with_pose is None or n == 0:
         return state.landmark_covariances()
     P = with_pose[axes.p :, axes.p :]
+    # What landmarks, moved together about their centre, have in common.
     G = axes.output_matrix(points - points.mean(axis=0)).reshape(n * k, -1)
     least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
     information = gauge_information(G, with_variances_above(least_m2, P))

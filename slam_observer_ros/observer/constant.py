@@ -1,13 +1,13 @@
 """The paper's gains: constant k_i and l_i; (28)–(31) integrated so that any step is stable.
 
 The explicit Euler step of (28)–(31) is stable only below dt ≈ 2/Σ k_i(1 + |e_i|²/2). Here the pose
-is moved by an exponential integrator of the linearised flow. With gains k_i (m,), J_i = [−[e_i]×,
-I] for errors e_i (m, 3), residuals r_i (m, 3), g = Σ k_i J_iᵀ r_i and H = Σ k_i J_iᵀ J_i, that is
+is moved by an exponential integrator of the linearised flow. With gains k_i (m,), errors e_i and
+residuals r_i (m, 3), J_i = [−[e_i]×, I], g = Σ k_i J_iᵀ r_i and H = Σ k_i J_iᵀ J_i, that is
 
     ξ = −U diag((1 − e^{−λ dt})/λ) Uᵀ g,      H = U diag(λ) Uᵀ,
 
-and the landmarks close the share 1 − e^{−(l/k) dt} of what remains: for dt → ∞ one Gauss–Newton
-step, for dt → 0 a step down the same L as the paper's Δ dt (docs/theory.md, Discrete time).
+one Gauss–Newton step for dt → ∞, and down the same L as the paper's Δ dt for dt → 0. The landmarks
+close the share 1 − e^{−(l/k) dt} of what remains. See docs/theory.md, Discrete time.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class ConstantFilter(Filter):
 
     The ``step_mode`` 'paper' turns about the reference's origin with the metric of (10), and so
     converges to the paper's equation (:mod:`.innovation`) for dt → 0; 'exponential' turns about
-    the centroid of the e_i, where rotation and translation do not compete.
+    the centroid of the e_i, where rotation and translation do not compete. In ``two_d_mode`` all
+    turns are about z.
     """
 
     ignores = (

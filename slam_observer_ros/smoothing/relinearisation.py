@@ -121,7 +121,7 @@ class Relinearisation:
         if in_doubt:
             self._relinearise()
             # The landmark may be relocated by this very keyframe, which must be kept for that.
-            self._is_owed = True
+            self._is_overdue = True
         elif self._window_is_full or self._is_due:
             self._sum_up(self._relinearise())
 
@@ -170,7 +170,7 @@ class Relinearisation:
     def _clear_counts(self) -> None:
         self._observations = 0
         self._turn_squared = self._largest_turn = 0.0
-        self._is_owed = False
+        self._is_overdue = False
 
     @property
     def _window_is_full(self) -> bool:
@@ -180,7 +180,7 @@ class Relinearisation:
     @property
     def _is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
-        if self._is_owed:  # it could not be summed up for a landmark in doubt
+        if self._is_overdue:  # it could not be summed up for a landmark in doubt
             return True
         settings = self._settings
         least = max(
@@ -228,10 +228,12 @@ class Relinearisation:
         something of the gauge, of which nothing is known.
         """
         start, end, observer = step.start, step.end, self._observer
+        # The reference and its covariance, in the coordinates of the filter.
         observer.A = start.poses[-1]
         observer.set_reference(start.points)
         P = _with_pose_error_by(observer.A, covariance, self._axes)
         self._joint.set_of_positions(P, start.points)
+        # The step, as any correction.
         self._calibration.shift(end.calibration - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)

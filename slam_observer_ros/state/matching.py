@@ -65,7 +65,7 @@ def keyframe_of(state: State, event: ObservationEvent, rows: IntArray) -> Keyfra
 
 
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
-    """Return where points seem to be (m, 3), metres, reference frame, and the tolerance of that.
+    """Return where points seem to be (m, 3), reference frame, and tolerances (m,), metres.
 
     By their own noise: that of where a landmark should be may be much less.
     """

@@ -33,7 +33,7 @@ class Outcome:
 def step(state: State, matched: MatchedObservation) -> Outcome:
     """One step of the observer (28), from where the velocity has led it (27): the innovation."""
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
-    _make_room(state, matched)
+    _drop_history_if_full(state, matched)
     weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
     rejected = weights == 0.0
     _count(state, matched, rejected)
@@ -70,7 +70,7 @@ def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> No
 
 def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
     """Relinearise, if it is time; relocate landmarks in doubt that this does not explain."""
-    # After the correction: their positions are known better than when they were seen.
+    # After the correction it is known better where they were seen.
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     some_are = bool(in_doubt.any())
     past = state.relinearisation
@@ -81,8 +81,8 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
     return np.empty(0, dtype=np.int64)
 
 
-def _make_room(state: State, matched: MatchedObservation) -> None:
-    """Give up the history before landmarks are forgotten for new ones: it depends on them."""
+def _drop_history_if_full(state: State, matched: MatchedObservation) -> None:
+    """Drop the history before landmarks are forgotten for new ones: it depends on them."""
     if len(_rows_to_forget(state, matched)):
         state.forget_past('landmarks had to make room (max_landmarks)')
 

@@ -102,7 +102,7 @@ class RiccatiFilter(Filter):
         self.joint = ExactMapCovariance(self.axes, self.joint, covariances)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
-        """Put the robot at Â = ``pose``; what it has to do with the map is forgotten."""
+        """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
         super().set_pose(pose, covariance)
         self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.observer.points)
 

@@ -23,7 +23,7 @@ from slam_observer_ros.sensor_models.motion import Motion
 CAPACITY = 8
 """K: three points fix a frame in space, and still do when half of eight have been exchanged."""
 
-NOBODY = -1
+EMPTY = -1
 """Row of a slot of the core that has no landmark."""
 
 NEVER = 1 << 62
@@ -43,7 +43,7 @@ class Core:
         # (K, k) the entries of z that each slot has
         self._slots = len(start) + np.arange(CAPACITY * axes.point).reshape(CAPACITY, axes.point)
         self._unseen = np.full(CAPACITY, NEVER)
-        self.rows: IntArray = np.full(CAPACITY, NOBODY)  # (K,) the landmarks in the slots
+        self.rows: IntArray = np.full(CAPACITY, EMPTY)  # (K,) the landmarks in the slots
         # (q, q) covariance of z; the entries of an empty slot are zero
         self.P: FloatArray = np.zeros((len(start) + self._slots.size,) * 2)
         self.P[: len(start), : len(start)] = start
@@ -98,7 +98,7 @@ class Core:
             return
         slots = np.argsort(-self._unseen, kind='stable')[: len(new)]
         replaced, columns = self.rows[slots], self._slots[slots]
-        self.postponed.release(replaced[replaced != NOBODY])
+        self.postponed.release(replaced[replaced != EMPTY])
         # z' has F_i z + η_i in these.
         F, N, _ = self.postponed.now(new)
         before, Phi = self.P, np.eye(len(self.P))
@@ -111,11 +111,11 @@ class Core:
 
     def dismiss(self, rows: IntArray) -> None:
         """Take those of the landmarks (m,) that are in the core out of it."""
-        slots = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != NOBODY))
+        slots = np.flatnonzero(np.isin(self.rows, rows) & (self.rows != EMPTY))
         if not len(slots):
             return
         self.postponed.release(self.rows[slots])
-        self.rows[slots], self._unseen[slots] = NOBODY, NEVER
+        self.rows[slots], self._unseen[slots] = EMPTY, NEVER
         before, Phi = self.P, np.eye(len(self.P))
         Phi[self._slots[slots].ravel()] = 0.0
         self.P = _transformed(before, Phi)
@@ -125,7 +125,7 @@ class Core:
         """Forget landmarks (m,); those behind move up."""
         self.dismiss(rows)
         self.postponed.remove(rows)
-        self.rows -= np.searchsorted(np.sort(rows), self.rows)  # by 0 for NOBODY
+        self.rows -= np.searchsorted(np.sort(rows), self.rows)  # by 0 for EMPTY
 
     def _change_core(self, before: FloatArray, Phi: FloatArray) -> None:
         """Let landmarks depend on z', whose covariance P is already; ``before`` is that of z."""

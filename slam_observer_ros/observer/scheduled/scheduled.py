@@ -79,17 +79,17 @@ class ScheduledFilter(Filter):
         H = self._output_matrix(residuals.landmarks) - F
         passed = self._distances(residuals, F, N) <= self._settings.rejection_threshold
         step = self._reweighted_step(residuals, H, N, passed)
-        # (31)  δ_i, and what F_i and N_i are then; a motion of everything remains one.
+        # (31)  δ_i; F_i and N_i after it, where a motion of everything remains one.
         Delta, gain_k = step.Delta, step.gain_k
         delta = self.axes.full_points((F @ Delta + N @ step.k_left).ravel())
         F = F + N @ gain_k @ H
         F[:, :, : self.axes.p] += self.axes.turn_matrix(delta)
         N[passed] = symmetric(N[passed] @ gain_k[passed] @ step.noise)  # N − N k N, but positive
-        # P⁺; all other landmarks follow later.
+        # P⁺; other landmarks follow later.
         self._core.measurement_update(H[passed], gain_k[passed])
         self._postponed.shift(Delta[:, 0])
         self._postponed.update(rows, F, N)
-        # The core has the landmarks just seen; X̂ ← (exp Δ, δ_i) · X̂.
+        # The core takes in the landmarks just seen; X̂ ← (exp Δ, δ_i) · X̂.
         self._core.turn(Delta[:, 0])
         self._core.admit(rows[passed])
         self._move(rows, Delta[:, 0], delta)
@@ -137,7 +137,7 @@ class ScheduledFilter(Filter):
         return super().expected_points(rows)
 
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
-        """Put the robot at Â = ``pose``; what it has to do with the map is forgotten."""
+        """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
         super().set_pose(pose, covariance)
         self._core.set_pose_error_covariance(covariance[self.axes.pose, self.axes.pose])
 
@@ -156,12 +156,11 @@ class ScheduledFilter(Filter):
         P[: gamma[0], : gamma[0]] = self._with_landmarks(F[rows], N[rows])
         G[:p] = G[gamma] = np.eye(p)
         G[known] = J[rows].reshape(-1, p)
-        # All of them by what is known of the landmarks.
+        # All of these corrected by what is known of the landmarks.
         S = P[np.ix_(known, known)] + block_diagonal(self._noise(covariances))
         x, P = anchor(P, G, P[:, known], S, G[known], r[:, :k].ravel())
-
-        self._core.P = P[:q, :q]
         # γ = B z + ζ, so ã_i = F_i z + (J_i − F_i) γ + η_i depends on z by F_i + (J_i − F_i) B.
+        self._core.P = P[:q, :q]
         J_gamma = J - F[:, :, :p]
         errors = F @ x[z] + J_gamma @ x[gamma]
         B, left = regression(P, gamma, z)
