@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from slam_observer_ros.association.contradictions import Contradictions
 from slam_observer_ros.association.hypothesis import Hypothesis
 from slam_observer_ros.association.interpretations import (
     Interpretation,
@@ -65,6 +66,7 @@ class Hypotheses:
         self._limit = state.settings.max_hypotheses
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
+        self._contradictions = Contradictions()
 
     @property
     def counts(self) -> Counter[str]:
@@ -119,6 +121,7 @@ class Hypotheses:
         """Let all hypotheses go on from where they are at any other time."""
         for hypothesis in self._all:
             hypothesis.state.clear_time()
+        self._contradictions.clear()
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
@@ -136,6 +139,8 @@ class Hypotheses:
         self._some_have_ids = self._some_have_ids or not is_unknown.all()
         matches = [match(hypothesis.state, event) for hypothesis in self._all]
         if len(self._all) == 1 and not is_unknown.any():
+            if not self.best.filter.has_joint_covariance:
+                return self._observe_alone(event, matches[0])
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])
             if is_clear and not may_relabel(self.best, matches[0]):
                 return step(self.best, matches[0])
@@ -146,6 +151,12 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
         return children[0].outcome
+
+    def _observe_alone(self, event: ObservationEvent, matched: MatchedObservation) -> Outcome:
+        """Use an observation that can't be weighed: of a state without a joint covariance."""
+        if self._contradictions.resolve(self.best, matched):
+            matched = match(self.best, event)
+        return step(self.best, matched)
 
     def _follow(
         self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]

@@ -26,7 +26,8 @@ MOVED_LATELY_NS = 60 * NANOSECONDS_PER_SECOND
 """How long ago that is at most, nanoseconds."""
 
 UNEXPECTED_POSES = {
-    'slip': 'Odometry does not explain what is seen: the robot slipped or was carried',
+    'slip': 'Odometry does not explain what is seen: the robot slipped or was carried, or the '
+    'stated noise of its velocity is too small',
     'unexpected_place': 'Nothing that is seen is where the map has it: if the robot slipped or '
     'was carried, it is not found again, as the points have no ids',
 }

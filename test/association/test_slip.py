@@ -341,3 +341,49 @@ def test_a_robot_that_never_moves_by_itself_never_slips():
     world = with_slip(gain_worlds.drive(settings, 50.0, 1, noise=0.5), 0.8)
     estimator, _ = run(world, settings)
     assert estimator.counts['slip'] == 0
+
+
+SCHEDULED = replace(PLANAR, gains='scheduled')
+
+
+def one_after_another(index, event):
+    """Of the landmarks in view another one each time."""
+    return event.select(np.arange(len(event.ids)) == index % len(event.ids))
+
+
+@seeds
+@pytest.mark.parametrize('turn_rad', [0.9, -0.8])
+def test_without_hypotheses_two_landmarks_that_agree_show_a_slip(seed, turn_rad):
+    """Then no landmark is taken for moved."""
+    world = gain_worlds.drive(PLANAR, 60.0, seed, noise=0.5)
+    turned = np.array([0.0, 0.0, turn_rad / 2.0, 0.0, 0.0, 0.0])
+    events = [
+        replace(event, body_velocity=event.body_velocity + turned)
+        if isinstance(event, VelocityEvent) and 30.0 <= seconds(event) < 32.0
+        else event
+        for event in world.events
+        if not (isinstance(event, ObservationEvent) and 30.0 <= seconds(event) < 34.0)
+    ]
+    world = replace(world, events=events).with_observations(one_after_another)
+    estimator, errors_m = run(world, SCHEDULED)
+    assert estimator.counts['slip'] >= 1
+    assert estimator.counts['moved_landmark'] == 0
+    assert max(error_m for time_s, error_m in errors_m.items() if time_s > 50.0) < 0.3
+
+
+@seeds
+def test_without_hypotheses_outliers_one_after_another_are_no_slip(seed):
+    world, rng = (
+        gain_worlds.drive(PLANAR, 60.0, seed, noise=0.5, seen=1),
+        np.random.default_rng(seed),
+    )
+
+    def garbled(index, event):
+        if index % 20 > 3:
+            return event
+        shift = rng.uniform(2.0, 10.0) * np.append(rng.normal(size=2), 0.0)
+        return replace(event, points=event.points + shift)
+
+    estimator, errors_m = run(world.with_observations(garbled), SCHEDULED)
+    assert estimator.counts['slip'] <= 1
+    assert max(errors_m.values()) < 1.0
