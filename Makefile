@@ -44,7 +44,7 @@ pytest: $(READY)  ## the tests alone
 colcon: $(READY)  ## build, install and test as a ROS workspace does
 	scripts/colcon_check.sh $(VENV)
 
-docs: $(READY)  ## write the tables anew, build the site into site/, check its links
+docs: $(READY)  ## write the tables, build the site into site/, check its links
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[docs]'
 	$(PYTHON_IN_VENV) scripts/write_docs.py
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict

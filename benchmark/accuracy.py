@@ -87,7 +87,7 @@ def parse_arguments() -> argparse.Namespace:
         '--seed', type=int, default=0, metavar='N', help='seed of the first Monte Carlo run'
     )
     parser.add_argument(
-        '--write-docs', action='store_true', help='write docs/benchmark.md and its figure anew'
+        '--write-docs', action='store_true', help='write docs/benchmark.md and its figure'
     )
     args = parser.parse_args()
     if args.write_docs and (args.only or args.quick or args.skip):

@@ -12,7 +12,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 
 class BaselineNoise:
-    """The observer's noise of points, and by how much less those tell whose errors last.
+    """The observer's noise of points, and how much larger it counts where errors last.
 
     Parameters
     ----------

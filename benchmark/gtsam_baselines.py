@@ -26,7 +26,7 @@ FIRST_POSE_DEVIATION = 1e-4
 """The first pose is the map's frame: known to this, rad and m."""
 
 RELINEARISE_THRESHOLD = 0.01
-"""Change (rad, m) from which iSAM2 linearises a variable anew; a tenth of GTSAM's default."""
+"""Change (rad, m) from which iSAM2 relinearises a variable; a tenth of GTSAM's default."""
 
 
 class IndeterminateError(Exception):
@@ -300,7 +300,7 @@ class Isam2:
 
 
 def accurate_isam2(settings: Settings) -> Isam2:
-    """Return iSAM2 that linearises anew after every observation, from a small change on."""
+    """Return iSAM2 that relinearises after every observation, from a small change on."""
     parameters = gtsam.ISAM2Params()
     parameters.relinearizeSkip = 1
     parameters.setRelinearizeThreshold(RELINEARISE_THRESHOLD)
@@ -315,7 +315,7 @@ def default_isam2(settings: Settings) -> Isam2:
 def optimise_batch(
     events: Iterable[Event], settings: Settings, start: Isam2
 ) -> tuple[FloatArray, FloatArray]:
-    """Optimise everything in hindsight by Levenberg–Marquardt, from iSAM2's last estimate.
+    """Smooth everything by Levenberg–Marquardt, from iSAM2's last estimate.
 
     Returns
     -------

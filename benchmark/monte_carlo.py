@@ -21,7 +21,7 @@ from slam_observer_ros.events import ObservationEvent
 CHECKPOINT_S = 5
 
 BATCH = 50
-"""Runs of which a band is told as well; over all runs it is narrower."""
+"""Runs of which a band is given as well; over all runs it is narrower."""
 
 LOOPS = {
     '3D stereo': Loop('stereo_inertial', 60.0, 100.0, 20, 6.0, 5),

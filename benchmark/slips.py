@@ -31,7 +31,7 @@ TURNING_S = 1.5
 def with_slips(world: World, seed: int, unseen_s: float = 0.0) -> World:
     """Let wheels spin once a minute, for 1 to 2 s: half of the times those of one side, else all.
 
-    Odometry then tells of a turn of 0.3 to 0.8 rad, either way, or of 0.5 to 1 m of way, that the
+    Odometry then reports a turn of 0.3 to 0.8 rad, either way, or 0.5 to 1 m of way, that the
     robot has not made. Nothing is seen in the first ``unseen_s`` of it.
     """
     rng = np.random.default_rng(seed)
@@ -53,18 +53,18 @@ def carried(world: World, seed: int) -> World:
     """Let someone lift the robot once a minute and carry it along its course, for 1 to 3 m.
 
     Its wheels stand still until it is put down, turned by any angle; then it turns back on the
-    spot, which odometry tells. It sees nothing in all that time.
+    spot, which odometry reports. It sees nothing in all that time.
     """
     rng = np.random.default_rng(seed)
     lifted = np.zeros(len(world.events), dtype=bool)
-    told = np.zeros((len(world.events), 6))
+    reported = np.zeros((len(world.events), 6))
     for start_s in _starts_s(world, rng):
         end_s = start_s + rng.uniform(*CARRIED_S)
         lifted |= _within(world, start_s, end_s)
         turning = _within(world, end_s - TURNING_S, end_s)
-        told[turning, 2] = rng.uniform(-np.pi, np.pi) / TURNING_S
+        reported[turning, 2] = rng.uniform(-np.pi, np.pi) / TURNING_S
     events: list[Event] = []
-    for event, body_velocity, is_lifted in zip(world.events, told, lifted, strict=True):
+    for event, body_velocity, is_lifted in zip(world.events, reported, lifted, strict=True):
         if not is_lifted:
             events.append(event)
         elif isinstance(event, VelocityEvent):
@@ -73,7 +73,7 @@ def carried(world: World, seed: int) -> World:
 
 
 def _slip(rng: np.random.Generator) -> FloatArray:
-    """Return the motion (6,) that odometry tells of and the robot has not made."""
+    """Return the motion (6,) that odometry reports and the robot has not made."""
     motion = np.zeros(6)
     if rng.random() < 0.5:
         motion[2] = rng.choice([-1.0, 1.0]) * rng.uniform(*SLIP_TURN_RAD)

@@ -1,4 +1,4 @@
-"""The package's structure in numbers: ``python benchmark/structure.py``; a test keeps them."""
+"""The package's structure in numbers: ``python benchmark/structure.py``."""
 
 from __future__ import annotations
 

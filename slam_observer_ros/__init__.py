@@ -1,3 +1,40 @@
 """The SLAM_n(3) observer of Mahony and Hamel: a numpy library, ROS 2 nodes and offline tools."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from slam_observer_ros.estimator.estimator import Estimator
+    from slam_observer_ros.events import AngularVelocityEvent, ObservationEvent, VelocityEvent
+    from slam_observer_ros.known_map.landmark_map import LandmarkMap
+    from slam_observer_ros.settings.estimator_settings import Settings
+
 __version__ = '0.1.0'
+
+__all__ = [
+    'AngularVelocityEvent',
+    'Estimator',
+    'LandmarkMap',
+    'ObservationEvent',
+    'Settings',
+    'VelocityEvent',
+]
+
+_MODULES = {
+    'AngularVelocityEvent': 'events',
+    'Estimator': 'estimator.estimator',
+    'LandmarkMap': 'known_map.landmark_map',
+    'ObservationEvent': 'events',
+    'Settings': 'settings.estimator_settings',
+    'VelocityEvent': 'events',
+}
+"""Where the names are defined; none is imported before it is used, as scipy takes a while."""
+
+
+def __getattr__(name: str) -> object:
+    """Import the module of an exported name."""
+    if name not in _MODULES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
