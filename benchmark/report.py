@@ -415,19 +415,19 @@ def _with_aim(ratios: dict[str, float], aim: str) -> dict[str, str]:
 
 
 def _draw_ratios(axes: Axes, table: Table) -> None:
-    """Draw configuration errors as multiples of iSAM2's, one place for each world."""
+    """Draw configuration errors as multiples of iSAM2's, one position for each world."""
     isam2 = _values(table, table, ISAM2, 'configuration_rmse_m')
-    places = np.arange(len(table))
+    positions = np.arange(len(table))
     axes.axhline(1.0, color='#555555', linewidth=1.0, zorder=1)
     axes.text(-0.45, 1.0, 'iSAM2', fontsize=8, verticalalignment='bottom')
     for column, style in DRAWN.items():
         ratios = _values(table, table, column, 'configuration_rmse_m') / isam2
-        axes.plot(places, ratios, linestyle='none', label=column, **style)
+        axes.plot(positions, ratios, linestyle='none', label=column, **style)
     axes.set_yscale('log')
     axes.yaxis.set_major_locator(FixedLocator(RATIO_TICKS))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter('{x:g}')
-    axes.set_xticks(places, [fill(world, 12) for world in table], fontsize=8)
+    axes.set_xticks(positions, [fill(world, 12) for world in table], fontsize=8)
     axes.set_xlim(-0.5, len(table) - 0.5)
     axes.set_title('Configuration error as a multiple of that of iSAM2')
     axes.legend(ncols=len(DRAWN), fontsize=8)

@@ -278,7 +278,7 @@ def _roadside(loop: Loop, planar: bool, rng: np.random.Generator) -> FloatArray:
 
 def _walks(loop: Loop, planar: bool, seed: int) -> FloatArray:
     """Return the landmarks' velocities (n, 3), of most of them zero."""
-    rng = np.random.default_rng([seed, loop.landmarks])  # the landmarks' places stay what they are
+    rng = np.random.default_rng([seed, loop.landmarks])  # landmarks stay where they are
     directions = rng.standard_normal((loop.landmarks, 3)) * np.array([1.0, 1.0, not planar])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     speeds = rng.uniform(*LANDMARK_SPEED, loop.landmarks)

@@ -30,10 +30,11 @@ _MODULES = {
     'Settings': 'settings.estimator_settings',
     'VelocityEvent': 'events',
 }
+"""Where the names are defined; none is imported before it is used, as scipy takes a while."""
 
 
 def __getattr__(name: str) -> object:
-    """Import a public class when it is asked for: SciPy takes a while, and programs start."""
+    """Import the module of an exported name."""
     if name not in _MODULES:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)

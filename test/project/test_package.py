@@ -6,6 +6,8 @@ from distutils.core import run_setup  # setuptools' own where Python has none an
 from importlib.metadata import distribution
 from pathlib import Path
 import re
+import subprocess
+import sys
 
 from catkin_pkg.package import parse_package
 import pytest
@@ -30,6 +32,18 @@ def test_versions_are_equal_everywhere():
         'CHANGELOG.rst': newest[1],
     }
     assert set(versions.values()) == {slam_observer_ros.__version__}, versions
+
+
+def test_exported_names_are_imported_only_when_they_are_used():
+    code = 'import slam_observer_ros, sys; print(*sys.modules)'
+    run = subprocess.run(
+        [sys.executable, '-c', code], cwd=CHECKOUT, capture_output=True, text=True, check=True
+    )
+    assert not {'numpy', 'scipy', 'matplotlib'} & set(run.stdout.split())
+    for name in slam_observer_ros.__all__:
+        assert getattr(slam_observer_ros, name).__name__ == name
+    with pytest.raises(AttributeError, match='Estimater'):
+        _ = slam_observer_ros.Estimater
 
 
 def test_manifest_is_valid_and_agrees_with_setup():
