@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
-from itertools import chain, count
 from pathlib import Path
-import shutil
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -91,19 +89,8 @@ class MapServices:
         if self._autosave and self._is_another(path):
             self._node.get_logger().warning(
                 f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
-                f'holds will be kept in {free_name(path).name}'
+                f'holds will be kept in {_backup(path).name}'
             )
-
-    def _keep(self, path: Path) -> str:
-        """Keep a copy of a map that is not this node's own; return a note about it."""
-        try:
-            if not self._is_another(path):
-                return ''
-            backup = free_name(path)
-            shutil.copy2(path, backup)
-        except OSError as error:
-            raise MapError(f"can't keep a copy of map {path}: {error.strerror}") from error
-        return f'; what it held before is in {backup.name}'
 
     def _is_another(self, path: Path) -> bool:
         return path not in self._own_files and path.exists()
@@ -138,11 +125,14 @@ class MapServices:
     def _save(self, path: Path) -> str:
         estimator = self._estimator
         estimator.release()
+        if len(estimator.landmark_ids):  # of an empty map it is said below
+            check_writable(path)  # before all that takes time
         if not estimator.is_localised:
             raise MapError('the pose in the loaded map is not known yet: nothing is saved')
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
-        kept = self._keep(path)
-        write_map(path, landmark_map, estimator.settings)
+        backup = _backup(path) if self._is_another(path) else None
+        write_map(path, landmark_map, estimator.settings, backup)
+        kept = '' if backup is None else f'; what it held before is in {backup.name}'
         self._own_files.add(path)
         moving = len(estimator.landmark_ids) - len(landmark_map.ids)
         without = f' (without {moving} that move)' if moving else ''
@@ -176,10 +166,8 @@ class MapServices:
         return 'the robot has found its pose in it'
 
 
-def free_name(path: Path) -> Path:
-    """Return a name that is not taken for a copy of a file: with ~, ~2 and so on behind it."""
-    names = (path.with_name(f'{path.name}~{ending}') for ending in chain([''], count(2)))
-    return next(name for name in names if not name.exists())
+def _backup(path: Path) -> Path:
+    return path.with_name(f'{path.name}~')
 
 
 def _absolute(path: str) -> Path:
