@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import pairwise
+from pathlib import Path
+import sys
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -14,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.settings.parameter_file import names_of_others
+from slam_observer_ros.settings.parameter_file import misplaced_sections, names_of_others
 from slam_observer_ros.settings.parameter_table import (
     Dataclass,
     from_parameters,
@@ -41,6 +44,7 @@ def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
     """
     rows = [row for settings_class in settings_classes for row in table(settings_class)]
     _check_names(node, [row.name for row in rows])
+    _warn_of_misplaced(node, [row.name for row in rows])
 
     def check(changes: Sequence[RosParameter]) -> SetParametersResult:
         try:
@@ -100,6 +104,24 @@ def _check_names(node: Node, names: Collection[str]) -> None:
     ]
     if ignored := names_of_others(written, names):
         node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
+
+
+def _warn_of_misplaced(node: Node, names: Collection[str]) -> None:
+    """Warn of files on the command line whose parameters have the name of another node."""
+    full_name = node.get_fully_qualified_name()
+    for option, path in pairwise(sys.argv):
+        if option != '--params-file':
+            continue
+        try:
+            sections = misplaced_sections(Path(path), full_name, names)
+        except ParameterError as error:  # though ROS has read it
+            node.get_logger().warning(str(error))
+            continue
+        if sections:
+            node.get_logger().warning(
+                f"parameter file {path} has nothing for '{full_name}'; are those of "
+                f"'{sections[0]}' meant for it?"
+            )
 
 
 def _check_changes(

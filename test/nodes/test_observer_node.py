@@ -361,6 +361,19 @@ def test_parameter_misspelt_by_a_letter_is_refused_with_the_one_that_may_be_mean
     assert 'Traceback' not in node.output
 
 
+def test_parameters_under_the_name_of_another_node_are_reported_at_the_start(ros, tmp_path):
+    file = tmp_path / 'robot.yaml'
+    file.write_text(
+        'slam_node: {ros__parameters: {gains: scheduled, two_d_mode: true}}\n'
+        'amcl: {ros__parameters: {base_frame: base, min_particles: 500, max_particles: 900}}\n'
+    )
+    with running('observer_node', tmp_path / 'log', '--params-file', str(file)) as node:
+        node.wait_for_output(
+            f"parameter file {file} has nothing for '/observer_node'; are those of '/slam_node' "
+            'meant for it'
+        )
+
+
 @pytest.mark.parametrize('name', ['observer_node', 'lifecycle_observer_node', 'simulator_node'])
 def test_parameters_that_are_not_given_to_ros_are_not_passed_over(ros, tmp_path, name):
     node = NodeProcess(name, tmp_path / name, '--', '--params-file', 'robot.yaml')
