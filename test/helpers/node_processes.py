@@ -51,6 +51,14 @@ class NodeProcess:
             assert time.monotonic() < deadline, f'no {pattern!r} in:\n{self.output}'
             time.sleep(0.05)
 
+    def wait_for_library(self, name: str) -> None:
+        """Wait until the process, which is just starting, has loaded a shared library."""
+        deadline = time.monotonic() + PATIENCE_S
+        while name not in Path(f'/proc/{self.process.pid}/maps').read_text():
+            assert self.process.poll() is None, f'the node has ended:\n{self.output}'
+            assert time.monotonic() < deadline, f'{name} is not loaded'
+            time.sleep(0.002)
+
     def wait(self) -> int:
         return self.process.wait(timeout=PATIENCE_S)
 
