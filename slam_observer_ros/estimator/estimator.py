@@ -189,6 +189,8 @@ class Estimator:
 
         """
         check_map(landmark_map)
+        if self.settings.localization_mode == 'off':
+            self._warnings.loaded_map(len(landmark_map.ids), self.settings.max_landmarks)
         if pose is not None:
             check_pose(pose, pose_covariance)
             self._timeline.catch_up()
@@ -537,14 +539,14 @@ class Estimator:
 
     def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
         """Warn of what is wrong with an observation, its outcome, or the map."""
-        settings, warnings = self.settings, self._warnings
-        if 0 < settings.max_landmarks < len(event.ids) and self._state.is_mapping:
-            warnings.more_than_max(len(event.ids), settings.max_landmarks)
+        warnings, state = self._warnings, self._state
+        limit = self.settings.max_landmarks if state.is_mapping else 0
+        if 0 < limit < len(event.ids):
+            warnings.more_than_max(len(event.ids), limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
         warnings.unexpected_poses(self._hypotheses.count)
-        if self._state.filter.has_joint_covariance:
-            warnings.large_map(len(self._state.landmarks))
+        warnings.large_map(len(state.landmarks), limit, state.filter.has_joint_covariance)
 
     def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
         observer = self._state.observer

@@ -28,7 +28,7 @@ from slam_observer_ros.observer.gauge import JITTER_M2
 from slam_observer_ros.state.state import State
 
 ROUNDING = 1e-14
-"""Least variance that can be told from zero, as a share of the sum of all variances."""
+"""Least variance that can be distinguished from zero, as a share of the sum of all variances."""
 
 
 def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:

@@ -1,6 +1,6 @@
 """ROS 2 nodes; the only part of the package that needs rclpy and message packages.
 
-``observer_node``, ``lifecycle_observer_node`` and ``simulator_node`` are the executables: they wait
+``observer_node``, ``lifecycle_observer_node`` and ``simulator_node`` are executables: they wait
 for signals from the first instant, and load ``plain_observer``, ``managed_observer`` and
 ``simulator``. Both observers are shells around ``observer_core``, which joins ``intake/`` (topics
 to the estimator), ``publishing/`` (the estimate to topics) and ``services/``. ``demo/`` runs the

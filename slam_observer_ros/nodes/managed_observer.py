@@ -11,12 +11,12 @@ from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.nodes.entities import Entities
 from slam_observer_ros.nodes.log_bridge import forward_logging
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.ros_parameters import declare_settings
+from slam_observer_ros.nodes.ros_parameters import declare_settings, RepeatableParameters
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 
-class LifecycleObserverNode(LifecycleNode):  # type: ignore[misc]  # rclpy comes untyped
+class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignore[misc]
     """Estimates while it is active.
 
     Configured, it has its topics, services and map; inactive, it drops what comes in and

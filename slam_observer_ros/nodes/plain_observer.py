@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from rclpy.node import Node
-
 from slam_observer_ros.nodes.log_bridge import forward_logging
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.ros_parameters import declare_settings
+from slam_observer_ros.nodes.ros_parameters import declare_settings, RepeatableParameters
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 
-class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
+class ObserverNode(RepeatableParameters):
     """Estimates from its start to its end."""
 
     def __init__(self) -> None:

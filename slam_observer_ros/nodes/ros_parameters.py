@@ -11,6 +11,7 @@ from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
+    ParameterValue,
     SetParametersResult,
 )
 from rclpy.node import Node
@@ -27,6 +28,27 @@ from slam_observer_ros.settings.parameter_table import (
 )
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+
+
+class RepeatableParameters(Node):  # type: ignore[misc]  # rclpy comes untyped
+    """A node where setting a parameter to the value that it has is no failure.
+
+    rclpy refuses that for those that are read-only, which most of a dumped file are.
+    """
+
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """Set those parameters that are read-only only where they change, all others as ever."""
+        changes = [each for each in parameter_list if not self._is_repeated(each)]
+        if parameter_list and not changes:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(changes)
+
+    def _is_repeated(self, parameter: RosParameter) -> bool:
+        name = parameter.name
+        if not self.has_parameter(name) or not self.describe_parameter(name).read_only:
+            return False
+        present: ParameterValue = self.get_parameter(name).get_parameter_value()
+        return bool(parameter.get_parameter_value() == present)
 
 
 def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:

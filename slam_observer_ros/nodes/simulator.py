@@ -9,7 +9,6 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from rclpy.clock import Clock as RosClock
 from rclpy.clock import ClockType
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud, PointCloud2
 
@@ -20,7 +19,11 @@ from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.nodes.ros_parameters import declare_settings, read_settings
+from slam_observer_ros.nodes.ros_parameters import (
+    declare_settings,
+    read_settings,
+    RepeatableParameters,
+)
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
 from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
@@ -32,7 +35,7 @@ ACKNOWLEDGED_S = 10.0  # how long the last messages may be on their way, as on a
 SIMULATED_EPOCH_NS = 1_000_000_000  # first stamp of a simulated /clock; zero means 'no time yet'
 
 
-class SimulatorNode(Node):  # type: ignore[misc]  # rclpy comes untyped
+class SimulatorNode(RepeatableParameters):
     """Publishes a :class:`Simulation` in real time, or faster or slower with ``/clock``."""
 
     def __init__(self) -> None:

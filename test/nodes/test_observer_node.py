@@ -14,7 +14,13 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from robots import Robot, stamp_ns
@@ -309,6 +315,29 @@ def test_parameters_can_be_set_within_their_range_only(ros, observer):
     assert wrong_type.reason == "parameter 'gain_k' takes a number, not 'high'"
     read_only = _set(ros, 'map_frame', string_value='moon')
     assert 'read-only' in read_only.reason
+
+
+def test_a_dumped_parameter_file_is_loaded_again_without_a_failure(ros, observer):
+    names = ros.call(
+        ListParameters, '/observer_node/list_parameters', ListParameters.Request()
+    ).result.names
+    values = ros.call(
+        GetParameters, '/observer_node/get_parameters', GetParameters.Request(names=names)
+    ).values
+    assert len(names) > 60
+    dumped = [Parameter(name=name, value=value) for name, value in zip(names, values, strict=True)]
+    request = SetParameters.Request(parameters=dumped)
+    results = ros.call(SetParameters, '/observer_node/set_parameters', request).results
+    assert [result.reason for result in results if not result.successful] == []
+    request = SetParametersAtomically.Request(parameters=dumped)
+    answer = ros.call(SetParametersAtomically, '/observer_node/set_parameters_atomically', request)
+    assert answer.result.successful, answer.result.reason
+
+
+def test_noise_may_be_tuned_while_the_node_runs(ros, observer):
+    assert _set(ros, 'range_noise', double_value=0.3).successful
+    assert not _set(ros, 'range_noise', double_value=-0.3).successful
+    assert _set(ros, 'range_noise', double_value=0.1).successful
 
 
 def test_parameters_describe_themselves(ros, observer):
