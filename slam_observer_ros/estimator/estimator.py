@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 import logging
+import math
+import time
 
 import numpy as np
 
@@ -263,13 +265,18 @@ class Estimator:
             self._process(ready)
         return True
 
-    def release(self) -> None:
+    def release(self, limit_s: float = math.inf) -> None:
         """Use the events that are held back for others, as before something is changed.
 
         One with a stamp far ahead stays: it may be wrong, and would make all others too late.
+        After ``limit_s``, seconds, no further one is begun with, and they are dropped.
         """
+        end_s = time.monotonic() + limit_s
         for ready in self._queue.pop_believed():
-            self._process(ready)
+            if time.monotonic() > end_s:
+                self._drop(InvalidEventError('stopped', 'held back when the end came'))
+            else:
+                self._process(ready)
 
     def flush(self) -> None:
         """Use all events that are held back and move on to the last: the recording is over."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 import os
 import resource
+import time
 from unittest.mock import Mock
 
 import numpy as np
@@ -14,7 +15,7 @@ from std_srvs.srv import Trigger
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.known_map.map_file import read_map
-from slam_observer_ros.nodes.services.map_services import MapServices
+from slam_observer_ros.nodes.services.map_services import END_S, MapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
@@ -112,6 +113,25 @@ def test_what_is_no_regular_file_is_refused_at_once_in_a_line(tmp_path, service,
         f"can't read map {path}: it is no regular file",
     )
     assert names(path.parent) == before
+
+
+def test_at_the_end_what_is_held_back_is_used_only_as_far_as_that_is_quick(tmp_path):
+    path = tmp_path / 'hall.yaml'
+    used = []
+
+    def take_long(update):
+        used.append(update.stamp_ns)
+        time.sleep(2.0 * END_S)
+
+    estimator = Estimator(Settings(reorder_window=10.0, confirmations=1), on_update=take_long)
+    for stamp_ns in range(100_000_000, 600_000_000, 100_000_000):
+        estimator.add(ObservationEvent(stamp_ns, np.arange(4), np.eye(4, 3)))
+    settings = ObserverNodeSettings(map_path=str(path), autosave_map=True)
+    node = Mock()
+    node.get_parameter.return_value.value = str(path)
+    MapServices(node, settings, estimator, Mock()).save_at_end()
+    assert len(used) == 1
+    assert len(read_map(path).ids) == 4
 
 
 def test_nothing_is_computed_of_landmarks_that_are_not_confirmed(tmp_path, monkeypatch):

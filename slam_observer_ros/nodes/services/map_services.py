@@ -16,6 +16,9 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.known_map.map_file import check_writable, read_map, write_map
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
+END_S = 0.2
+"""For how long, at the end, events that are held back are begun with."""
+
 
 class MapServices:
     """The map file of the start, ``~/load_map``, ``~/save_map`` and the autosave at the end.
@@ -58,8 +61,13 @@ class MapServices:
         node.create_service(Trigger, '~/load_map', self._answer_load)
 
     def save_at_end(self) -> None:
-        """Save the map if that was asked for and there is one; MapError if it can't be saved."""
+        """Save the map if that was asked for and there is one; MapError if it can't be saved.
+
+        Events that are held back count as far as that is quick: launch waits for five seconds.
+        """
         self._node.remove_on_set_parameters_callback(self._check_changes)
+        if self._autosave:
+            self._estimator.release(END_S)
         if not self._autosave or not len(self._estimator.landmark_ids):
             return
         try:
