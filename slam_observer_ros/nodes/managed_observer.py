@@ -63,6 +63,10 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
         self._close_and_log()
         return TransitionCallbackReturn.SUCCESS
 
+    def end_in_haste(self) -> int | None:
+        """See :meth:`.ObserverCore.end_in_haste`."""
+        return None if self._core is None else self._core.end_in_haste()
+
     def destroy_node(self) -> None:
         """End, whatever the state; raise a MapError if the map can't be saved."""
         try:

@@ -19,6 +19,10 @@ class ObserverNode(RepeatableParameters):
         self._core = ObserverCore(self)
         self._core.start()
 
+    def end_in_haste(self) -> int | None:
+        """See :meth:`.ObserverCore.end_in_haste`."""
+        return self._core.end_in_haste()
+
     def destroy_node(self) -> None:
         """Save the map if that was asked for, and end; raise a MapError if it can't be saved."""
         try:

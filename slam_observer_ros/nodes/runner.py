@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import os
 import sys
+import threading
 
 import rclpy
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -30,6 +32,9 @@ docs/parameters.md all parameters; of a running node `ros2 param list` does.
 
 STOP_LATENCY_S = 0.1
 """Longest time that an idle node takes to notice a signal."""
+
+PATIENCE_S = 1.2
+"""How long a node may take to end by itself, as within a long computation; launch waits 5 s."""
 
 
 def run(
@@ -77,6 +82,9 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     except REFUSALS as error:
         get_logger('slam_observer_ros').fatal(str(error))
         return 2
+    has_ended = threading.Event()
+    if hasattr(node, 'end_in_haste'):
+        threading.Thread(target=_watch, args=(node, stop, has_ended), daemon=True).start()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -87,7 +95,17 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     finally:
         executor.shutdown()
         exit_code = _destroy(node)
+        has_ended.set()
     return exit_code
+
+
+def _watch(node: Node, stop: StopSignal, has_ended: threading.Event) -> None:
+    """End the process if the node does not do so in time after a signal."""
+    stop.wait()
+    if not has_ended.wait(PATIENCE_S):
+        exit_code = node.end_in_haste()
+        if exit_code is not None:
+            os._exit(exit_code)
 
 
 def _destroy(node: Node) -> int:

@@ -27,6 +27,14 @@ class StopSignal:
     def begin(self) -> None:
         """From now on only set the flag."""
         self._has_begun = True
+        # Python's handlers wait while a library computes; a byte in this pipe does not.
+        self._read_end, write_end = os.pipe()
+        os.set_blocking(write_end, False)
+        signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+
+    def wait(self) -> None:
+        """Wait for the first signal, in a thread, even while the main one computes."""
+        os.read(self._read_end, 1)
 
     def _set(self, _number: int, _frame: FrameType | None) -> None:
         if not self._has_begun:

@@ -28,9 +28,18 @@ class NodeProcess:
 
     started: ClassVar[int] = 0
 
-    def __init__(self, name: str, log: Path, *arguments: str, **parameters: object) -> None:
+    def __init__(
+        self,
+        name: str,
+        log: Path,
+        *arguments: str,
+        program: Path | None = None,
+        **parameters: object,
+    ) -> None:
+        """Start a node, or a program of its own in its place."""
         self.log = log
-        command = [sys.executable, '-m', f'slam_observer_ros.nodes.{name}', '--ros-args']
+        module = ['-m', f'slam_observer_ros.nodes.{name}']
+        command = [sys.executable, *(module if program is None else [str(program)]), '--ros-args']
         for key, value in parameters.items():
             command += ['-p', f'{key}:={_yaml(value)}']
         NodeProcess.started += 1

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 import dataclasses
 from pathlib import Path
+import threading
+import time
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -13,8 +15,12 @@ from std_srvs.srv import Trigger
 
 from slam_observer_ros.common.errors import MapError, ParameterError, SlamObserverError
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import check_writable, read_map, write_map
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+RECENT_PERIODS = 20.0
+"""How many times as long as it took the map at hand is kept before it is made again."""
 
 END_S = 0.2
 """For how long, at the end, events that are held back are begun with."""
@@ -47,6 +53,11 @@ class MapServices:
         self._autosave = settings.autosave_map
         self._estimator = estimator
         self._on_load = on_load
+        # For an end within a long observation: a map at hand, and whether the end has come.
+        self._recent: tuple[LandmarkMap, int] | None = None
+        self._recent_s = self._next_s = 0.0
+        self._end = threading.Lock()
+        self._has_ended = False
         # Files that hold what this node has loaded or saved, and that it may write again.
         self._own_files: set[Path] = set()
         if self._autosave:
@@ -68,12 +79,43 @@ class MapServices:
         self._node.remove_on_set_parameters_callback(self._check_changes)
         if self._autosave:
             self._estimator.release(END_S)
-        if not self._autosave or not len(self._estimator.landmark_ids):
+        with self._end:
+            self._has_ended = True
+            if not self._autosave or not len(self._estimator.landmark_ids):
+                return
+            try:
+                self._node.get_logger().info(self._save(self._path()))
+            except SlamObserverError as error:
+                raise MapError(f'the map is not saved: {error}') from error
+
+    def keep_recent(self) -> None:
+        """Have a map at hand for :meth:`end_in_haste`; a twentieth of the time goes there."""
+        start_s = time.monotonic()
+        if not self._autosave or start_s < self._next_s:
             return
-        try:
-            self._node.get_logger().info(self._save(self._path()))
-        except SlamObserverError as error:
-            raise MapError(f'the map is not saved: {error}') from error
+        estimator = self._estimator
+        has_map = estimator.is_localised and len(estimator.landmark_ids)
+        self._recent = self._present_map() if has_map else None
+        self._recent_s = time.monotonic()
+        self._next_s = self._recent_s + RECENT_PERIODS * (self._recent_s - start_s)
+
+    def end_in_haste(self) -> int | None:
+        """Save the map at hand, for an end within an observation that another thread works on.
+
+        Return the exit code; None if that thread has come to the end by itself.
+        """
+        with self._end:
+            if self._has_ended:
+                return None
+            log = self._node.get_logger()
+            recent = self._recent
+            if not self._autosave or recent is None:
+                log.warning('stopped within an observation')
+                return 0
+            age_s = time.monotonic() - self._recent_s
+            answer = self._answer(Trigger.Response(), lambda path: self._write(path, *recent))
+            log.warning(f'stopped within an observation: the map is that of {age_s:.1f} s before')
+            return 0 if answer.success else 1
 
     def _check_changes(self, changes: list[Parameter]) -> SetParametersResult:
         """Refuse a file that the map could not be saved to at the end."""
@@ -137,12 +179,20 @@ class MapServices:
             check_writable(path)  # before all that takes time
         if not estimator.is_localised:
             raise MapError('the pose in the loaded map is not known yet: nothing is saved')
+        return self._write(path, *self._present_map())
+
+    def _present_map(self) -> tuple[LandmarkMap, int]:
+        """Return the map as it would be saved now, and how many landmarks are not in it."""
+        estimator = self._estimator
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
+        return landmark_map, len(estimator.landmark_ids) - len(landmark_map.ids)
+
+    def _write(self, path: Path, landmark_map: LandmarkMap, moving: int) -> str:
+        """Write a map, without ``moving`` landmarks; return what is to be said of it."""
         backup = _backup(path) if self._is_another(path) else None
-        write_map(path, landmark_map, estimator.settings, backup)
+        write_map(path, landmark_map, self._estimator.settings, backup)
         kept = '' if backup is None else f'; what it held before is in {backup.name}'
         self._own_files.add(path)
-        moving = len(estimator.landmark_ids) - len(landmark_map.ids)
         without = f' (without {moving} that move)' if moving else ''
         what = f'{len(landmark_map.ids)} landmarks{without}'
         return f"saved {what} in frame '{self._map_frame}' to {path}{kept}"
