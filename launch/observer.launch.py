@@ -1,10 +1,27 @@
 """Start the observer alone, with a parameter file and topics of one's own robot."""
 
+from pathlib import Path
+
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
+
+
+def check_params_file(context):
+    """Expand ~ in params_file; end the launch where there is no such file.
+
+    Launch itself would only warn, and start the node with its defaults.
+    """
+    written = context.launch_configurations['params_file']
+    try:
+        path = Path(written).expanduser().absolute()
+    except RuntimeError as error:  # of a user that there is none of
+        raise RuntimeError(f"params_file: no file '{written}': {error}") from error
+    if not path.is_file():
+        raise RuntimeError(f"params_file: no file '{path}'")
+    context.launch_configurations['params_file'] = str(path)
 
 
 def generate_launch_description():
@@ -36,6 +53,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'use_sim_time', default_value='false', description='whether time is that of /clock'
             ),
+            OpaqueFunction(function=check_params_file),
             Node(
                 package='slam_observer_ros',
                 executable='observer_node',

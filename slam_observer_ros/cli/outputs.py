@@ -7,10 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import os
 from pathlib import Path
-import tempfile
 
 from slam_observer_ros.common.errors import EvaluationError, OutputError, UsageError
-from slam_observer_ros.common.output_files import destination
+from slam_observer_ros.common.output_files import destination, unfinished_directory
 
 
 def add_force_option(parser: argparse.ArgumentParser) -> None:
@@ -99,13 +98,13 @@ def filled_directory(directory: Path, names: Iterable[str]) -> Iterator[Path]:
     """
     beside = directory if directory.is_dir() else directory.parent
     try:
-        with tempfile.TemporaryDirectory(dir=beside, prefix='.writing-') as unfinished:
+        with unfinished_directory(beside) as unfinished:
             try:
-                yield Path(unfinished)
+                yield unfinished
             except EvaluationError as error:  # which names a directory that is gone then
-                raise OutputError(str(error).replace(unfinished, str(directory))) from error
+                raise OutputError(str(error).replace(str(unfinished), str(directory))) from error
             directory.mkdir(exist_ok=True)
-            files = sorted(Path(unfinished).iterdir())
+            files = sorted(unfinished.iterdir())
             for file in files:
                 file.replace(destination(directory / file.name))
             for name in set(names) - {file.name for file in files}:

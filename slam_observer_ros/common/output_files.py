@@ -1,12 +1,25 @@
-"""Files that are put where their name leads: whole or not at all, and over files only."""
+"""Files that are put where their name leads: whole or not at all, and over files only.
+
+They are written beside it, under names that nobody can guess or has taken, and locked: a file that
+nobody has locked is what a killed process has left, and goes when the next one is written.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 import errno
+import fcntl
+import glob
 import os
 from pathlib import Path
+import secrets
+import shutil
+import tempfile
+from typing import BinaryIO, TextIO
+
+_MARK = '.unfinished-'
+_DIRECTORY_MARK = f'.slam_observer{_MARK}'
 
 
 def destination(path: Path) -> Path:
@@ -18,12 +31,77 @@ def destination(path: Path) -> Path:
 
 
 @contextmanager
-def unfinished_file(path: Path) -> Iterator[Path]:
-    """Give a file to write that becomes ``path`` at the end, or goes if there is an error."""
-    target = destination(path)
-    unfinished = target.with_name(f'.{target.name}.{os.getpid()}')
-    try:
-        yield unfinished
-        unfinished.replace(target)
-    finally:
-        unfinished.unlink(missing_ok=True)
+def unfinished_file(path: Path) -> Iterator[TextIO]:
+    """Give a text file that becomes ``path`` at the end, or goes if there is an error."""
+    with (
+        _replacement(destination(path)) as file,
+        open(file.fileno(), 'w', encoding='utf-8', closefd=False) as text,
+    ):
+        yield text
+
+
+def keep_copy(path: Path, copy: Path) -> None:
+    """Let ``copy`` be a copy of a file, whole or not at all; what has that name goes."""
+    with _replacement(copy) as file, path.open('rb') as source:
+        shutil.copyfileobj(source, file)
+        status = os.fstat(source.fileno())
+        os.fchmod(file.fileno(), status.st_mode & 0o777)
+        os.utime(file.fileno(), ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+@contextmanager
+def unfinished_directory(beside: Path) -> Iterator[Path]:
+    """Give a directory in another one, from where files can be moved in one step; it then goes."""
+    _remove_left(beside.glob(f'{_DIRECTORY_MARK}*'))
+    while True:
+        directory = Path(tempfile.mkdtemp(prefix=_DIRECTORY_MARK, dir=beside))
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            if _lock_own(directory, descriptor):
+                yield directory
+                return
+        finally:
+            os.close(descriptor)
+            shutil.rmtree(directory, ignore_errors=True)
+
+
+@contextmanager
+def _replacement(target: Path) -> Iterator[BinaryIO]:
+    """Give a file that takes the place of ``target`` at the end, or goes if there is an error."""
+    prefix = f'.{target.name}{_MARK}'
+    _remove_left(target.parent.glob(f'{glob.escape(prefix)}*'))
+    while True:
+        unfinished = target.with_name(f'{prefix}{secrets.token_hex(4)}')
+        try:
+            with unfinished.open('xb') as file:  # x: it is new, and no link of somebody
+                if not _lock_own(unfinished, file.fileno()):
+                    continue
+                yield file
+                file.flush()
+                os.fsync(file.fileno())  # else a power cut may leave the name on an empty file
+                unfinished.replace(target)
+                return
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+
+def _lock_own(path: Path, descriptor: int) -> bool:
+    """Lock a new file or directory; return whether it is still there."""
+    with suppress(OSError):  # where there are no locks, nothing is taken for left behind either
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    return path.exists()
+
+
+def _remove_left(paths: Iterable[Path]) -> None:
+    """Remove those files and directories that no process is writing, as far as one may."""
+    for path in paths:
+        with suppress(OSError):  # another process's, or another user's
+            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+            finally:
+                os.close(descriptor)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 import logging
+import math
+import time
 
 import numpy as np
 
@@ -138,6 +140,8 @@ class Estimator:
         then.
         """
         check_map(landmark_map)
+        if self.settings.localization_mode == 'off':
+            self._warnings.loaded_map(len(landmark_map.ids), self.settings.max_landmarks)
         if pose is not None:
             check_pose(pose, pose_covariance)
             self._timeline.catch_up()
@@ -198,13 +202,18 @@ class Estimator:
             self._process(ready)
         return True
 
-    def release(self) -> None:
+    def release(self, limit_s: float = math.inf) -> None:
         """Use the events that are held back for others, as before something is changed.
 
         One with a stamp far ahead stays: it may be wrong, and would make all others too late.
+        After ``limit_s``, seconds, no further one is begun with, and they are dropped.
         """
+        end_s = time.monotonic() + limit_s
         for ready in self._queue.pop_believed():
-            self._process(ready)
+            if time.monotonic() > end_s:
+                self._drop(InvalidEventError('stopped', 'held back when the end came'))
+            else:
+                self._process(ready)
 
     def flush(self) -> None:
         """Use all events that are held back and move on to the last: the recording is over."""
@@ -449,14 +458,14 @@ class Estimator:
 
     def _warn_of(self, event: ObservationEvent, outcome: Outcome) -> None:
         """Warn of what is wrong with an observation, its outcome, or the map."""
-        settings, warnings = self.settings, self._warnings
-        if 0 < settings.max_landmarks < len(event.ids) and self._state.is_mapping:
-            warnings.more_than_max(len(event.ids), settings.max_landmarks)
+        warnings, state = self._warnings, self._state
+        limit = self.settings.max_landmarks if state.is_mapping else 0
+        if 0 < limit < len(event.ids):
+            warnings.more_than_max(len(event.ids), limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
         warnings.unexpected_poses(self._hypotheses.count)
-        if self._state.filter.has_joint_covariance:
-            warnings.large_map(len(self._state.landmarks))
+        warnings.large_map(len(state.landmarks), limit, state.filter.has_joint_covariance)
 
     def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
         observer = self._state.observer

@@ -69,15 +69,35 @@ class EventWarnings:
         text = f'Points without an id are not used by {gains} gains, only by riccati'
         self._warn('unknown_id', text)
 
-    def large_map(self, count: int) -> None:
-        """Warn once that Riccati gains are slow if a map has so many landmarks."""
-        if count >= MANY_LANDMARKS and not self._counts['large_map']:
+    def large_map(self, count: int, limit: int, is_slow: bool) -> None:
+        """Say once that a map is full, with 0 < ``limit``, and once that it takes long."""
+        if 0 < limit <= count and not self._counts['full_map']:
+            self._counts['full_map'] = 1
+            logger.warning(
+                'The map has %d landmarks, and max_landmarks is %d: from now on a new one '
+                'replaces the one seen least often. If so many are right, set it higher; if not, '
+                'look for ids that the sensor makes up.',
+                count,
+                limit,
+            )
+        if is_slow and count >= MANY_LANDMARKS and not self._counts['large_map']:
             self._counts['large_map'] = 1
             logger.warning(
                 'The map has %d landmarks, and the time that riccati gains take grows with their '
                 'square: scheduled gains take many more, if points have ids, and max_landmarks '
                 'limits them.',
                 count,
+            )
+
+    def loaded_map(self, count: int, limit: int) -> None:
+        """Say that a loaded map, to which new landmarks are added, will not be kept whole."""
+        if 0 < limit < count:
+            logger.warning(
+                'The loaded map has %d landmarks, and max_landmarks is %d: those that are not '
+                'seen make room for new ones. To keep them, set it higher, or '
+                'localization_mode: uncertain.',
+                count,
+                limit,
             )
 
     def more_than_max(self, count: int, limit: int) -> None:

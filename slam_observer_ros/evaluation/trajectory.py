@@ -127,7 +127,7 @@ def write_tum(trajectory: Trajectory, path: Path) -> Path:
         for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), numbers, strict=True)
     )
     try:
-        with unfinished_file(path) as unfinished, unfinished.open('w', encoding='ascii') as file:
+        with unfinished_file(path) as file:
             file.write(_TUM_HEADER)
             file.writelines(lines)
     except OSError as error:

@@ -7,6 +7,9 @@ from scipy.linalg.lapack import dgesv
 
 from slam_observer_ros.common.types import FloatArray
 
+LARGE = 500
+"""Equations whose solution takes longer than NumPy's overhead."""
+
 
 def transpose(M: FloatArray) -> FloatArray:
     """Transpose each matrix of a stack (…, m, n)."""
@@ -27,6 +30,8 @@ def solve(S: FloatArray, right: FloatArray) -> FloatArray:
     """
     if not right.size:  # which SciPy does not take
         return right
+    if len(S) > LARGE:  # with SciPy no other thread would get a word in for seconds
+        return np.asarray(np.linalg.solve(S, right), dtype=np.float64)
     _, _, solution, is_singular = dgesv(S, right)
     if is_singular:
         raise np.linalg.LinAlgError('Singular matrix')

@@ -17,10 +17,13 @@ def map_of(state: State, is_own_frame: bool) -> LandmarkMap:
     """Return the confirmed landmarks at rest; in its own frame, with covariances of its shape."""
     rows = state.confirmed
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
-    covariances = shape_covariances(state) if is_own_frame else state.landmark_covariances()
+    if is_own_frame:
+        covariances = shape_covariances(state, rows)
+    elif (covariances := state.landmark_covariances()) is not None:
+        covariances = covariances[rows]
     return LandmarkMap(
         state.landmarks.ids[rows],
         state.world_points[rows],
-        None if covariances is None else with_variances_above(0.0, covariances[rows]),
+        None if covariances is None else with_variances_above(0.0, covariances),
         state.landmarks.counts[rows],
     )

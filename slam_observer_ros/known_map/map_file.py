@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 import dataclasses
-import os
 from pathlib import Path
 import re
 import tempfile
@@ -29,7 +28,7 @@ import yaml
 
 from slam_observer_ros import __version__
 from slam_observer_ros.common.errors import MapError
-from slam_observer_ros.common.output_files import destination, unfinished_file
+from slam_observer_ros.common.output_files import destination, keep_copy, unfinished_file
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.yaml_errors import reason_of, UniqueKeys
 from slam_observer_ros.events import MAX_ID
@@ -76,8 +75,12 @@ _StrictLoader.add_implicit_resolver(
 )
 
 
-def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None:
+def write_map(
+    path: Path, landmark_map: LandmarkMap, settings: Settings, backup: Path | None = None
+) -> None:
     """Write a map, and with which settings it was made; the file appears whole or not at all.
+
+    ``backup`` is a file to be a copy of the one that is replaced, once the new one is written.
 
     Raise :exc:`MapError` if the map is empty, or the file can't be written.
     """
@@ -95,12 +98,13 @@ def write_map(path: Path, landmark_map: LandmarkMap, settings: Settings) -> None
     }
     lines = [_on_one_line(landmark) for landmark in _as_mappings(landmark_map)]
     try:
-        with unfinished_file(path) as unfinished, unfinished.open('w', encoding='utf-8') as file:
+        with unfinished_file(path) as file:
             yaml.safe_dump(head, file, sort_keys=False)
             file.write('landmarks:\n')
             file.writelines(f'- {line}' for line in lines)
-            file.flush()
-            os.fsync(file.fileno())  # else a power cut may leave the new name on an empty file
+            file.flush()  # and a full disk shows before anything is replaced
+            if backup is not None:
+                keep_copy(path, backup)
     except OSError as error:
         raise MapError(f"can't write map {path}: {error.strerror}") from error
 
@@ -132,6 +136,8 @@ def read_map(path: Path) -> LandmarkMap:
     the reason.
     """
     try:
+        if path.exists() and not path.is_file():  # reading it might never end
+            raise MapError(f"can't read map {path}: it is no regular file")
         content = yaml.load(path.read_text(encoding='utf-8'), _StrictLoader)
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error

@@ -8,8 +8,12 @@ one after another, nor whether the map is known from the start or is loaded late
 
 from __future__ import annotations
 
-import numpy as np
+from contextlib import suppress
 
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
@@ -17,11 +21,10 @@ from slam_observer_ros.geometry.matrices import (
     block_diagonal,
     diagonal_blocks,
     transpose,
-    with_variances_above,
 )
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import find_transform
-from slam_observer_ros.observer.gauge import gauge_information, JITTER_M2
+from slam_observer_ros.observer.gauge import JITTER_M2
 from slam_observer_ros.state.state import State
 
 ROUNDING = 1e-14
@@ -66,31 +69,40 @@ def enter_map(state: State, known: LandmarkMap) -> bool:
     return True
 
 
-def shape_covariances(state: State) -> FloatArray | None:
-    """Return covariances (n, 3, 3) of the landmarks in a frame of their own, world axes, m².
+def shape_covariances(state: State, rows: IntArray) -> FloatArray | None:
+    """Return covariances (m, 3, 3) of landmarks ``rows`` in a frame of their own, world axes, m².
 
-    A map's frame starts where the robot did, and all landmarks share the error of that pose. Who
-    loads the map knows it by its landmarks alone: what remains is the error of its shape,
-    P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None where the
-    filter knows no covariances.
+    A map's frame starts where the robot did, and all landmarks share the error of how they lie to
+    that pose. Who loads the map knows it by its landmarks alone: what remains is the error of
+    its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None
+    where the gains know no covariances.
     """
-    n, axes, points = len(state.landmarks), state.axes, state.observer.points
+    m, axes = len(rows), state.axes
     k, R = axes.point, state.observer.reference_pose[:3, :3]
-    joint = state.filter.joint
-    with_pose = None if joint is None else joint.with_pose(np.arange(n), points)
-    if with_pose is None or n == 0:
-        return state.landmark_covariances()
+    joint, points = state.filter.joint, state.observer.points[rows]
+    with_pose = None if joint is None or m == 0 else joint.with_pose(rows, points)
+    if with_pose is None:
+        of_all = state.landmark_covariances()
+        return None if of_all is None else of_all[rows]
     P = with_pose[axes.p :, axes.p :]
-    # What landmarks, moved together about their centre, have in common.
-    G = axes.output_matrix(points - points.mean(axis=0)).reshape(n * k, -1)
-    least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
-    information = gauge_information(G, with_variances_above(least_m2, P))
-    G_each = G.reshape(n, k, -1)
+    G = axes.output_matrix(points - points.mean(axis=0)).reshape(m * k, -1)
+    whitened = solve_triangular(_lower_root(P), G, lower=True, check_finite=False)
+    information = whitened.T @ whitened
+    G_each = G.reshape(m, k, -1)
     common = G_each @ np.linalg.pinv(information, hermitian=True) @ transpose(G_each)
-    own = np.zeros((n, 3, 3))
+    own = np.zeros((m, 3, 3))
     own[:, :k, :k] = diagonal_blocks(P, k) - common
     world: FloatArray = R @ own @ R.T
     return world
+
+
+def _lower_root(P: FloatArray) -> FloatArray:
+    """Return L with L Lᵀ = P + δ I, and δ no larger than rounding in P makes necessary."""
+    least_m2 = JITTER_M2 + ROUNDING * np.trace(P)
+    for growth in 100.0 ** np.arange(8):  # with the last one δ is the trace, which always does
+        with suppress(np.linalg.LinAlgError):
+            return np.linalg.cholesky(P + growth * least_m2 * np.eye(len(P)))
+    raise MapError('the covariance of the landmarks is not finite')
 
 
 def _find_frame(

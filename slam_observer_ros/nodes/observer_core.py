@@ -112,6 +112,13 @@ class ObserverCore:
             self._node.remove_post_set_parameters_callback(self._apply_parameters)
             self._entities.remove_new()
 
+    def end_in_haste(self) -> int | None:
+        """Save the map, if that was asked for, while another thread is busy with an observation.
+
+        Return the exit code of a process that ends at once then; None if it is ending anyway.
+        """
+        return self._maps.end_in_haste()
+
     def _create_timers(self, publish_rate_hz: float) -> list[Timer]:
         # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
         clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -120,6 +127,7 @@ class ObserverCore:
             for period_s, callback in (
                 (1.0 / publish_rate_hz, self._publish_state),
                 (OVERVIEW_PERIOD_S, self._publisher.publish_overview),
+                (OVERVIEW_PERIOD_S, self._maps.keep_recent),
                 (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
                 (RETRY_PERIOD_S, self._feed.retry),
                 *((CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),

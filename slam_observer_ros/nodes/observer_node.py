@@ -1,40 +1,19 @@
-"""The SLAM observer as a ROS 2 node."""
+"""Executable: the SLAM observer as a ROS 2 node."""
 
 from __future__ import annotations
 
 import sys
 
-from rclpy.node import Node
-
-from slam_observer_ros.nodes.log_bridge import forward_logging
-from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.ros_parameters import declare_settings
-from slam_observer_ros.nodes.runner import run
-from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
-
-
-class ObserverNode(Node):  # type: ignore[misc]  # rclpy comes untyped
-    """Estimates from its start to its end."""
-
-    def __init__(self) -> None:
-        super().__init__('observer_node')
-        forward_logging(self.get_logger())
-        declare_settings(self, Settings, ObserverNodeSettings)
-        self._core = ObserverCore(self)
-        self._core.start()
-
-    def destroy_node(self) -> None:
-        """Save the map if that was asked for, and end; raise a MapError if it can't be saved."""
-        try:
-            self._core.close()
-        finally:
-            super().destroy_node()
+from slam_observer_ros.nodes.stop_signal import StopSignal
 
 
 def main() -> int:
-    """Run the observer node until it is asked to stop; return the exit code."""
-    return run(ObserverNode)
+    """Run the node until it is asked to stop; return the exit code."""
+    stop = StopSignal()  # before all else: what is imported here takes seconds
+    from slam_observer_ros.nodes.plain_observer import ObserverNode
+    from slam_observer_ros.nodes.runner import run
+
+    return run(ObserverNode, stop=stop)
 
 
 if __name__ == '__main__':

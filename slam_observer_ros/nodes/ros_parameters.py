@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import pairwise
+from pathlib import Path
+import sys
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
+    ParameterValue,
     SetParametersResult,
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.settings.parameter_file import names_of_others
+from slam_observer_ros.settings.parameter_file import misplaced_sections, names_of_others
 from slam_observer_ros.settings.parameter_table import (
     Dataclass,
     from_parameters,
@@ -24,6 +28,27 @@ from slam_observer_ros.settings.parameter_table import (
 )
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
+
+
+class RepeatableParameters(Node):  # type: ignore[misc]  # rclpy comes untyped
+    """A node where setting a parameter to the value that it has is no failure.
+
+    rclpy refuses that for those that are read-only, which most of a dumped file are.
+    """
+
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
+        """Set those parameters that are read-only only where they change, all others as ever."""
+        changes = [each for each in parameter_list if not self._is_repeated(each)]
+        if parameter_list and not changes:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(changes)
+
+    def _is_repeated(self, parameter: RosParameter) -> bool:
+        name = parameter.name
+        if not self.has_parameter(name) or not self.describe_parameter(name).read_only:
+            return False
+        present: ParameterValue = self.get_parameter(name).get_parameter_value()
+        return bool(parameter.get_parameter_value() == present)
 
 
 def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
@@ -41,6 +66,7 @@ def declare_settings(node: Node, *settings_classes: type[Dataclass]) -> None:
     """
     rows = [row for settings_class in settings_classes for row in table(settings_class)]
     _check_names(node, [row.name for row in rows])
+    _warn_of_misplaced(node, [row.name for row in rows])
 
     def check(changes: Sequence[RosParameter]) -> SetParametersResult:
         try:
@@ -100,6 +126,24 @@ def _check_names(node: Node, names: Collection[str]) -> None:
     ]
     if ignored := names_of_others(written, names):
         node.get_logger().warning(f'unknown parameters are ignored: {", ".join(ignored)}')
+
+
+def _warn_of_misplaced(node: Node, names: Collection[str]) -> None:
+    """Warn of files on the command line whose parameters have the name of another node."""
+    full_name = node.get_fully_qualified_name()
+    for option, path in pairwise(sys.argv):
+        if option != '--params-file':
+            continue
+        try:
+            sections = misplaced_sections(Path(path), full_name, names)
+        except ParameterError as error:  # though ROS has read it
+            node.get_logger().warning(str(error))
+            continue
+        if sections:
+            node.get_logger().warning(
+                f"parameter file {path} has nothing for '{full_name}'; are those of "
+                f"'{sections[0]}' meant for it?"
+            )
 
 
 def _check_changes(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-import signal
+import os
 import sys
-from types import FrameType
+import threading
 
 import rclpy
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -17,6 +17,7 @@ from rclpy.utilities import remove_ros_args
 
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.common.threads import use_one_thread
+from slam_observer_ros.nodes.stop_signal import StopSignal
 
 REFUSALS = (SlamObserverError, InvalidParameterValueException, InvalidParameterTypeException)
 """What a node may raise at its start; the last one of what rclpy declares, as use_sim_time."""
@@ -32,32 +33,24 @@ docs/parameters.md all parameters; of a running node `ros2 param list` does.
 STOP_LATENCY_S = 0.1
 """Longest time that an idle node takes to notice a signal."""
 
-
-class StopSignal:
-    """Turns SIGINT and SIGTERM into a flag.
-
-    rclpy's own handlers raise KeyboardInterrupt or ExternalShutdownException wherever the program
-    happens to be, a second time even inside the clean-up. A flag interrupts nothing.
-    """
-
-    def __init__(self) -> None:
-        self.is_set = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._set)
-
-    def _set(self, _number: int, _frame: FrameType | None) -> None:
-        self.is_set = True
+PATIENCE_S = 1.2
+"""How long a node may take to end by itself, as within a long computation; launch waits 5 s."""
 
 
-def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+def run(
+    make_node: Callable[[], Node],
+    args: Sequence[str] | None = None,
+    stop: StopSignal | None = None,
+) -> int:
     """Make a node and spin it until it shuts its context down or a signal asks it to stop.
 
-    ``args`` is a command line with ROS arguments, None for the process's own. The exit code that
-    is returned is 0 after a clean stop, 1 if something could not be saved at the end, 2 where ROS
-    or the node refused to start.
+    ``args`` is a command line with ROS arguments, None for the process's own; ``stop`` has waited
+    for signals since the process began. The exit code that is returned is 0 after a clean stop, 1
+    if something could not be saved at the end, 2 where ROS or the node refused to start.
     """
     use_one_thread()
-    stop = StopSignal()
+    stop = StopSignal() if stop is None else stop
+    stop.begin()
     try:
         rclpy.init(
             args=list(args) if args is not None else None,
@@ -89,6 +82,9 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     except REFUSALS as error:
         get_logger('slam_observer_ros').fatal(str(error))
         return 2
+    has_ended = threading.Event()
+    if hasattr(node, 'end_in_haste'):
+        threading.Thread(target=_watch, args=(node, stop, has_ended), daemon=True).start()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -99,7 +95,17 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     finally:
         executor.shutdown()
         exit_code = _destroy(node)
+        has_ended.set()
     return exit_code
+
+
+def _watch(node: Node, stop: StopSignal, has_ended: threading.Event) -> None:
+    """End the process if the node does not do so in time after a signal."""
+    stop.wait()
+    if not has_ended.wait(PATIENCE_S):
+        exit_code = node.end_in_haste()
+        if exit_code is not None:
+            os._exit(exit_code)
 
 
 def _destroy(node: Node) -> int:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-import tempfile
 from types import TracebackType
 
 import numpy as np
@@ -27,7 +26,7 @@ from rosbags.rosbag2 import (
 from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.common.errors import RecordingError
-from slam_observer_ros.common.output_files import destination
+from slam_observer_ros.common.output_files import destination, unfinished_directory
 from slam_observer_ros.evaluation.truth import LandmarkTruth, PoseTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
@@ -72,14 +71,15 @@ class RecordingWriter:
         if self.path.suffix != '.mcap':
             raise RecordingError(f'{self.path}: recordings are written as .mcap files')
         self._refuse_to_overwrite()
+        self._directory = ExitStack()
         try:
             # Beside its destination, so that the file can be moved there in one step.
             directory = destination(self.path).parent
-            self._directory = tempfile.TemporaryDirectory(dir=directory, prefix='.writing-')
+            unfinished = self._directory.enter_context(unfinished_directory(directory))
         except OSError as error:
             raise RecordingError(f'{self.path}: {error.strerror}') from error
         self._bag = Writer(
-            Path(self._directory.name) / self.path.stem,
+            unfinished / self.path.stem,
             version=Writer.VERSION_LATEST,
             storage_plugin=StoragePlugin.MCAP,
         )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, Immutable
 from slam_observer_ros.geometry.matrices import limited
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
 MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
 """Standard deviations of a velocity beyond which a message only says 'unknown'.
@@ -31,10 +33,10 @@ class MotionNoise(Immutable):
     """How far motions may be off: noise densities of the settings, or covariances of messages."""
 
     def __init__(self, settings: Settings) -> None:
-        s = settings
-        density = np.array([*s.angular_velocity_noise, *s.linear_velocity_noise])
-        unknown = np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3)
-        self._density_squared, self._unknown_squared = density**2, unknown**2
+        self._settings = s = settings
+        self._unknown_squared = (
+            np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3) ** 2
+        )
         self._scale = np.array([*s.angular_scale_noise, *s.linear_scale_noise])
         self._has_scale = bool(self._scale.any())
 
@@ -43,7 +45,8 @@ class MotionNoise(Immutable):
         dt_s, some_are_stated = held.dt_s[:, None], held.is_stated.any()
         # White noise of the stated density, and in proportion to the mean speed: a single message
         # is noisy itself, and its square too large.
-        variances = self._density_squared * _white_s(held)
+        s = self._settings  # which may change
+        variances = _squares(s.angular_velocity_noise, s.linear_velocity_noise) * _white_s(held)
         if self._has_scale:
             variances += (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2 * dt_s
         if some_are_stated:
@@ -61,6 +64,13 @@ class MotionNoise(Immutable):
             stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
+
+
+@lru_cache(maxsize=8)
+def _squares(angular: Vector3, linear: Vector3) -> FloatArray:
+    squares = np.array([*angular, *linear]) ** 2
+    squares.setflags(write=False)
+    return squares
 
 
 def _white_s(held: HeldVelocities) -> FloatArray:

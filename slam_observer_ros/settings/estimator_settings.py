@@ -100,6 +100,7 @@ class Settings(Immutable):
         'White noise of the angular velocity x y z: standard deviation of the angle after 1 s',
         unit='rad/√s',
         minimum=0.0,
+        read_only=False,
         basic=True,
     )
     linear_velocity_noise: Vector3 = parameter(
@@ -107,6 +108,7 @@ class Settings(Immutable):
         'White noise of the linear velocity x y z: standard deviation of the distance after 1 s',
         unit='m/√s',
         minimum=0.0,
+        read_only=False,
         basic=True,
     )
     angular_scale_noise: Vector3 = parameter(
@@ -148,6 +150,7 @@ class Settings(Immutable):
         'Range and bearing: standard deviation of the range',
         unit='m',
         minimum=1e-4,
+        read_only=False,
         basic=True,
     )
     range_scale_noise: float = parameter(
@@ -160,6 +163,7 @@ class Settings(Immutable):
         'Range and bearing: standard deviation of each angle',
         unit='rad',
         minimum=1e-6,
+        read_only=False,
         basic=True,
     )
     point_noise: float = parameter(
@@ -167,15 +171,24 @@ class Settings(Immutable):
         'Cartesian: standard deviation of each coordinate',
         unit='m',
         minimum=1e-4,
+        read_only=False,
         basic=True,
     )
     stereo_focal_length: float = parameter(500.0, 'Stereo: focal length', unit='px', minimum=1.0)
     stereo_baseline: float = parameter(0.2, 'Stereo: baseline', unit='m', minimum=1e-3)
     pixel_noise: float = parameter(
-        1.0, 'Stereo: standard deviation across the line of sight', unit='px', minimum=1e-6
+        1.0,
+        'Stereo: standard deviation across the line of sight',
+        unit='px',
+        minimum=1e-6,
+        read_only=False,
     )
     disparity_noise: float = parameter(
-        1.0, 'Stereo: standard deviation of the disparity', unit='px', minimum=1e-6
+        1.0,
+        'Stereo: standard deviation of the disparity',
+        unit='px',
+        minimum=1e-6,
+        read_only=False,
     )
     observation_correlation_time: float = parameter(
         0.0,
@@ -261,7 +274,7 @@ class Settings(Immutable):
         minimum=1,
     )
     max_landmarks: int = parameter(
-        0,
+        2000,
         'Most landmarks kept; a new one then replaces the one seen least often; 0 for any number',
         minimum=0,
     )

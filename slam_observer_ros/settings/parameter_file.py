@@ -56,6 +56,23 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     return values
 
 
+def misplaced_sections(path: Path, node: str, ours: Collection[str]) -> list[str]:
+    """Return the sections of other nodes that seem to be meant for a node, as none is of it.
+
+    ``node`` is its full name, and most parameters of such a section are among ``ours``. A file
+    that can't be read is a ParameterError.
+    """
+    misplaced = []
+    for name, body in _read_sections(path):
+        written = set(_flatten(body)) - {'use_sim_time'}
+        known = written.intersection(ours)
+        if known and _fits(name, node):
+            return []
+        if 2 * len(known) > len(written):
+            misplaced.append(name)
+    return misplaced
+
+
 def mixed_lists(values: Mapping[str, object]) -> list[str]:
     """Return the names of lists that ROS can't read: some numbers are integers, and some not."""
     return [

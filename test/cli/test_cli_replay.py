@@ -461,7 +461,7 @@ class TestOutputs:
     ):
         errors = slam_observer('replay', simulated, '--plot', '/proc/figures').errors
         assert "can't write figures to /proc/figures: " in errors
-        assert '.writing-' not in errors
+        assert 'unfinished' not in errors
 
     def test_figures_of_an_earlier_replay_are_not_left_among_the_new_ones(
         self, slam_observer, simulated, tmp_path
@@ -487,7 +487,7 @@ class TestOutputs:
         slam_observer.succeed('replay', simulated, '--plot', tmp_path)
         assert (tmp_path / 'notes.txt').read_text() == 'mine'
         assert (tmp_path / 'map.png').exists()
-        assert not list(tmp_path.glob('.writing-*'))
+        assert not list(tmp_path.glob('.*'))
 
 
 class TestSmoothing:

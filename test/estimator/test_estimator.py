@@ -767,6 +767,36 @@ def test_while_there_is_room_no_landmark_makes_room_for_a_new_one():
     assert estimator.counts['forgotten_landmark'] == 0
 
 
+def test_by_default_a_map_does_not_grow_for_ever_and_it_is_said_once_when_it_is_full(caplog):
+    limit = Settings().max_landmarks
+    assert 500 <= limit <= 5000
+    estimator = Estimator(Settings(gains='scheduled', reorder_window=0.0))
+    noise = np.random.default_rng(0)
+    for step in range(12):
+        estimator.add(velocity(0.1 * step))
+        ids = np.arange(300) + 300 * step
+        points = noise.normal(scale=20.0, size=(300, 3))
+        estimator.add(ObservationEvent(START_NS + step * 10**8, ids, points))
+    assert estimator.counts['forgotten_landmark'] == 12 * 300 - limit
+    said = [text for text in caplog.messages if f'max_landmarks is {limit}' in text]
+    assert len(said) == 1
+    assert 'from now on a new one replaces the one seen least often' in said[0]
+
+
+def test_a_loaded_map_that_will_not_be_kept_whole_is_reported_when_it_is_loaded(caplog):
+    points = np.random.default_rng(0).normal(scale=20.0, size=(30, 3))
+    known = LandmarkMap(np.arange(100, 130), points, None, np.zeros(30, dtype=np.int64))
+    for settings, is_reported in (
+        (Settings(max_landmarks=10), True),
+        (Settings(max_landmarks=10, localization_mode='fixed'), False),
+        (Settings(), False),
+    ):
+        caplog.clear()
+        Estimator(settings).load_map(known, np.eye(4))
+        text = 'The loaded map has 30 landmarks, and max_landmarks is 10: '
+        assert (text in caplog.text) == is_reported
+
+
 def test_a_full_map_forgets_the_landmark_seen_least_often_never_one_in_view():
     events = [observation(0.0, [0, 1, 2]), observation(0.1, [0, 2]), observation(0.2, [0, 1, 3])]
     estimator = run([velocity(0.0), *events], max_landmarks=3)
@@ -1210,6 +1240,35 @@ def test_settings_that_change_while_running_count_from_then_on(gains):
             assert rejected(estimator, step) == 0
         estimator.change_settings(changed)
         assert rejected(estimator, 10) == expected
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+@pytest.mark.parametrize(
+    ('model', 'noise'),
+    [
+        ('range_bearing', {'angular_velocity_noise': (0.1, 0.2, 0.3)}),
+        ('range_bearing', {'linear_velocity_noise': (0.1, 0.2, 0.3)}),
+        ('range_bearing', {'range_noise': 0.4}),
+        ('range_bearing', {'bearing_noise': 0.2}),
+        ('cartesian', {'point_noise': 0.3}),
+        ('stereo', {'pixel_noise': 5.0}),
+        ('stereo', {'disparity_noise': 5.0}),
+    ],
+)
+def test_noise_that_changes_while_running_counts_from_then_on(gains, model, noise):
+    before = Settings(gains=gains, observation_model=model, confirmations=1)
+    changed, from_the_start = Estimator(before), Estimator(replace(before, **noise))
+    changed.change_settings(replace(before, **noise))
+    unchanged = Estimator(before)
+    for event in drive(2.0):
+        for estimator in (changed, from_the_start, unchanged):
+            estimator.add(event)
+    np.testing.assert_array_equal(changed.pose, from_the_start.pose)
+    assert np.abs(changed.pose - unchanged.pose).max() > 1e-6
+    if gains == 'riccati':
+        covariances = [each.pose_covariance for each in (changed, from_the_start, unchanged)]
+        np.testing.assert_array_equal(*covariances[:2])
+        assert not np.allclose(*covariances[1:], rtol=1e-2, atol=0.0)
 
 
 def test_what_is_no_settings_is_refused():

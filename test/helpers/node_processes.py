@@ -28,9 +28,18 @@ class NodeProcess:
 
     started: ClassVar[int] = 0
 
-    def __init__(self, name: str, log: Path, *arguments: str, **parameters: object) -> None:
+    def __init__(
+        self,
+        name: str,
+        log: Path,
+        *arguments: str,
+        program: Path | None = None,
+        **parameters: object,
+    ) -> None:
+        """Start a node, or a program of its own in its place."""
         self.log = log
-        command = [sys.executable, '-m', f'slam_observer_ros.nodes.{name}', '--ros-args']
+        module = ['-m', f'slam_observer_ros.nodes.{name}']
+        command = [sys.executable, *(module if program is None else [str(program)]), '--ros-args']
         for key, value in parameters.items():
             command += ['-p', f'{key}:={_yaml(value)}']
         NodeProcess.started += 1
@@ -50,6 +59,14 @@ class NodeProcess:
             assert self.process.poll() is None, f'the node has ended:\n{self.output}'
             assert time.monotonic() < deadline, f'no {pattern!r} in:\n{self.output}'
             time.sleep(0.05)
+
+    def wait_for_library(self, name: str) -> None:
+        """Wait until the process, which is just starting, has loaded a shared library."""
+        deadline = time.monotonic() + PATIENCE_S
+        while name not in Path(f'/proc/{self.process.pid}/maps').read_text():
+            assert self.process.poll() is None, f'the node has ended:\n{self.output}'
+            assert time.monotonic() < deadline, f'{name} is not loaded'
+            time.sleep(0.002)
 
     def wait(self) -> int:
         return self.process.wait(timeout=PATIENCE_S)

@@ -28,7 +28,6 @@ from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener
-from slam_observer_ros.nodes.services.map_services import free_name
 from slam_observer_ros.settings.estimator_settings import Settings
 
 pytestmark = pytest.mark.ros
@@ -213,15 +212,6 @@ def test_a_file_that_there_can_not_be_is_reported_and_ends_nothing(ros, robot, t
             answer = call(ros, 'save_map')
             assert not answer.success
             assert answer.message.startswith("can't ")
-
-
-def test_what_a_file_held_is_never_lost_however_often_it_is_replaced(tmp_path):
-    path = tmp_path / 'hall.yaml'
-    for text in ('first', 'second', 'third'):
-        path.write_text(text)
-        path.replace(free_name(path))
-    kept = [(tmp_path / f'hall.yaml~{ending}').read_text() for ending in ('', '2', '3')]
-    assert kept == ['first', 'second', 'third']
 
 
 def test_a_map_that_can_not_be_saved_at_the_end_shows_in_the_exit_code(ros, robot, tmp_path):

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from robots import Robot, stamp_ns
@@ -311,6 +317,29 @@ def test_parameters_can_be_set_within_their_range_only(ros, observer):
     assert 'read-only' in read_only.reason
 
 
+def test_a_dumped_parameter_file_is_loaded_again_without_a_failure(ros, observer):
+    names = ros.call(
+        ListParameters, '/observer_node/list_parameters', ListParameters.Request()
+    ).result.names
+    values = ros.call(
+        GetParameters, '/observer_node/get_parameters', GetParameters.Request(names=names)
+    ).values
+    assert len(names) > 60
+    dumped = [Parameter(name=name, value=value) for name, value in zip(names, values, strict=True)]
+    request = SetParameters.Request(parameters=dumped)
+    results = ros.call(SetParameters, '/observer_node/set_parameters', request).results
+    assert [result.reason for result in results if not result.successful] == []
+    request = SetParametersAtomically.Request(parameters=dumped)
+    answer = ros.call(SetParametersAtomically, '/observer_node/set_parameters_atomically', request)
+    assert answer.result.successful, answer.result.reason
+
+
+def test_noise_may_be_tuned_while_the_node_runs(ros, observer):
+    assert _set(ros, 'range_noise', double_value=0.3).successful
+    assert not _set(ros, 'range_noise', double_value=-0.3).successful
+    assert _set(ros, 'range_noise', double_value=0.1).successful
+
+
 def test_parameters_describe_themselves(ros, observer):
     request = DescribeParameters.Request(names=['publish_rate', 'gain_k'])
     rate, gain = ros.call(
@@ -359,6 +388,19 @@ def test_parameter_misspelt_by_a_letter_is_refused_with_the_one_that_may_be_mean
     assert node.wait() == 2
     assert f"'{written}'; did you mean '{meant}'?" in node.output
     assert 'Traceback' not in node.output
+
+
+def test_parameters_under_the_name_of_another_node_are_reported_at_the_start(ros, tmp_path):
+    file = tmp_path / 'robot.yaml'
+    file.write_text(
+        'slam_node: {ros__parameters: {gains: scheduled, two_d_mode: true}}\n'
+        'amcl: {ros__parameters: {base_frame: base, min_particles: 500, max_particles: 900}}\n'
+    )
+    with running('observer_node', tmp_path / 'log', '--params-file', str(file)) as node:
+        node.wait_for_output(
+            f"parameter file {file} has nothing for '/observer_node'; are those of '/slam_node' "
+            'meant for it'
+        )
 
 
 @pytest.mark.parametrize('name', ['observer_node', 'lifecycle_observer_node', 'simulator_node'])

@@ -13,7 +13,7 @@ from slam_observer_ros.common.threads import CHOICES
 
 NODE = """
 from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.nodes import observer_node
+from slam_observer_ros.nodes import plain_observer
 from slam_observer_ros.nodes.runner import run
 def refuse():
     raise SlamObserverError('this node does not start')

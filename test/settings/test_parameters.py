@@ -17,6 +17,7 @@ from slam_observer_ros.settings import parameter_table
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.settings.parameter_file import (
+    misplaced_sections,
     mixed_lists,
     names_of_others,
     read_parameter_file,
@@ -295,6 +296,29 @@ def test_wildcards_are_of_the_node_as_in_ros(tmp_path, sections, used):
         for section, name in zip(sections, 'abcde', strict=False)
     }
     assert ''.join(sorted(read_parameter_file(write(tmp_path, yaml.dump(tree))))) == used
+
+
+@pytest.mark.parametrize(
+    ('sections', 'reported'),
+    [
+        ({'/slam_node': ['gains', 'use_sim_time']}, ['/slam_node']),
+        ({'robot2/observer_node': ['gains', 'range_noise']}, ['/robot2/observer_node']),
+        ({'/slam_node': ['gains'], '/**': ['use_sim_time']}, ['/slam_node']),
+        ({'/slam_node': ['gains'], '/**': ['two_d_mode']}, []),
+        ({'/robot1/observer_node': ['gains'], '/robot2/observer_node': ['gains']}, []),
+        ({'/amcl': ['base_frame', 'min_particles', 'max_particles']}, []),
+        ({'/**': ['use_sim_time']}, []),
+        ({}, []),
+    ],
+)
+def test_parameters_that_seem_to_be_under_a_wrong_name_are_found(tmp_path, sections, reported):
+    tree = {
+        section: {'ros__parameters': dict.fromkeys(names, 1)}
+        for section, names in sections.items()
+    }
+    ours = {row.name for row in table(Settings)} | {'base_frame'}
+    path = write(tmp_path, yaml.dump(tree))
+    assert misplaced_sections(path, '/robot1/observer_node', ours) == reported
 
 
 def test_a_file_that_holds_itself_is_refused_in_one_line(tmp_path):

@@ -26,7 +26,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.nodes.demo.demo_listener import DemoListener
 from slam_observer_ros.nodes.demo.demo_report import report
-from slam_observer_ros.nodes.runner import StopSignal
+from slam_observer_ros.nodes.stop_signal import StopSignal
 from slam_observer_ros.recording.writer import RecordingWriter
 
 NodeContext: TypeAlias = AbstractContextManager['subprocess.Popen[bytes]']
@@ -115,6 +115,7 @@ def _run(
 ) -> DemoListener:
     """Start both nodes, listen until the simulation is over, stop them."""
     stop = StopSignal()
+    stop.begin()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with ExitStack() as cleanup:
         cleanup.callback(rclpy.try_shutdown)

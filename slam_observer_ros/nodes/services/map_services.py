@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
-from itertools import chain, count
 from pathlib import Path
-import shutil
+import threading
+import time
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -15,8 +15,15 @@ from std_srvs.srv import Trigger
 
 from slam_observer_ros.common.errors import MapError, ParameterError, SlamObserverError
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import check_writable, read_map, write_map
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+RECENT_PERIODS = 20.0
+"""How many times as long as it took the map at hand is kept before it is made again."""
+
+END_S = 0.2
+"""For how long, at the end, events that are held back are begun with."""
 
 
 class MapServices:
@@ -46,6 +53,11 @@ class MapServices:
         self._autosave = settings.autosave_map
         self._estimator = estimator
         self._on_load = on_load
+        # For an end within a long observation: a map at hand, and whether the end has come.
+        self._recent: tuple[LandmarkMap, int] | None = None
+        self._recent_s = self._next_s = 0.0
+        self._end = threading.Lock()
+        self._has_ended = False
         # Files that hold what this node has loaded or saved, and that it may write again.
         self._own_files: set[Path] = set()
         if self._autosave:
@@ -60,14 +72,50 @@ class MapServices:
         node.create_service(Trigger, '~/load_map', self._answer_load)
 
     def save_at_end(self) -> None:
-        """Save the map if that was asked for and there is one; MapError if it can't be saved."""
+        """Save the map if that was asked for and there is one; MapError if it can't be saved.
+
+        Events that are held back count as far as that is quick: launch waits for five seconds.
+        """
         self._node.remove_on_set_parameters_callback(self._check_changes)
-        if not self._autosave or not len(self._estimator.landmark_ids):
+        if self._autosave:
+            self._estimator.release(END_S)
+        with self._end:
+            self._has_ended = True
+            if not self._autosave or not len(self._estimator.landmark_ids):
+                return
+            try:
+                self._node.get_logger().info(self._save(self._path()))
+            except SlamObserverError as error:
+                raise MapError(f'the map is not saved: {error}') from error
+
+    def keep_recent(self) -> None:
+        """Have a map at hand for :meth:`end_in_haste`; a twentieth of the time goes there."""
+        start_s = time.monotonic()
+        if not self._autosave or start_s < self._next_s:
             return
-        try:
-            self._node.get_logger().info(self._save(self._path()))
-        except SlamObserverError as error:
-            raise MapError(f'the map is not saved: {error}') from error
+        estimator = self._estimator
+        has_map = estimator.is_localised and len(estimator.landmark_ids)
+        self._recent = self._present_map() if has_map else None
+        self._recent_s = time.monotonic()
+        self._next_s = self._recent_s + RECENT_PERIODS * (self._recent_s - start_s)
+
+    def end_in_haste(self) -> int | None:
+        """Save the map at hand, for an end within an observation that another thread works on.
+
+        Return the exit code; None if that thread has come to the end by itself.
+        """
+        with self._end:
+            if self._has_ended:
+                return None
+            log = self._node.get_logger()
+            recent = self._recent
+            if not self._autosave or recent is None:
+                log.warning('stopped within an observation')
+                return 0
+            age_s = time.monotonic() - self._recent_s
+            answer = self._answer(Trigger.Response(), lambda path: self._write(path, *recent))
+            log.warning(f'stopped within an observation: the map is that of {age_s:.1f} s before')
+            return 0 if answer.success else 1
 
     def _check_changes(self, changes: list[Parameter]) -> SetParametersResult:
         """Refuse a file that the map could not be saved to at the end."""
@@ -91,19 +139,8 @@ class MapServices:
         if self._autosave and self._is_another(path):
             self._node.get_logger().warning(
                 f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
-                f'holds will be kept in {free_name(path).name}'
+                f'holds will be kept in {_backup(path).name}'
             )
-
-    def _keep(self, path: Path) -> str:
-        """Keep a copy of a map that is not this node's own; return a note about it."""
-        try:
-            if not self._is_another(path):
-                return ''
-            backup = free_name(path)
-            shutil.copy2(path, backup)
-        except OSError as error:
-            raise MapError(f"can't keep a copy of map {path}: {error.strerror}") from error
-        return f'; what it held before is in {backup.name}'
 
     def _is_another(self, path: Path) -> bool:
         return path not in self._own_files and path.exists()
@@ -138,13 +175,24 @@ class MapServices:
     def _save(self, path: Path) -> str:
         estimator = self._estimator
         estimator.release()
+        if len(estimator.landmark_ids):  # of an empty map it is said below
+            check_writable(path)  # before all that takes time
         if not estimator.is_localised:
             raise MapError('the pose in the loaded map is not known yet: nothing is saved')
+        return self._write(path, *self._present_map())
+
+    def _present_map(self) -> tuple[LandmarkMap, int]:
+        """Return the map as it would be saved now, and how many landmarks are not in it."""
+        estimator = self._estimator
         landmark_map = dataclasses.replace(estimator.landmark_map, frame_id=self._map_frame)
-        kept = self._keep(path)
-        write_map(path, landmark_map, estimator.settings)
+        return landmark_map, len(estimator.landmark_ids) - len(landmark_map.ids)
+
+    def _write(self, path: Path, landmark_map: LandmarkMap, moving: int) -> str:
+        """Write a map, without ``moving`` landmarks; return what is to be said of it."""
+        backup = _backup(path) if self._is_another(path) else None
+        write_map(path, landmark_map, self._estimator.settings, backup)
+        kept = '' if backup is None else f'; what it held before is in {backup.name}'
         self._own_files.add(path)
-        moving = len(estimator.landmark_ids) - len(landmark_map.ids)
         without = f' (without {moving} that move)' if moving else ''
         what = f'{len(landmark_map.ids)} landmarks{without}'
         return f"saved {what} in frame '{self._map_frame}' to {path}{kept}"
@@ -176,10 +224,8 @@ class MapServices:
         return 'the robot has found its pose in it'
 
 
-def free_name(path: Path) -> Path:
-    """Return a name that is not taken for a copy of a file: with ~, ~2 and so on behind it."""
-    names = (path.with_name(f'{path.name}~{ending}') for ending in chain([''], count(2)))
-    return next(name for name in names if not name.exists())
+def _backup(path: Path) -> Path:
+    return path.with_name(f'{path.name}~')
 
 
 def _absolute(path: str) -> Path:

@@ -1,0 +1,102 @@
+"""The SLAM observer as a managed node, whose start and stop others command."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.nodes.entities import Entities
+from slam_observer_ros.nodes.log_bridge import forward_logging
+from slam_observer_ros.nodes.observer_core import ObserverCore
+from slam_observer_ros.nodes.ros_parameters import declare_settings, RepeatableParameters
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+
+class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignore[misc]
+    """Estimates while it is active.
+
+    Configured, it has its topics, services and map; inactive, it drops what comes in and
+    publishes nothing; cleaned up, it has forgotten all but its parameters.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('observer_node')
+        forward_logging(self.get_logger())
+        declare_settings(self, Settings, ObserverNodeSettings)
+        self._core: ObserverCore | None = None
+        self._refuse_impossible_transitions()
+
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Create all parts."""
+        entities = Entities(self)
+        try:
+            self._core = ObserverCore(self)
+        except SlamObserverError as error:
+            entities.remove_new()
+            self.get_logger().error(f'not configured: {error}')
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to estimate and to publish, or go on."""
+        if self._core is not None:
+            self._core.start()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Hold the estimate."""
+        if self._core is not None:
+            self._core.stop()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Save the map if that was asked for, and forget all."""
+        self._close_and_log()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Save the map if that was asked for, and end for good."""
+        self._close_and_log()
+        return TransitionCallbackReturn.SUCCESS
+
+    def end_in_haste(self) -> int | None:
+        """See :meth:`.ObserverCore.end_in_haste`."""
+        return None if self._core is None else self._core.end_in_haste()
+
+    def destroy_node(self) -> None:
+        """End, whatever the state; raise a MapError if the map can't be saved."""
+        try:
+            self._close()
+        finally:
+            super().destroy_node()
+
+    def _refuse_impossible_transitions(self) -> None:
+        """Answer no to what the state does not allow; rclpy would end with a traceback."""
+        service = next(each for each in self.services if each.srv_type.__name__ == 'ChangeState')
+        change = service.callback
+
+        def change_if_possible(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except rclpy_implementation.RCLError:
+                # rcl itself has logged a warning that names transition and state.
+                response.success = False
+                return response
+
+        service.callback = change_if_possible
+
+    def _close_and_log(self) -> None:
+        """Close the core; a map that can't be saved keeps no transition from being made."""
+        try:
+            self._close()
+        except SlamObserverError as error:
+            self.get_logger().error(str(error))
+
+    def _close(self) -> None:
+        core, self._core = self._core, None
+        if core is not None:
+            core.close()

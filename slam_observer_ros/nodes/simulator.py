@@ -1,0 +1,161 @@
+"""The paper's simulation as a ROS 2 node, with the truth beside the measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import time
+
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from rclpy.clock import Clock as RosClock
+from rclpy.clock import ClockType
+from rclpy.duration import Duration
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud, PointCloud2
+
+from slam_observer_ros.common.units import to_ns
+from slam_observer_ros.evaluation.truth import PoseTruth
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.nodes.message_classes import MESSAGES
+from slam_observer_ros.nodes.publishing.transform_publisher import TransformPublisher
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.ros_parameters import (
+    declare_settings,
+    read_settings,
+    RepeatableParameters,
+)
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
+from slam_observer_ros.settings.node_settings import SimulatorNodeSettings
+from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Simulation
+
+QUEUE_DEPTH = 1000  # nothing is lost while a reliable reader falls behind for a moment
+TICK_S = 0.005  # wall time between two checks of what is due
+MATCH_DELAY_S = 1.0  # a publisher knows of its reader before the reader can receive
+ACKNOWLEDGED_S = 10.0  # how long the last messages may be on their way, as on a busy machine
+SIMULATED_EPOCH_NS = 1_000_000_000  # first stamp of a simulated /clock; zero means 'no time yet'
+
+
+class SimulatorNode(RepeatableParameters):
+    """Publishes a :class:`Simulation` in real time, or faster or slower with ``/clock``."""
+
+    def __init__(self) -> None:
+        super().__init__('simulator_node')
+        declare_settings(self, Scenario, SimulatorNodeSettings)
+        self._settings = read_settings(self, SimulatorNodeSettings)
+        self._scenario = read_settings(self, Scenario)
+        self._create_publishers()
+        self._log = ThrottledLog(self)
+        self._steady_clock = RosClock(clock_type=ClockType.STEADY_TIME)
+        self._wait_timer = self.create_timer(TICK_S, self._wait, clock=self._steady_clock)
+
+    def _create_publishers(self) -> None:
+        twist_class = TwistStamped if self._settings.stamped else Twist
+        is_cloud2 = self._settings.landmarks_type == 'PointCloud2'
+        cloud_class = PointCloud2 if is_cloud2 else PointCloud
+        self._twist = self.create_publisher(twist_class, 'twist', QUEUE_DEPTH)
+        self._landmarks = self.create_publisher(cloud_class, 'landmarks', QUEUE_DEPTH)
+        self._true_pose = self.create_publisher(PoseStamped, 'ground_truth/pose', QUEUE_DEPTH)
+        self._true_landmarks = self.create_publisher(
+            PointCloud2, 'ground_truth/landmarks', LATCHED_QOS
+        )
+        self._publishes_clock = self._settings.real_time_factor != 1.0
+        if self._publishes_clock:
+            self._clock_publisher = self.create_publisher(Clock, '/clock', 10)
+
+    def _wait(self) -> None:
+        """Start once the subscribers are there: the biased first sighting must not be missed."""
+        needed = self._settings.wait_for_subscribers
+        missing = [
+            publisher.topic_name
+            for publisher in (self._twist, self._landmarks)
+            if publisher.get_subscription_count() < needed
+        ]
+        if missing:
+            topics = ' and '.join(missing)
+            self._log.info(
+                'waiting',
+                f'waiting for {needed} subscriber(s) on {topics} (parameter wait_for_subscribers)',
+            )
+            return
+        self.destroy_timer(self._wait_timer)
+        delay_s = MATCH_DELAY_S if needed else 0.0
+        self._start_timer = self.create_timer(delay_s, self._start, clock=self._steady_clock)
+
+    def _start(self) -> None:
+        self.destroy_timer(self._start_timer)
+        self._start_wall_s = time.monotonic()
+        self._start_ns = (
+            SIMULATED_EPOCH_NS if self._publishes_clock else self.get_clock().now().nanoseconds
+        )
+        self._simulation = Simulation(self._scenario, self._start_ns)
+        self._deliveries: Iterator[Delivery] = self._simulation.deliveries()
+        self._next: Delivery | None = next(self._deliveries, None)
+        self._publish_true_landmarks(self._start_ns)
+        self._publish_start()
+        self.create_timer(TICK_S, self._publish_due, clock=self._steady_clock)
+        self.get_logger().info('the robot starts')
+
+    def _publish_due(self) -> None:
+        elapsed_s = (time.monotonic() - self._start_wall_s) * self._settings.real_time_factor
+        now_ns = self._start_ns + to_ns(elapsed_s)
+        if self._publishes_clock:
+            self._clock_publisher.publish(Clock(clock=MESSAGES.time(now_ns)))
+        while self._next is not None and self._next.arrival_ns <= now_ns:
+            self._publish(self._next.event)
+            self._next = next(self._deliveries, None)
+        if self._next is None:
+            self._finish()
+
+    def _finish(self) -> None:
+        for publisher in (self._twist, self._landmarks, self._true_pose):
+            publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED_S))
+        self.get_logger().info('the run is over')
+        self.context.try_shutdown()
+
+    def _publish(self, event: SimulatedEvent) -> None:
+        match event:
+            case VelocityEvent():
+                self._publish_velocity(event)
+            case ObservationEvent():
+                self._publish_observation(event)
+            case PoseTruth():
+                self._publish_true_pose(event)
+
+    def _publish_velocity(self, event: VelocityEvent) -> None:
+        stamp_ns, velocity = event.stamp_ns, event.body_velocity
+        if self._settings.stamped:
+            frame = self._settings.base_frame
+            self._twist.publish(MESSAGES.twist_stamped(stamp_ns, frame, velocity))
+        else:
+            self._twist.publish(MESSAGES.twist(velocity))
+
+    def _publish_observation(self, event: ObservationEvent) -> None:
+        contents = (event.stamp_ns, self._settings.base_frame, event.ids, event.points)
+        if self._settings.landmarks_type == 'PointCloud2':
+            self._landmarks.publish(MESSAGES.point_cloud2(*contents, velocities=event.velocities))
+        else:
+            self._landmarks.publish(encode_point_cloud(*contents))
+
+    def _publish_start(self) -> None:
+        """Publish the pose, in the true world, of an estimate that starts at the identity."""
+        self._start_transform = TransformPublisher(self, '/tf_static', LATCHED_QOS)
+        self._start_transform.publish(
+            self._start_ns,
+            self._settings.truth_frame,
+            self._settings.map_frame,
+            self._simulation.pose(self._start_ns),
+        )
+
+    def _publish_true_pose(self, truth: PoseTruth) -> None:
+        frame = self._settings.truth_frame
+        self._true_pose.publish(MESSAGES.pose_stamped(truth.stamp_ns, frame, truth.pose))
+        if self._scenario.landmark_speed > 0.0:
+            self._publish_true_landmarks(truth.stamp_ns)
+
+    def _publish_true_landmarks(self, stamp_ns: int) -> None:
+        truth = self._simulation.landmark_truth(stamp_ns)
+        self._true_landmarks.publish(
+            MESSAGES.point_cloud2(
+                stamp_ns, self._settings.truth_frame, truth.ids, truth.world_points
+            )
+        )
