@@ -2,6 +2,17 @@
 
 from __future__ import annotations
 
+import reprlib
+
+_shortened = reprlib.Repr()
+_shortened.maxstring = _shortened.maxother = _shortened.maxlong = 80
+_shortened.maxlist = 12
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it, which may come from a file of any size."""
+    return _shortened.repr(value)
+
 
 class SlamObserverError(Exception):
     """Root of every error that this package raises on purpose."""
@@ -33,6 +44,10 @@ class RecordingError(SlamObserverError):
 
 class DataSetError(SlamObserverError):
     """A public data set's files are missing or not in their published format."""
+
+
+class YamlError(SlamObserverError):
+    """A file is not valid YAML, or has what is not taken from files, as aliases."""
 
 
 class MapError(SlamObserverError):
