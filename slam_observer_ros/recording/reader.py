@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterator
 import dataclasses
 import logging
@@ -57,7 +57,7 @@ class Recording:
     dropped : Counter
         Measurements that did not become events so far, by reason.
     arrivals : dict of str to Arrivals
-        When the measurements so far were received, by topic.
+        When the measurements of the last :meth:`events` were received, by topic.
     contents : Contents
         What is known of its messages before they are used.
 
@@ -71,7 +71,7 @@ class Recording:
         self.malformed: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.unstamped: Counter[str] = Counter()
-        self.arrivals: defaultdict[str, Arrivals] = defaultdict(Arrivals)
+        self.arrivals: dict[str, Arrivals] = {}
         if self.message_count == 0:
             self.close()
             raise RecordingError(f'{path}: the recording is empty')
@@ -142,6 +142,7 @@ class Recording:
         simulated = {
             topic for topic in decoders if self.contents.begins_at_zero(topic, decoders[topic])
         }
+        self.arrivals = {topic.name: Arrivals(velocity_timeout_s) for topic in decoders}
         moving = selected.transforms.moving
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:

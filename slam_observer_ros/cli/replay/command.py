@@ -117,14 +117,16 @@ def _replay(
             'replaying',
             recording.event_count(selected),
         )
-        result = replay(events, settings, truth, landmark_map)
+        is_drawn = args.tum is not None or args.plot is not None
+        needs_poses = is_drawn or len(truth.stamps_ns) > 0
+        result = replay(events, settings, truth, landmark_map, keep_all=needs_poses)
         warn_of_resets(result)
         check_used(args, recording, selected, inputs, result)
         if landmark_map is not None:
             check_localised(args, result, landmark_map)
         outcome = outcome_of(recording, selected, result, truth)
         warn_of_input(recording, selected, result)
-        warn_of_timing(recording, selected, settings.velocity_timeout)
+        warn_of_timing(recording, selected)
     return with_smoothed(outcome) if args.smooth else outcome
 
 
