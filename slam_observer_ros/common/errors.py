@@ -62,6 +62,10 @@ class EvaluationError(SlamObserverError):
     """A trajectory, its file or a pair of point sets can't be evaluated."""
 
 
+class LossError(SlamObserverError):
+    """A part of a recording could not be read, and all of it was asked for."""
+
+
 class UsageError(SlamObserverError):
     """The command line asks for something that can't be done."""
 
