@@ -95,7 +95,8 @@ class CdrReader:
         values = np.frombuffer(self._raw, dtype, count, start)
         with np.errstate(invalid='ignore'):  # Any bits may be there, signalling NaNs, too:
             # a product, unlike a copy, makes them quiet for whoever reads them next.
-            return np.multiply(values, 1.0, dtype=np.float64)
+            quiet: FloatArray = np.multiply(values, 1.0, dtype=np.float64)
+        return quiet
 
     def data(self, size: int) -> memoryview:
         """Read ``size`` bytes without copying them."""
