@@ -19,6 +19,7 @@ from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.recording.datasets.data_set import DataSet
+from slam_observer_ros.recording.datasets.graph import load_graph
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import load_starry_night
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
@@ -183,6 +184,38 @@ def starry_night() -> World:
     return _recorded(data_set, shipped_settings('stereo_inertial'))
 
 
+def victoria_park() -> World:
+    """Return Victoria Park: a car among trees, with the batch optimum of its graph for truth.
+
+    Wheel encoder and steering angle give an edge to 1 cm and 0.1°; the laser's trees are as far
+    off as their trunks are wide, and their file states.
+    """
+    return _graph('victoria_park', 'victoria_park_batch', graph_settings(0.002, 0.01, 0.632))
+
+
+def city_trees() -> World:
+    """Return cityTrees10000: simulated steps and turns on a grid, with the noise as stated."""
+    truth = 'city_trees_10000_groundtruth'
+    return _graph('city_trees_10000', truth, graph_settings(0.01, 0.02, 0.1))
+
+
+def graph_settings(turn_rad: float, step_m: float, point_m: float) -> Settings:
+    """Return the settings of a planar graph: deviations of an edge, a second, and of a point."""
+    return Settings(
+        reorder_window=0.0,
+        two_d_mode=True,
+        angular_velocity_noise=(0.0, 0.0, turn_rad),
+        linear_velocity_noise=(step_m, step_m, 0.0),
+        observation_model='cartesian',
+        point_noise=point_m,
+    )
+
+
+def _graph(name: str, truth: str, settings: Settings) -> World:
+    folder = data_folder() / 'graphs'
+    return _recorded(load_graph(folder / f'{name}.txt', folder / f'{truth}.txt'), settings)
+
+
 def circle() -> World:
     """Return the paper's circle with noise, whose figures the estimators know."""
     simulation = Simulation(CIRCLE)
@@ -337,6 +370,8 @@ def _measured(
 _RECORDED: dict[str, Callable[[], World]] = {
     'Starry Night': starry_night,
     **{f'MRCLAM 6, robot {robot}': partial(mrclam, robot) for robot in range(1, 6)},
+    'Victoria Park': victoria_park,
+    'cityTrees10000': city_trees,
 }
 
 _SIMULATED: dict[str, Callable[[], World]] = {

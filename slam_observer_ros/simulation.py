@@ -64,6 +64,7 @@ class Scenario:
         0,
         'Landmarks in a random field; 0 for the four of the paper',
         minimum=0,
+        maximum=10_000,
     )
     landmark_distance: float = parameter(
         4.0, "Distance of every landmark from the circle's axis at z = 0", unit='m', minimum=0.0

@@ -8,6 +8,7 @@ from pathlib import Path
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.outputs import add_force_option, check_outputs, recording_path
 from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
+from slam_observer_ros.recording.datasets.graph import load_graph
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import load_starry_night
 
@@ -34,7 +35,15 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         '--robot', type=int, required=True, metavar='N', help='which robot, from 1 to 5'
     )
     mrclam.set_defaults(run=_run, load=lambda args: load_mrclam(args.folder, args.robot))
-    for data_set in (starry_night, mrclam):
+    graph = data_sets.add_parser(
+        'graph', help='poses and points in the plane, in the text formats of iSAM and g2o'
+    )
+    graph.add_argument('file', type=Path, metavar='FILE', help='such as victoria_park.txt')
+    graph.add_argument(
+        '--truth', type=Path, metavar='FILE', help='the same graph with true, or the best, values'
+    )
+    graph.set_defaults(run=_run, load=lambda args: load_graph(args.file, args.truth))
+    for data_set in (starry_night, mrclam, graph):
         data_set.add_argument(
             'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
         )

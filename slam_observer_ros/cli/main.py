@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-import io
-import logging
-import os
-from pathlib import Path
-import signal
-import sys
-from typing import Any, NoReturn
+from slam_observer_ros.cli.interrupts import leaving_at_once
 
-from slam_observer_ros import __version__
-from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
-from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.common.threads import use_one_thread
-from slam_observer_ros.settings.parameter_table import suggestion
+with leaving_at_once():
+    import argparse
+    from collections.abc import Sequence
+    import io
+    import logging
+    import os
+    from pathlib import Path
+    import signal
+    import sys
+    from typing import Any, NoReturn
+
+    from slam_observer_ros import __version__
+    from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
+    from slam_observer_ros.common.errors import LossError, SlamObserverError
+    from slam_observer_ros.common.threads import use_one_thread
+    from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2
+EXIT_LOSS = 3
 EXIT_SIGNAL = 128
 """To which the number of the signal that ended the program is added, as shells do."""
 
@@ -57,9 +61,9 @@ class Parser(argparse.ArgumentParser):
 
 def make_parser() -> Parser:
     """Return the parser of the whole command line."""
-    # These take a second to load. Here, Ctrl-C meanwhile is handled as it is at any other time.
-    from slam_observer_ros.cli import convert, simulate
-    from slam_observer_ros.cli.replay import command as replay
+    with leaving_at_once():
+        from slam_observer_ros.cli import convert, simulate
+        from slam_observer_ros.cli.replay import command as replay
 
     parser = Parser(
         prog=PROGRAM,
@@ -92,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError):
             return _leave_broken_pipe()
         show_message('error', str(error))
-        return EXIT_ERROR
+        return EXIT_LOSS if isinstance(error, LossError) else EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_SIGNAL + signal.SIGINT
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
 import json
@@ -29,6 +29,9 @@ from slam_observer_ros.settings.parameter_table import (
 )
 
 logger = logging.getLogger(__name__)
+
+MAX_LISTED = 20
+"""Most names that a warning gives."""
 
 _PACKAGE = 'slam_observer_ros'
 _ESTIMATOR_NAMES = frozenset(row.name for row in table(Settings))
@@ -121,11 +124,17 @@ def _for_estimator(values: Mapping[str, object]) -> dict[str, object]:
         logger.warning(
             "The node can't read %s of --config: in ROS all numbers of a list are written alike, "
             '0.0 for 0.',
-            ', '.join(mixed),
+            _listed(mixed),
         )
     if unknown:
-        logger.warning('Unknown parameters of --config are ignored: %s.', ', '.join(unknown))
+        logger.warning('Unknown parameters of --config are ignored: %s.', _listed(unknown))
     return {name: value for name, value in values.items() if name in _ESTIMATOR_NAMES}
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names as text; of a great many, the first."""
+    more = len(names) - MAX_LISTED
+    return ', '.join([*names[:MAX_LISTED], *([f'and {more} more'] if more > 0 else [])])
 
 
 def find_config(name: str) -> Path:

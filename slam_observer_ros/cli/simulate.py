@@ -32,6 +32,9 @@ START_NS = 1_000_000_000
 
 MAX_STEP_S = 10.0
 
+MAX_STEPS = 10_000_000
+"""More of them take days."""
+
 FIGURES = ('lyapunov.png', 'configuration.png')
 
 _SCENARIO_OPTIONS = {
@@ -119,6 +122,11 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     if not args.step <= args.duration < math.inf:
         raise UsageError(
             f'--duration takes seconds, at least one step of {args.step:g}, not {args.duration:g}'
+        )
+    if args.duration / args.step > MAX_STEPS:
+        raise UsageError(
+            f'--duration {args.duration:g} in steps of {args.step:g} are more than {MAX_STEPS} '
+            'steps; take a shorter one, or longer steps'
         )
     values = {name: getattr(args, name) for name in _SCENARIO_OPTIONS.values()}
     values['duration'] = args.duration

@@ -2,6 +2,17 @@
 
 from __future__ import annotations
 
+import reprlib
+
+_shortened = reprlib.Repr()
+_shortened.maxstring = _shortened.maxother = _shortened.maxlong = 80
+_shortened.maxlist = 12
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it, which may come from a file of any size."""
+    return _shortened.repr(value)
+
 
 class SlamObserverError(Exception):
     """Root of every error that this package raises on purpose."""
@@ -35,6 +46,10 @@ class DataSetError(SlamObserverError):
     """A public data set's files are missing or not in their published format."""
 
 
+class YamlError(SlamObserverError):
+    """A file is not valid YAML, or has what is not taken from files, as aliases."""
+
+
 class MapError(SlamObserverError):
     """A map file can't be read or written, or its content can't be right."""
 
@@ -45,6 +60,10 @@ class TransformError(SlamObserverError):
 
 class EvaluationError(SlamObserverError):
     """A trajectory, its file or a pair of point sets can't be evaluated."""
+
+
+class LossError(SlamObserverError):
+    """A part of a recording could not be read, and all of it was asked for."""
 
 
 class UsageError(SlamObserverError):

@@ -27,18 +27,22 @@ import numpy as np
 import yaml
 
 from slam_observer_ros import __version__
-from slam_observer_ros.common.errors import MapError
+from slam_observer_ros.common.errors import MapError, shown, YamlError
 from slam_observer_ros.common.output_files import destination, keep_copy, unfinished_file
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.yaml_errors import reason_of, UniqueKeys
+from slam_observer_ros.common.yaml_files import (
+    constructed,
+    FAST_LOADER,
+    load_yaml,
+    plain_value,
+)
 from slam_observer_ros.events import MAX_ID
+from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
 FORMAT = 'slam_observer_ros map'
 FORMAT_VERSION = 1
-
-_INT, _FLOAT = 'tag:yaml.org,2002:int', 'tag:yaml.org,2002:float'
 
 _MAX_INT64 = 2**63 - 1
 
@@ -46,33 +50,21 @@ _MAX_NUMBER = 1e12
 """Metres; nothing larger is meant seriously, and its square still has all digits."""
 
 _ROUNDING = 1e-6
-"""Share of a covariance's largest entry by which it may be asymmetric or negative."""
+"""By how much a correlation of a covariance may miss being one."""
 
-# Faster by far, where libyaml is.
-_FastLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_LEAST_DEVIATION = 1e-4
+"""Metres; entries of smaller standard deviations are compared with this one."""
+
 _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
+MAX_BYTES = 70_000_000
+"""Largest file that is read: two hundred thousand landmarks with covariances."""
 
-class _StrictLoader(UniqueKeys, _FastLoader):  # type: ignore[misc]  # one of two classes
-    """Reads decimal numbers alone: by YAML 1.1, 010 is 8 and 1:30 is 90."""
-
-    yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own)
-        first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT)]
-        for first, resolvers in _FastLoader.yaml_implicit_resolvers.items()
-    }
-
-
-_StrictLoader.add_implicit_resolver(
-    _INT, re.compile(r'^[-+]?(?:0|[1-9][0-9]*)$'), list('-+0123456789')
-)
-_StrictLoader.add_implicit_resolver(
-    _FLOAT,
-    re.compile(
-        r'^[-+]?(?:\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?$'
-        r'|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$'
-    ),
-    list('-+.0123456789'),
-)
+# Decimal numbers alone: by YAML 1.1, 010 is 8 and 1:30 is 90.
+_INT = re.compile(r'[-+]?(?:0|[1-9][0-9]*)')
+_FLOAT = re.compile(r'[-+]?(?:\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?')
+_NUMBER_STARTS = frozenset('+-.0123456789')
+_NOT_FINITE = re.compile(r'[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
 
 
 def write_map(
@@ -138,15 +130,25 @@ def read_map(path: Path) -> LandmarkMap:
     try:
         if path.exists() and not path.is_file():  # reading it might never end
             raise MapError(f"can't read map {path}: it is no regular file")
-        content = yaml.load(path.read_text(encoding='utf-8'), _StrictLoader)
+        content = load_yaml(path, MAX_BYTES, _plain_value, FAST_LOADER)
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise MapError(f'map {path} is not valid YAML: {reason_of(error)}') from error
+    except YamlError as error:
+        raise MapError(f'map {path} is not valid YAML: {error}') from error
     try:
         return _parse(content)
     except MapError as error:
         raise MapError(f'map {path}: {error}') from error
+
+
+def _plain_value(text: str) -> object:
+    if text[:1] not in _NUMBER_STARTS:
+        return plain_value(text)
+    if _FLOAT.fullmatch(text):
+        return float(text)
+    if _INT.fullmatch(text):
+        return int(text)
+    return constructed('float', text) if _NOT_FINITE.fullmatch(text) else text
 
 
 def _as_mappings(landmark_map: LandmarkMap) -> list[dict[str, Any]]:
@@ -177,11 +179,13 @@ def _parse(content: Any) -> LandmarkMap:
     _expect(is_map, f"it has no line 'format: {FORMAT}'")
     version = content.get('version')
     if version != FORMAT_VERSION:
-        raise MapError(f'it has version {version!r}; this program reads {FORMAT_VERSION}')
+        raise MapError(f'it has version {shown(version)}; this program reads {FORMAT_VERSION}')
     required = ('format', 'version', 'frame', 'landmarks')
     _check_names('it', content, required, ('package_version', 'settings'))
     frame_id, rows = content['frame'], content['landmarks']
-    _expect(isinstance(frame_id, str) and frame_id != '', f"'frame' is {frame_id!r}, not a name")
+    _expect(
+        isinstance(frame_id, str) and frame_id != '', f"'frame' is {shown(frame_id)}, not a name"
+    )
     _expect(isinstance(rows, list), "'landmarks' is not a list")
     _expect(len(rows) > 0, 'it has no landmarks')
     ids = [_landmark_id(row, index) for index, row in enumerate(rows)]
@@ -217,10 +221,21 @@ def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:
     """Return (n, 3, 3) covariances, m²; None where no landmark has one."""
     if not any('sigma' in row or 'covariance' in row for row in rows):
         return None
-    return np.array([_covariance(row) for row in rows])
+    covariances = np.array([_covariance(row) for row in rows])
+    # Whatever their scales, in units of their own deviations; of the tiny ones, rounding is left.
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    deviations = np.sqrt(np.maximum(variances, _LEAST_DEVIATION**2))
+    scaled = covariances / (deviations[:, :, None] * deviations[:, None, :])
+    skew = np.abs(scaled - transpose(scaled)).max(axis=(1, 2))
+    is_wrong = (skew > _ROUNDING) | (np.linalg.eigvalsh(scaled)[:, 0] < -_ROUNDING)
+    if is_wrong.any():
+        who = f'landmark {rows[int(is_wrong.argmax())]["id"]}'
+        what = 'is not symmetric, or negative in some direction'
+        raise MapError(f"{who}: 'covariance' {what}")
+    return covariances
 
 
-def _covariance(row: Mapping[str, Any]) -> FloatArray:
+def _covariance(row: Mapping[str, Any]) -> list[list[float]]:
     who = f'landmark {row["id"]}'
     given = [name for name in ('sigma', 'covariance') if name in row]
     _expect(len(given) < 2, f"{who} has both 'sigma' and 'covariance': leave one")
@@ -228,18 +243,12 @@ def _covariance(row: Mapping[str, Any]) -> FloatArray:
     if 'sigma' in row:
         (sigma_m,) = _numbers([row['sigma']], 1, f"{who}: 'sigma'")
         _expect(sigma_m >= 0.0, f"{who}: 'sigma' is negative")
-        return sigma_m**2 * np.eye(3)
-    # A full covariance, symmetric and positive but for rounding.
+        variance_m2 = sigma_m**2
+        return [[variance_m2, 0.0, 0.0], [0.0, variance_m2, 0.0], [0.0, 0.0, variance_m2]]
     lines = row['covariance']
     _expect(isinstance(lines, list) and len(lines) == 3, f"{who}: 'covariance' is not 3 × 3")
-    covariance = np.array([_numbers(line, 3, f"{who}: a row of 'covariance'") for line in lines])
-    tolerance = _ROUNDING * np.abs(covariance).max()
-    is_symmetric = np.abs(covariance - covariance.T).max() <= tolerance
-    _expect(
-        bool(is_symmetric and np.linalg.eigvalsh(covariance).min() >= -tolerance),
-        f"{who}: 'covariance' is not symmetric, or negative in some direction",
-    )
-    return covariance
+    what = f"{who}: a row of 'covariance'"
+    return [_numbers(line, 3, what) for line in lines]
 
 
 def _check_names(
@@ -248,25 +257,23 @@ def _check_names(
     for name in required:
         _expect(name in mapping, f"{who} has no '{name}'")
     for name in mapping:
-        _expect(name in (*required, *optional), f"{who} has '{name}', which is not known here")
+        if name not in required and name not in optional:
+            raise MapError(f'{who} has {shown(name)}, which is not known here')
 
 
 def _natural(value: Any, what: str) -> int:
-    is_natural = isinstance(value, int) and not isinstance(value, bool)
-    _expect(
-        is_natural and 0 <= value <= _MAX_INT64,
-        f'{what} is {value!r}, not a whole number ≥ 0',
-    )
-    return int(value)
+    if type(value) is int and 0 <= value <= _MAX_INT64:
+        return value
+    raise MapError(f'{what} is {shown(value)}, not a whole number ≥ 0')
 
 
 def _numbers(value: Any, count: int, what: str) -> list[float]:
-    is_list = isinstance(value, list) and len(value) == count
-    _expect(is_list, f'{what} is {value!r}, not a list of {count} numbers')
+    if not isinstance(value, list) or len(value) != count:
+        raise MapError(f'{what} is {shown(value)}, not a list of {count} numbers')
     for entry in value:
-        is_number = isinstance(entry, int | float) and not isinstance(entry, bool)
         # Written so that NaN is refused too.
-        _expect(is_number and abs(entry) <= _MAX_NUMBER, f'{what} has {entry!r}, no finite number')
+        if type(entry) not in (int, float) or not abs(entry) <= _MAX_NUMBER:
+            raise MapError(f'{what} has {shown(entry)}, no finite number')
     return [float(entry) for entry in value]
 
 

@@ -189,7 +189,8 @@ def _columns(records: Records, names: tuple[str, ...]) -> FloatArray:
     columns = np.empty((records.size, len(names)))
     with np.errstate(invalid='ignore'):  # Any bits may be there, signalling NaNs, too.
         for index, name in enumerate(names):
-            columns[:, index] = records[name].ravel()
+            # A product makes them quiet, which a copy does not.
+            np.multiply(records[name].ravel(), 1.0, out=columns[:, index])
     return columns
 
 

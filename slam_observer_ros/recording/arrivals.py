@@ -8,27 +8,54 @@ import numpy as np
 
 from slam_observer_ros.common.units import to_s
 
+MOST_SAMPLES = 8192
+"""How many delays are kept; then every second one is left out, of those to come as well."""
+
 
 class Arrivals:
-    """When each measurement of a topic was received, and how long after its stamp; seconds."""
+    """When the measurements of a topic came, in memory that does not grow with their number.
 
-    def __init__(self) -> None:
-        self.received_s = array('d')
-        self.delays_s = array('d')
+    Attributes
+    ----------
+    first_s, last_s : float
+        When the first and the last so far were received, seconds.
+
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self.first_s = self.last_s = 0.0
+        self._timeout_s = timeout_s
+        self._silence_s = 0.0
+        self._count = 0
+        self._every = 1
+        self._received_s = array('d')
+        self._delays_s = array('d')
 
     def __len__(self) -> int:
         """Return how many measurements there were."""
-        return len(self.received_s)
+        return self._count
 
     def add(self, received_ns: int, stamp_ns: int) -> None:
         """Note when a measurement was received and what stamp it has, nanoseconds."""
-        self.received_s.append(to_s(received_ns))
-        self.delays_s.append(to_s(received_ns - stamp_ns))
+        received_s = to_s(received_ns)
+        if self._count:
+            self._silence_s += max(received_s - self.last_s - self._timeout_s, 0.0)
+        else:
+            self.first_s = received_s
+        if self._count % self._every == 0:
+            self._received_s.append(received_s)
+            self._delays_s.append(to_s(received_ns - stamp_ns))
+        if len(self._received_s) > MOST_SAMPLES:
+            del self._received_s[1::2], self._delays_s[1::2]
+            self._every *= 2
+        self.last_s = received_s
+        self._count += 1
 
-    def silence_s(self, start_s: float, end_s: float, timeout_s: float) -> float:
-        """Return for how long nothing was known, if each measurement holds until the timeout."""
-        waits_s = np.diff([start_s, *self.received_s, end_s])
-        return float(np.maximum(waits_s - timeout_s, 0.0).sum())
+    def silence_s(self, start_s: float, end_s: float) -> float:
+        """Return for how long nothing was known, as each measurement holds until the timeout."""
+        before_s = max(self.first_s - start_s - self._timeout_s, 0.0)
+        after_s = max(end_s - self.last_s - self._timeout_s, 0.0)
+        return before_s + self._silence_s + after_s
 
     def behind_s(self, other: Arrivals) -> float:
         """Return how far the stamps are behind those of another topic, seconds.
@@ -37,8 +64,8 @@ class Arrivals:
         that is slower than the recorder's is no offset. It is zero if they have no time in common.
         """
         others_s = np.interp(
-            self.received_s, other.received_s, other.delays_s, left=np.nan, right=np.nan
+            self._received_s, other._received_s, other._delays_s, left=np.nan, right=np.nan
         )
-        differences_s = self.delays_s - others_s
+        differences_s = self._delays_s - others_s
         known_s = differences_s[np.isfinite(differences_s)]
         return float(np.median(known_s)) if len(known_s) else 0.0

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import mmap
 from pathlib import Path, PurePath
 
 import yaml
 
 from slam_observer_ros.common.errors import RecordingError
-from slam_observer_ros.recording.sources import (
-    BagSource,
-    MessageSource,
-    SalvagedMcap,
-    SplitSource,
-)
+from slam_observer_ros.recording.salvage import MendedSource, SalvagedSource
+from slam_observer_ros.recording.salvage_formats import is_intact_mcap, SCANS
+from slam_observer_ros.recording.sources import BagSource, Loss, MessageSource, SplitSource
 
 FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
 
@@ -67,7 +65,10 @@ def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
             'missing, or replay the files that are there one by one'
         )
     try:
-        return BagSource(path), None
+        whole = BagSource(path)
+        if len(files) != 1:
+            return whole, None
+        return MendedSource(whole, lambda: _salvaged(files[0])), None
     except RecordingError:
         # A recorder that was killed leaves a truncated file, which its metadata calls whole.
         parts = files if len(files) == 1 else [file for file in listed if file in files]
@@ -80,15 +81,18 @@ def _open_parts(files: Sequence[Path]) -> tuple[MessageSource, str | None]:
     """Open what can be read of a recording's files; raise the first error if nothing can."""
     opened: list[tuple[MessageSource, str | None]] = []
     errors: list[Exception] = []
+    lost_bytes = 0
     for file in files:
         try:
             opened.append(open_source(file))
         except (RecordingError, OSError) as error:
             errors.append(error)
+            lost_bytes += file.stat().st_size if file.exists() else 0
     if not opened:
         raise errors[0]
     warnings = [warning for _, warning in opened if warning] + [str(error) for error in errors]
-    return SplitSource([source for source, _ in opened]), '; '.join(warnings) or None
+    loss = Loss(lost_bytes, is_cut_off=bool(errors))
+    return SplitSource([source for source, _ in opened], loss), '; '.join(warnings) or None
 
 
 def _listed_files(directory: Path) -> list[Path]:
@@ -139,15 +143,29 @@ def _refuse_compressed_messages(path: Path, source: MessageSource) -> None:
 
 def _open_file(path: Path) -> tuple[MessageSource, str | None]:
     try:
-        return BagSource(path), None
+        whole = BagSource(path)
+        if path.suffix == '.mcap':
+            _check_sums(path, whole)
+        return MendedSource(whole, lambda: _salvaged(path)), None
     except RecordingError as error:
-        if path.suffix != '.mcap':
-            raise
         return _salvage(path, error)
 
 
+def _check_sums(path: Path, whole: BagSource) -> None:
+    """Raise a RecordingError, with the file closed, if a chunk is not what was written."""
+    with path.open('rb') as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        if is_intact_mcap(data):
+            return
+    whole.close()
+    raise RecordingError(f'{path}: can not be read: a chunk is damaged')
+
+
+def _salvaged(path: Path) -> SalvagedSource:
+    return SalvagedSource(path, SCANS[path.suffix])
+
+
 def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str | None]:
-    source = SalvagedMcap(path)
+    source = _salvaged(path)
     if any(topic.count for topic in source.topics):
         return source, _left_out(path, source)
     if 'ros1' in source.other_encodings.values():
@@ -158,11 +176,14 @@ def _salvage(path: Path, error: RecordingError) -> tuple[MessageSource, str | No
     raise RecordingError(f'{error}; no whole message is left') from error
 
 
-def _left_out(path: Path, source: SalvagedMcap) -> str | None:
-    """Say what of an MCAP file is not read; None if all of it is."""
-    if not source.is_whole:
+def _left_out(path: Path, source: SalvagedSource) -> str | None:
+    """Say what of a file is not read; None if all of it is."""
+    if source.loss:
         count = sum(topic.count for topic in source.topics)
-        return f'{path}: cut off or damaged; only the {count} messages before that are used'
+        used = f'only the {count} messages before that are used'
+        if source.loss.seconds > 0.0:
+            used = f'the {count} whole messages before and behind that are used'
+        return f'{path}: cut off or damaged; {used}; {source.loss}'
     encodings = source.other_encodings.values()
     if not encodings:
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterator
 import dataclasses
 import logging
@@ -33,7 +33,7 @@ from slam_observer_ros.recording.decoding import (
 )
 from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
-from slam_observer_ros.recording.sources import RawMessage, Topic
+from slam_observer_ros.recording.sources import Loss, RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -45,7 +45,7 @@ _Decoded = TypeVar('_Decoded')
 class Recording:
     """An open MCAP file, rosbag2 (directory or bare .db3) or ROS 1 .bag: use it in ``with``.
 
-    A truncated MCAP file is read up to the damage. Raises a RecordingError that says in one line
+    Of a damaged one, what is whole is read. Raises a RecordingError that says in one line
     what to do if there is nothing to read, also later if the file turns out to be damaged.
 
     Attributes
@@ -57,7 +57,7 @@ class Recording:
     dropped : Counter
         Measurements that did not become events so far, by reason.
     arrivals : dict of str to Arrivals
-        When the measurements so far were received, by topic.
+        When the measurements of the last :meth:`events` were received, by topic.
     contents : Contents
         What is known of its messages before they are used.
 
@@ -71,7 +71,7 @@ class Recording:
         self.malformed: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.unstamped: Counter[str] = Counter()
-        self.arrivals: defaultdict[str, Arrivals] = defaultdict(Arrivals)
+        self.arrivals: dict[str, Arrivals] = {}
         if self.message_count == 0:
             self.close()
             raise RecordingError(f'{path}: the recording is empty')
@@ -90,6 +90,11 @@ class Recording:
     def close(self) -> None:
         """Close the file."""
         self._source.close()
+
+    @property
+    def loss(self) -> Loss:
+        """What has been found damaged so far."""
+        return self._source.loss
 
     @property
     def message_count(self) -> int:
@@ -142,6 +147,7 @@ class Recording:
         simulated = {
             topic for topic in decoders if self.contents.begins_at_zero(topic, decoders[topic])
         }
+        self.arrivals = {topic.name: Arrivals(velocity_timeout_s) for topic in decoders}
         moving = selected.transforms.moving
         for raw in self._source.messages((*decoders, *moving)):
             if raw.topic in moving:

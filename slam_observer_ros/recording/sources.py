@@ -1,4 +1,4 @@
-"""Serialised messages out of MCAP, rosbag2 and ROS 1 files, also out of truncated MCAP files."""
+"""Serialised messages out of whole MCAP, rosbag2 and ROS 1 files."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import heapq
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from mcap.records import Channel, Footer, Message, Schema
-from mcap.stream_reader import StreamReader
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_typestore, Stores
@@ -45,12 +43,55 @@ class RawMessage(NamedTuple):
     data: Buffer
 
 
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """What of a recording is damaged, as far as it has been read.
+
+    Attributes
+    ----------
+    byte_count, seconds : int, float
+        Bytes of its files that are not used, and the time from the last whole message before them
+        to the first one behind.
+    is_cut_off : bool
+        Whether a file has no proper end: more is missing than can be said.
+
+    """
+
+    byte_count: int = 0
+    seconds: float = 0.0
+    is_cut_off: bool = False
+
+    def __bool__(self) -> bool:
+        """Return whether anything is lost."""
+        return self.byte_count > 0 or self.is_cut_off
+
+    def __str__(self) -> str:
+        """Return the amount as text."""
+        text = f'{self.byte_count} bytes and {self.seconds:.1f} s in between are lost'
+        return f'{text}, and what was cut off' if self.is_cut_off else text
+
+    def __add__(self, other: Loss) -> Loss:
+        """Return what is lost of two files."""
+        return Loss(
+            self.byte_count + other.byte_count,
+            self.seconds + other.seconds,
+            self.is_cut_off or other.is_cut_off,
+        )
+
+
+NOTHING_LOST = Loss()
+
+
 class MessageSource(Protocol):
     """An open recording, whatever its format; it was received from ``start_ns`` to ``end_ns``."""
 
     topics: tuple[Topic, ...]
     start_ns: int
     end_ns: int
+
+    @property
+    def loss(self) -> Loss:
+        """What has been found damaged so far."""
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
@@ -64,6 +105,8 @@ class BagSource:
 
     Raises a RecordingError if rosbags can't read it.
     """
+
+    loss = NOTHING_LOST
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -105,67 +148,11 @@ class BagSource:
         return self._typestore.ros1_to_cdr(data, connection.msgtype)
 
 
-class SalvagedMcap:
-    """What is whole in a truncated MCAP file: all chunks, or bare messages, before the damage.
-
-    Whole files that rosbags refuses, as those that hold other than ROS messages, are read, too:
-    ``other_encodings`` are those of the channels that are left out, as they are no CDR.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.is_whole = False
-        self.other_encodings: dict[int, str] = {}
-        counts: Counter[tuple[str, str]] = Counter()
-        self.start_ns = self.end_ns = self._disorder_ns = 0
-        for name, message_type, message in self._records():
-            if not counts:
-                self.start_ns = self.end_ns = message.log_time
-            counts[name, message_type] += 1
-            self.start_ns = min(self.start_ns, message.log_time)
-            self.end_ns = max(self.end_ns, message.log_time)
-            self._disorder_ns = max(self._disorder_ns, self.end_ns - message.log_time)
-        self._topics = {key: Topic(*key, count) for key, count in counts.items()}
-        self.topics = tuple(self._topics.values())
-
-    def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
-        """Yield the messages of these topics in the order in which they were received."""
-        held: list[tuple[int, int, RawMessage]] = []
-        for number, (name, message_type, message) in enumerate(self._records()):
-            topic, stamp_ns = self._topics[name, message_type], message.log_time
-            if topic in topics:
-                raw = RawMessage(topic, stamp_ns, message.data)
-                heapq.heappush(held, (stamp_ns, number, raw))
-            while held and held[0][0] <= stamp_ns - self._disorder_ns:
-                yield heapq.heappop(held)[-1]
-        yield from (raw for *_, raw in sorted(held))
-
-    def close(self) -> None:
-        """Do nothing: the file is open only while it is read."""
-
-    def _records(self) -> Iterator[tuple[str, str, Message]]:
-        """Yield topic, type and record of each message up to the damage."""
-        message_types: dict[int, str] = {}
-        channels: dict[int, tuple[str, str]] = {}
-        with self._path.open('rb') as file:
-            records = StreamReader(file).records
-            while (record := _next_whole(records)) is not None:
-                if isinstance(record, Schema):
-                    message_types[record.id] = record.name
-                elif isinstance(record, Channel) and record.message_encoding != 'cdr':
-                    self.other_encodings[record.id] = record.message_encoding
-                elif isinstance(record, Channel):
-                    channels[record.id] = record.topic, message_types.get(record.schema_id, '')
-                elif isinstance(record, Message) and record.channel_id in channels:
-                    yield *channels[record.channel_id], record
-                elif isinstance(record, Footer):
-                    self.is_whole = True
-
-
 class SplitSource:
-    """The open files that one recording was split into."""
+    """The files that one recording was split into, and what is lost with those not open."""
 
-    def __init__(self, parts: Sequence[MessageSource]) -> None:
+    def __init__(self, parts: Sequence[MessageSource], loss: Loss = NOTHING_LOST) -> None:
+        self._loss = loss
         self._parts = sorted(parts, key=lambda part: part.start_ns)
         counts: Counter[tuple[str, str]] = Counter()
         for part in parts:
@@ -175,6 +162,11 @@ class SplitSource:
         self.topics = tuple(self._topics.values())
         self.start_ns = min(part.start_ns for part in parts)
         self.end_ns = max(part.end_ns for part in parts)
+
+    @property
+    def loss(self) -> Loss:
+        """What has been found damaged so far."""
+        return sum((part.loss for part in self._parts), self._loss)
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
@@ -207,11 +199,3 @@ def _damage_reported(path: Path, remedy: str = '') -> Iterator[None]:
         if isinstance(error, UnicodeError):  # bytes where text should be
             reason = f'it is damaged, or no {path.suffix} file'
         raise RecordingError(f'{path}: can not be read: {reason}{remedy}') from error
-
-
-def _next_whole(records: Iterator[object]) -> object | None:
-    """Give the next record, or None at the end or the damage."""
-    try:
-        return next(records, None)
-    except Exception:  # noqa: BLE001 (as above: any error means that the damage begins here)
-        return None

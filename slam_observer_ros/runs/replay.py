@@ -91,13 +91,15 @@ def replay(
     settings: Settings,
     truth: Truth | None = None,
     landmark_map: LandmarkMap | None = None,
+    keep_all: bool = True,
 ) -> Replay:
     """Run events through an estimator, from where the settings say or anywhere in a known map.
 
     The events are in the order in which they were received; the truth is what the configuration
-    error is measured against.
+    error is measured against. Where not all is kept, memory does not grow with the recording: of
+    poses there are the first and the last, and residuals there are none.
     """
-    run = _RunningReplay(settings, truth, landmark_map)
+    run = _RunningReplay(settings, truth, landmark_map, keep_all)
     for event in events:
         run.add(event)
     return run.finish()
@@ -107,9 +109,14 @@ class _RunningReplay:
     """Keeps what the metrics need, and the estimator's time apart from it."""
 
     def __init__(
-        self, settings: Settings, truth: Truth | None, landmark_map: LandmarkMap | None
+        self,
+        settings: Settings,
+        truth: Truth | None,
+        landmark_map: LandmarkMap | None,
+        keep_all: bool,
     ) -> None:
         self._settings = settings
+        self._keep_all = keep_all
         self._estimator = Estimator(
             settings,
             on_update=self._untimed(self._on_update),
@@ -129,8 +136,8 @@ class _RunningReplay:
         self._clear_figures()
 
     def _clear_figures(self) -> None:
-        self._sampler = TrajectorySampler()
-        self._dead_reckoning = DeadReckoning()
+        self._sampler = TrajectorySampler(self._keep_all)
+        self._dead_reckoning = DeadReckoning(self._keep_all)
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None
@@ -192,7 +199,8 @@ class _RunningReplay:
         self._dead_reckoning.advance(velocities, start_ns, end_ns)
 
     def _on_update(self, update: Update) -> None:
-        self._updates.append(update)
+        if self._keep_all:
+            self._updates.append(update)
         self._count_observation()
         self._compare_with_truth(update)
 

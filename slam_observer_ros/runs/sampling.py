@@ -15,9 +15,13 @@ SAMPLE_PERIOD_NS = 50_000_000
 
 
 class PoseSamples:
-    """Poses (4, 4) with their stamps, none less than a period after the one before."""
+    """Poses (4, 4) with their stamps, none less than a period after the one before.
 
-    def __init__(self) -> None:
+    Where not all are kept, the first and the last are.
+    """
+
+    def __init__(self, keep_all: bool = True) -> None:
+        self._keep_all = keep_all
         self.stamps_ns: list[int] = []
         self._poses: list[FloatArray] = []
 
@@ -27,6 +31,8 @@ class PoseSamples:
 
     def add(self, stamp_ns: int, pose: FloatArray) -> None:
         """Append a pose."""
+        if not self._keep_all:
+            del self.stamps_ns[1:], self._poses[1:]
         self.stamps_ns.append(stamp_ns)
         self._poses.append(pose)
 
@@ -39,8 +45,8 @@ class PoseSamples:
 class TrajectorySampler:
     """Collects poses and their covariances (6, 6), where these are known."""
 
-    def __init__(self) -> None:
-        self._samples = PoseSamples()
+    def __init__(self, keep_all: bool = True) -> None:
+        self._samples = PoseSamples(keep_all)
         self._covariances: list[FloatArray] = []
 
     def is_due(self, stamp_ns: int) -> bool:
@@ -70,9 +76,9 @@ class TrajectorySampler:
 class DeadReckoning:
     """Collects the poses that the velocities alone lead through, from the identity on."""
 
-    def __init__(self) -> None:
+    def __init__(self, keep_all: bool = True) -> None:
         self._pose = np.eye(4)
-        self._samples = PoseSamples()
+        self._samples = PoseSamples(keep_all)
 
     def advance(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         """Move on from one stamp to another, nanoseconds."""

@@ -6,13 +6,19 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 import re
 
-import yaml
-
-from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.common.yaml_errors import reason_of, UniqueKeys
+from slam_observer_ros.common.errors import ParameterError, shown, YamlError
+from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.settings.parameter_table import refuse_renamed, RENAMED, suggestion
 
 OBSERVER_NODE = 'observer_node'
+
+MAX_BYTES = 256_000
+"""Largest file that is read; those of whole robots have a tenth of it."""
+
+MAX_NAME = 255
+"""Longest name of a node with its namespaces, as in ROS, and of a parameter."""
+
+_ROS_FLOAT = re.compile(r'[-+]?(?:\d+\.?\d*[eE][-+]?\d+|\.\d+(?:[eE][-+]?\d+)?)')
 
 
 def names_of_others(written: Iterable[str], ours: Collection[str]) -> list[str]:
@@ -53,6 +59,7 @@ def read_parameter_file(path: Path) -> dict[str, object]:
     for name, body in sections:
         if _fits(name, node):
             values.update(_flatten(body))
+    _refuse_long_names(path, 'parameter', values)
     return values
 
 
@@ -84,6 +91,8 @@ def mixed_lists(values: Mapping[str, object]) -> list[str]:
 
 def _is_misspelt(name: str, ours: str) -> bool:
     """Return whether a letter of ``ours`` is wrong, missing, too many or behind the next one."""
+    if abs(len(name) - len(ours)) > 1:
+        return False
     same = [one == other for one, other in zip(name, ours, strict=False)]
     start = [*same, False].index(False)
     rest, right = name[start:], ours[start:]
@@ -91,26 +100,29 @@ def _is_misspelt(name: str, ours: str) -> bool:
     return rest in (right[1:], swapped) or rest[1:] in (right, right[1:])
 
 
-class _RosLoader(UniqueKeys, yaml.SafeLoader):
-    """Reads numbers as ROS does: 1e-3 and 1.0e3, too, where YAML 1.1 wants 1.0e-3 and 1.0e+3."""
-
-
-_RosLoader.add_implicit_resolver(
-    'tag:yaml.org,2002:float',
-    re.compile(r'^[-+]?(\d+\.?\d*[eE][-+]?\d+|\.\d+([eE][-+]?\d+)?)$'),
-    list('-+.0123456789'),
-)
+def _plain_value(text: str) -> object:
+    """Read numbers as ROS does: 1e-3 and 1.0e3, too, where YAML 1.1 wants 1.0e-3 and 1.0e+3."""
+    return float(text) if _ROS_FLOAT.fullmatch(text) else plain_value(text)
 
 
 def _read_sections(path: Path) -> list[tuple[str, dict[str, object]]]:
     try:
-        content = yaml.load(path.read_bytes(), _RosLoader)
-        return list(_sections(content if isinstance(content, dict) else {}))
+        content = load_yaml(path, MAX_BYTES, _plain_value)
     except OSError as error:
         raise ParameterError(f"can't read parameter file {path}: {error.strerror}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = reason_of(error)
-        raise ParameterError(f'parameter file {path} is not valid YAML: {reason}') from error
+    except YamlError as error:
+        raise ParameterError(f'parameter file {path} is not valid YAML: {error}') from error
+    sections = list(_sections(content if isinstance(content, dict) else {}))
+    _refuse_long_names(path, 'section', [name for name, _ in sections])
+    return sections
+
+
+def _refuse_long_names(path: Path, what: str, names: Iterable[str]) -> None:
+    for name in names:
+        if len(name) > MAX_NAME:
+            raise ParameterError(
+                f'parameter file {path}: the {what} {shown(name)} has more than {MAX_NAME} letters'
+            )
 
 
 def _sections(
@@ -129,10 +141,18 @@ def _sections(
 
 def _fits(section: str, node: str) -> bool:
     """Return whether a section is of the node with this full name, as ROS has it."""
-    wildcards = {'*': '/[^/]+', '**': '(/[^/]+)*'}
-    names = section.split('/')[1:]
-    pattern = ''.join(wildcards.get(name, '/' + re.escape(name)) for name in names)
-    return re.fullmatch(pattern, node) is not None
+    names = node.split('/')[1:]
+    fitted = {0}  # how many of the node's names the section may be of so far
+    for name in section.split('/')[1:]:
+        if name == '**':
+            fitted = set(range(min(fitted), len(names) + 1))
+        else:
+            fitted = {
+                count + 1 for count in fitted if count < len(names) and name in ('*', names[count])
+            }
+        if not fitted:
+            return False
+    return len(names) in fitted
 
 
 def _node_of(section: str) -> str:

@@ -14,7 +14,7 @@ import math
 from numbers import Integral, Real
 from typing import Any, cast, ClassVar, Protocol, TypeAlias, TypeVar
 
-from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.common.errors import ParameterError, shown
 
 Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 """A parameter's value; vectors are tuples of floats."""
@@ -110,7 +110,7 @@ class Parameter:
 
     def _expect(self, value: object, is_right: bool, expected: str) -> None:
         if not is_right:
-            raise ParameterError(f"parameter '{self.name}' takes {expected}, not {value!r}")
+            raise ParameterError(f"parameter '{self.name}' takes {expected}, not {shown(value)}")
 
     def _number(self, value: object) -> float:
         is_number = isinstance(value, Real) and not isinstance(value, bool)

@@ -49,6 +49,19 @@ def test_rounding_neither_spoils_the_slope_nor_the_json(slam_observer):
     assert result['log10_lyapunov'][-1] < -24.0
 
 
+@pytest.mark.parametrize(
+    ('options', 'reason'),
+    [
+        (['--duration', '1e300'], 'are more than 10000000 steps; take a shorter one, or longer'),
+        (['--step', '1e-300'], 'are more than 10000000 steps; take a shorter one, or longer'),
+        (['--step', '1e-320'], 'are more than 10000000 steps; take a shorter one, or longer'),
+        (['--landmarks', '1000000000'], "'landmark_count' takes a value ≥ 0, ≤ 10000, not 1000"),
+    ],
+)
+def test_what_would_run_for_ever_is_refused(slam_observer, options, reason):
+    assert reason in slam_observer.fail('simulate', *options)
+
+
 def test_without_bias_there_is_nothing_to_converge(slam_observer):
     result = slam_observer.succeed('simulate', '--json', '--bias', 0, '--duration', 1).json
     assert result['slope_per_s'] is None

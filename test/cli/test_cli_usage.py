@@ -173,8 +173,13 @@ def test_stopped_in_the_middle(tmp_path, stop):
     assert not list(tmp_path.iterdir())
 
 
-def test_interrupted_while_modules_load(tmp_path):
-    (tmp_path / 'numpy.py').write_text('import signal\nsignal.raise_signal(signal.SIGINT)\n')
+@pytest.mark.parametrize('module', ['rich', 'numpy', 'matplotlib'])
+def test_interrupted_while_modules_load(tmp_path, module):
+    # Python itself makes such errors of an interrupt, in __set_name__.
+    (tmp_path / f'{module}.py').write_text(
+        'import signal\ntry:\n    signal.raise_signal(signal.SIGINT)\n'
+        "except KeyboardInterrupt as error:\n    raise RuntimeError('in a library') from error\n"
+    )
     search_path = os.pathsep.join([str(tmp_path), os.environ.get('PYTHONPATH', '')])
     ended = subprocess.run(
         [*COMMAND, 'simulate'],

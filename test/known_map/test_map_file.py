@@ -271,3 +271,31 @@ def test_a_damaged_map_is_read_or_refused_but_nothing_else(tmp_path_factory, dat
         assert str(path) in str(error)
     else:
         assert np.isfinite(read.world_points).all()
+
+
+@pytest.mark.parametrize(
+    'rows',
+    [
+        '[[-1, 0, 0], [0, 1.0e12, 0], [0, 0, 1]]',
+        '[[1, 2, 0], [2, 1, 0], [0, 0, 1.0e12]]',
+        '[[1, 0.5, 0], [0.4, 1, 0], [0, 0, 1.0e12]]',
+        '[[0, 1, 0], [1, 1.0e6, 0], [0, 0, 1]]',
+        '[[1.0e-9, 1, 0], [1, 1.0e6, 0], [0, 0, 1]]',
+    ],
+)
+def test_a_large_variance_hides_no_wrong_one_beside_it(tmp_path, rows):
+    path = tmp_path / 'surveyed.yaml'
+    path.write_text(SURVEYED.replace('sigma: 0.02', f'covariance: {rows}'))
+    with pytest.raises(MapError, match="landmark 3: 'covariance' is not symmetric, or negative"):
+        read_map(path)
+
+
+@pytest.mark.parametrize('m2', [0.0, 1e-30, 1e-9, 1.0, 1e12])
+def test_covariances_of_every_scale_are_read_with_the_rounding_of_a_filter(tmp_path, m2):
+    path = tmp_path / 'map.yaml'
+    scales = np.sqrt(np.array([m2, 1e-4, 1e4]))
+    covariances = np.array([[1, 1, 0.5], [1, 1, 0.5], [0.5, 0.5, 1]]) * scales * scales[:, None]
+    covariances[0, 0] -= 1e-16
+    one = LandmarkMap(np.array([5]), np.zeros((1, 3)), covariances[None], np.array([1]))
+    write_map(path, one, Settings())
+    assert_same_map(read_map(path), one)

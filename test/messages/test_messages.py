@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 import struct
 
 import detector_messages as detector
@@ -494,6 +495,23 @@ class TestMalformed:
             DECODERS[key](bytes(raw), 0)
         except MessageError as error:
             assert str(error)
+
+    @all_decoders
+    def test_thousands_of_mutations_never_raise_anything_else(self, key):
+        """Lengths, numbers and texts that no publisher sends, in any place."""
+        random = np.random.default_rng(list(key[0].encode()))
+        words = [0, 1, 0x7F, 0xFF, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 0x7F800000, 0x7FC00000]
+        whole = np.frombuffer(EXAMPLES[key[0]], np.uint8)
+        for _ in range(4000):
+            raw = whole.copy()
+            for _ in range(random.integers(1, 5)):
+                at = random.integers(len(raw) - 4)
+                word = int(random.choice(words)) if random.random() < 0.7 else random.bytes(4)
+                raw[at : at + 4] = np.frombuffer(
+                    word if isinstance(word, bytes) else word.to_bytes(4, 'little'), np.uint8
+                )
+            with suppress(MessageError):
+                DECODERS[key](raw.tobytes(), 0)
 
     def test_other_encapsulations_are_refused(self):
         raw = b'\0\x03' + EXAMPLES['geometry_msgs/msg/Twist'][2:]

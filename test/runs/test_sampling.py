@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import gc
+import tracemalloc
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -48,6 +50,26 @@ def test_dead_reckoning_holds_its_pose_where_no_velocity_is_in_force():
     events = [VelocityEvent(0, TWIST), ObservationEvent(5 * SECOND, IDS, POINTS)]
     reckoned = replay(events, Settings(velocity_timeout=1.0)).dead_reckoning
     assert_allclose(reckoned.poses[-1], se3.exp(TWIST * 1.0), atol=1e-12)
+
+
+def test_memory_does_not_grow_with_a_replay_of_which_not_all_is_kept():
+    held_bytes = []
+
+    def events():
+        for number, event in enumerate(events_of(3000, 5000)):
+            if number in (1000, 3000):
+                gc.collect()
+                held_bytes.append(tracemalloc.get_traced_memory()[0])
+            yield event
+
+    tracemalloc.start()
+    try:
+        result = replay(events(), Settings(gains='scheduled'), keep_all=False)
+    finally:
+        tracemalloc.stop()
+    assert held_bytes[1] - held_bytes[0] < 2000  # a byte a message
+    for trajectory in (result.trajectory, result.dead_reckoning):
+        assert trajectory.stamps_ns[[0, -1]].tolist() == [0, 2997 * STEP_NS]
 
 
 def test_there_is_no_dead_reckoning_without_velocities():

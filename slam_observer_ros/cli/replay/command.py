@@ -29,7 +29,7 @@ from slam_observer_ros.cli.replay.outcome_checks import (
 )
 from slam_observer_ros.cli.replay.summary import as_json, print_summary
 from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
-from slam_observer_ros.common.errors import OutputError, UsageError
+from slam_observer_ros.common.errors import LossError, OutputError, UsageError
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.observer.designs import DESIGNS
@@ -78,6 +78,12 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     outputs.add_argument('--map', type=Path, metavar='FILE', help='landmarks, as YAML')
     add_result_options(outputs, FIGURES)
+    parser.add_argument(
+        '--strict',
+        action='store_true',
+        help='end with exit code 3 if anything of the recording was lost: if it is damaged, cut '
+        'off, or has malformed messages',
+    )
     add_force_option(parser)
     add_settings_options(parser, InputSettings)
     parser.set_defaults(run=run)
@@ -117,14 +123,16 @@ def _replay(
             'replaying',
             recording.event_count(selected),
         )
-        result = replay(events, settings, truth, landmark_map)
+        is_drawn = args.tum is not None or args.plot is not None
+        needs_poses = is_drawn or len(truth.stamps_ns) > 0
+        result = replay(events, settings, truth, landmark_map, keep_all=needs_poses)
         warn_of_resets(result)
         check_used(args, recording, selected, inputs, result)
         if landmark_map is not None:
             check_localised(args, result, landmark_map)
         outcome = outcome_of(recording, selected, result, truth)
         warn_of_input(recording, selected, result)
-        warn_of_timing(recording, selected, settings.velocity_timeout)
+        warn_of_timing(recording, selected)
     return with_smoothed(outcome) if args.smooth else outcome
 
 
@@ -150,3 +158,5 @@ def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame
         print_summary(args.recording, outcome, written)
     if errors:
         raise OutputError('; '.join(errors))
+    if args.strict and any(outcome.lost.values()):
+        raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')

@@ -13,6 +13,7 @@ from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.recording.sources import Loss, NOTHING_LOST
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.accuracy import Accuracy, measure, measure_smoothed, trajectory_of
 from slam_observer_ros.runs.replay import Replay
@@ -38,6 +39,7 @@ class ReplayOutcome:
     duration_s: float
     unused: Counter[str]
     missing_ids: str
+    loss: Loss = NOTHING_LOST
     smoothed: Smoothed | None = None
     smoothed_errors: TrajectoryErrors | None = None
     smoothed_landmark_rmse_m: float | None = None
@@ -51,6 +53,16 @@ class ReplayOutcome:
     def dropped(self) -> dict[str, int]:
         """How many of them were dropped, by reason."""
         return dict(self.result.estimator.dropped + self.unused)
+
+    @property
+    def lost(self) -> dict[str, int | float | bool]:
+        """What of the recording could not be read, as ``--json`` has it."""
+        return {
+            'bytes': self.loss.byte_count,
+            'seconds': self.loss.seconds,
+            'cut_off': self.loss.is_cut_off,
+            'malformed': self.unused[MALFORMED],
+        }
 
     @property
     def trajectory(self) -> Trajectory:
@@ -114,6 +126,7 @@ def outcome_of(
         recording.duration_s,
         unused_messages(recording, selected),
         recording.contents.missing_ids(selected.landmarks),
+        recording.loss,
     )
 
 

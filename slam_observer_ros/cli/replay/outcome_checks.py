@@ -151,6 +151,8 @@ def _advice(result: Replay) -> str:
 
 def warn_of_input(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
     """Say what of the recording, or of the settings, is likely to be wrong."""
+    if recording.loss and not recording.warning:
+        logger.warning('%s: damaged; %s.', recording.path, recording.loss)
     _warn_of_missing_stamps(recording)
     _warn_of_rejections(result)
     _warn_of_calibration(result)

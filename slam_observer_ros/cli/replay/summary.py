@@ -49,6 +49,7 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'seconds': outcome.result.seconds,
         'landmarks': len(estimator.landmark_ids),
         'dropped': outcome.dropped,
+        'lost': outcome.lost,
         'used': dict(estimator.counts),
         'calibration': {part.name: asdict(part) for part in estimator.calibration},
         'localised_after_s': outcome.localised_after_s,
@@ -87,6 +88,8 @@ def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str,
         'observed points': _points_text(estimator.counts),
         'dropped': list_dropped(outcome.dropped),
     }
+    if outcome.loss or outcome.lost['malformed']:
+        rows['lost'] = _loss_text(outcome)
     if slips := estimator.counts['slip']:
         rows['slips'] = f'{slips} × the robot was not where odometry had it'
     if unexpected := estimator.counts['unexpected_place']:
@@ -97,6 +100,15 @@ def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str,
     rows |= _accuracy_rows(outcome)
     rows |= {name: str(path) for name, path in written.items()}
     print_table(str(recording), rows)
+
+
+def _loss_text(outcome: ReplayOutcome) -> str:
+    parts = []
+    if outcome.loss:
+        parts.append(str(outcome.loss))
+    if malformed := outcome.lost['malformed']:
+        parts.append(f'{malformed} malformed messages')
+    return ', '.join(parts)
 
 
 def _localisation_text(result: Replay, localised_after_s: float) -> str:

@@ -24,24 +24,22 @@ FEWEST = 10
 logger = logging.getLogger(__name__)
 
 
-def warn_of_timing(recording: Recording, selected: SelectedTopics, timeout_s: float) -> None:
-    """Say which inputs of a recording, read to its end, were silent or are of another clock.
-
-    ``timeout_s`` is how long a velocity holds, seconds.
-    """
+def warn_of_timing(recording: Recording, selected: SelectedTopics) -> None:
+    """Say which inputs of a recording, read to its end, were silent or are of another clock."""
     names = [topic.name for topic in selected.inputs]
-    inputs = {name: recording.arrivals[name] for name in names if recording.arrivals[name]}
+    arrivals = recording.arrivals
+    inputs = {name: arrivals[name] for name in names if name in arrivals and len(arrivals[name])}
     if not inputs:
         return
-    start_s = min(arrivals.received_s[0] for arrivals in inputs.values())
+    start_s = min(arrivals.first_s for arrivals in inputs.values())
     end_s = recording.end_s
     velocity, landmarks = selected.velocity.name, selected.landmarks.name
     if velocity in inputs:
-        silence_s = inputs[velocity].silence_s(start_s, end_s, timeout_s)
+        silence_s = inputs[velocity].silence_s(start_s, end_s)
         consequence = 'the pose was held, but for what landmarks say'
         _warn_of_silence('velocity', velocity, silence_s, end_s - start_s, consequence)
     if selected.imu is not None and selected.imu.name in inputs:
-        silence_s = inputs[selected.imu.name].silence_s(start_s, end_s, timeout_s)
+        silence_s = inputs[selected.imu.name].silence_s(start_s, end_s)
         consequence = f'that of {velocity} was taken'
         _warn_of_silence(
             'angular velocity', selected.imu.name, silence_s, end_s - start_s, consequence
@@ -64,7 +62,7 @@ def _warn_of_silence(
 def _warn_of_landmarks_end(
     topic_name: str, arrivals: Arrivals, start_s: float, end_s: float
 ) -> None:
-    silence_s = end_s - arrivals.received_s[-1]
+    silence_s = end_s - arrivals.last_s
     if len(arrivals) >= FEWEST and silence_s > MAX_END_SILENCE * (end_s - start_s):
         logger.warning(
             'No landmarks on %s for the last %.1f s of %.1f s: did the detector end?',

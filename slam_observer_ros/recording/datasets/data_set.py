@@ -20,7 +20,7 @@ class DataSet:
 
     ``body_velocities`` (k, 6) are angular then linear, rad/s and m/s; ``true_poses`` (p, 4, 4)
     body to world. The observations are in stamp order and none is empty; ``left_out`` counts
-    measurements that are no landmark observations, by reason.
+    measurements that are no landmark observations, by reason. The truth may be empty.
     """
 
     velocity_stamps_ns: IntArray
@@ -54,6 +54,7 @@ def write_data_set(data_set: DataSet, out: Path | str, overwrite: bool = False) 
     ]
     order = np.argsort([item.stamp_ns for item in items], kind='stable')
     with RecordingWriter(out, overwrite) as writer:
-        writer.write_landmarks(items[order[0]].stamp_ns, data_set.landmarks)
+        if len(data_set.landmarks.ids):
+            writer.write_landmarks(items[order[0]].stamp_ns, data_set.landmarks)
         for index in order:
             writer.write_event(items[index])

@@ -36,13 +36,13 @@ def load_mrclam(folder: Path | str, robot: int) -> DataSet:
     Velocities are the commands that the robot was given: forward speed and yaw rate. Landmark ids
     are subject numbers; sightings of other robots and misread barcodes are left out and counted.
     Raises a DataSetError if a file is missing or malformed; if there is no such robot it lists
-    those there are.
+    those there are. Files of the truth may be missing.
     """
     folder = Path(folder)
     _require_robot(folder, robot)
     odometry = _table(folder / f'Robot{robot}_Odometry.dat', columns=3)
-    truth = _table(folder / f'Robot{robot}_Groundtruth.dat', columns=4)
-    landmarks = _table(folder / 'Landmark_Groundtruth.dat', columns=5)
+    truth = _truth(folder / f'Robot{robot}_Groundtruth.dat', columns=4)
+    landmarks = _truth(folder / 'Landmark_Groundtruth.dat', columns=5)
     body_velocities = np.zeros((len(odometry), 6))
     body_velocities[:, 2] = odometry[:, 2]
     body_velocities[:, 3] = odometry[:, 1]
@@ -67,6 +67,11 @@ def _require_robot(folder: Path, robot: int) -> None:
         raise DataSetError(f'{folder}: not an MRCLAM data set: no RobotN_Odometry.dat in it')
     if robot not in robots:
         raise DataSetError(f'{folder}: no robot {robot}; there are {", ".join(map(str, robots))}')
+
+
+def _truth(path: Path, columns: int) -> FloatArray:
+    """Read a table of what is true, which a run may be without."""
+    return _table(path, columns) if path.exists() else np.empty((0, columns))
 
 
 def _table(path: Path, columns: int) -> FloatArray:

@@ -1,0 +1,179 @@
+"""What is whole in a damaged recording, before and behind the damage."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+import heapq
+import mmap
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+from rosbags.typesys import get_typestore, Stores
+
+from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.common.units import to_s
+from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.recording.sources import Loss, MessageSource, RawMessage, Topic
+
+
+class FoundChannel(NamedTuple):
+    """Under which number a file has a topic, and how its messages are encoded."""
+
+    number: int
+    topic: str
+    message_type: str
+    encoding: str
+
+
+class FoundMessage(NamedTuple):
+    """A whole message, and the number of its topic."""
+
+    channel: int
+    stamp_ns: int
+    data: Buffer
+
+
+class Damaged(NamedTuple):
+    """Bytes that are not used; and whether the file ends there though it should go on."""
+
+    byte_count: int
+    is_cut_off: bool = False
+
+
+Found: TypeAlias = FoundChannel | FoundMessage | Damaged
+Scan: TypeAlias = Callable[[mmap.mmap], Iterator[Found]]
+"""Reads a file from its beginning to its end, whatever is in it, and raises nothing."""
+
+
+class SalvagedSource:
+    """The whole messages of a damaged file, or of one that rosbags does not know.
+
+    ``other_encodings`` are those of the channels that are left out, as they are neither CDR nor of
+    a ROS 1 bag.
+    """
+
+    def __init__(self, path: Path, scan: Scan) -> None:
+        self._path, self._scan = path, scan
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._channels: dict[int, FoundChannel] = {}
+        self._disorder_ns = 0
+        self.start_ns = self.end_ns = 0
+        counts: Counter[int] = Counter()
+        byte_count, gap_ns, is_cut_off, is_behind_damage = 0, 0, False, False
+        for found in self._found():
+            if isinstance(found, FoundChannel):
+                self._channels[found.number] = found
+            elif isinstance(found, Damaged):
+                byte_count += found.byte_count
+                is_cut_off |= found.is_cut_off
+                is_behind_damage = True
+            else:
+                if not counts:
+                    self.start_ns = self.end_ns = found.stamp_ns
+                if is_behind_damage:
+                    gap_ns += max(found.stamp_ns - self.end_ns, 0)
+                    is_behind_damage = False
+                counts[found.channel] += 1
+                self.start_ns = min(self.start_ns, found.stamp_ns)
+                self.end_ns = max(self.end_ns, found.stamp_ns)
+                self._disorder_ns = max(self._disorder_ns, self.end_ns - found.stamp_ns)
+        self.loss = Loss(byte_count, to_s(gap_ns), is_cut_off)
+        self.other_encodings = {
+            number: channel.encoding
+            for number, channel in self._channels.items()
+            if channel.encoding not in ('cdr', 'ros1 bag')
+        }
+        self._set_topics(counts)
+
+    def _set_topics(self, counts: Counter[int]) -> None:
+        of_topic: Counter[tuple[str, str]] = Counter()
+        for number, channel in self._channels.items():
+            if number not in self.other_encodings and counts[number]:
+                of_topic[channel.topic, channel.message_type] += counts[number]
+        topics = {key: Topic(*key, count) for key, count in of_topic.items()}
+        self.topics = tuple(topics.values())
+        self._topic_of = {
+            number: topics[channel.topic, channel.message_type]
+            for number, channel in self._channels.items()
+            if (channel.topic, channel.message_type) in topics
+            and number not in self.other_encodings
+        }
+
+    def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
+        """Yield the messages of these topics in the order in which they were received."""
+        held: list[tuple[int, int, RawMessage]] = []
+        for number, found in enumerate(self._found()):
+            if not isinstance(found, FoundMessage) or found.channel not in self._topic_of:
+                continue
+            topic, stamp_ns = self._topic_of[found.channel], found.stamp_ns
+            if topic in topics:
+                raw = RawMessage(topic, stamp_ns, self._cdr(found))
+                heapq.heappush(held, (stamp_ns, number, raw))
+            while held and held[0][0] <= stamp_ns - self._disorder_ns:
+                yield heapq.heappop(held)[-1]
+        yield from (raw for *_, raw in sorted(held))
+
+    def close(self) -> None:
+        """Do nothing: the file is open only while it is read."""
+
+    def _found(self) -> Iterator[Found]:
+        with self._path.open('rb') as file:
+            if file.seek(0, 2) == 0:
+                yield Damaged(0, is_cut_off=True)
+                return
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                yield from self._scan(data)
+
+    def _cdr(self, found: FoundMessage) -> Buffer:
+        channel = self._channels[found.channel]
+        if channel.encoding == 'cdr':
+            return found.data
+        if channel.message_type not in self._typestore.types:
+            raise RecordingError(f'messages of type {channel.message_type} are read of ROS 2 only')
+        try:
+            return self._typestore.ros1_to_cdr(bytes(found.data), channel.message_type)
+        except Exception:  # noqa: BLE001 (no list of what rosbags raises is complete)
+            return b''  # which is counted as malformed
+
+
+class MendedSource:
+    """A file that rosbags opens; should it turn out to be damaged, what is whole of the rest."""
+
+    def __init__(self, whole: MessageSource, salvage: Callable[[], SalvagedSource]) -> None:
+        self._whole, self._salvage = whole, salvage
+        self._salvaged: SalvagedSource | None = None
+        self.topics = whole.topics
+        self.start_ns, self.end_ns = whole.start_ns, whole.end_ns
+
+    @property
+    def loss(self) -> Loss:
+        """What has been found damaged so far."""
+        return self._whole.loss if self._salvaged is None else self._salvaged.loss
+
+    def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
+        """Yield the messages of these topics in the order in which they were received."""
+        last_ns: int | None = None
+        try:
+            for raw in self._whole.messages(topics):
+                last_ns = raw.receive_stamp_ns
+                yield raw
+        except RecordingError as error:
+            if self._salvaged is None:
+                self._salvaged = self._salvage()
+            if not self._salvaged.topics:
+                raise RecordingError(f'{error}; no whole message is left') from error
+            yield from self._rest(self._salvaged, topics, last_ns)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._whole.close()
+
+    def _rest(
+        self, salvaged: SalvagedSource, topics: Collection[Topic], last_ns: int | None
+    ) -> Iterator[RawMessage]:
+        known = {(topic.name, topic.message_type): topic for topic in topics}
+        wanted = [topic for topic in salvaged.topics if (topic.name, topic.message_type) in known]
+        for raw in salvaged.messages(wanted):
+            if last_ns is None or raw.receive_stamp_ns > last_ns:
+                yield raw._replace(topic=known[raw.topic.name, raw.topic.message_type])

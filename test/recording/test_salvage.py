@@ -1,0 +1,177 @@
+"""Of a damaged recording what is whole is read, and how much is lost is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from command_line import CommandLine
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+import ros_messages as ros
+from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import get_typestore, Stores
+
+from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.salvage import SalvagedSource
+from slam_observer_ros.recording.salvage_formats import SCANS
+from slam_observer_ros.recording.writer import RecordingWriter
+
+COUNT = 30_000
+STEP_NS = 1_000_000
+FORMATS = ['mcap', 'db3', 'bag']
+
+
+def write_mcap(path):
+    random = np.random.default_rng(0)  # which does not compress
+    with RecordingWriter(path) as writer:
+        writer.write_observation(ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3))))
+        for index in range(COUNT):
+            event = VelocityEvent(ros.STAMP_NS + index * STEP_NS, random.normal(size=6))
+            writer.write_velocity(event)
+    return path
+
+
+def write_db3(path):
+    bag = rosbag2.Writer(path.with_suffix(''), version=9, storage_plugin=StoragePlugin.SQLITE3)
+    with bag:
+        write_all(bag, ros.TYPESTORE, lambda message: bytes(ros.serialise(message)))
+    next(path.with_suffix('').glob('*.db3')).rename(path)
+    return path
+
+
+def write_bag(path):
+    typestore = get_typestore(Stores.ROS1_NOETIC)
+    bag = rosbag1.Writer(path)
+    bag.set_compression(bag.CompressionFormat.LZ4)
+    with bag:
+        write_all(
+            bag, typestore, lambda message: typestore.serialize_ros1(message, message.__msgtype__)
+        )
+    return path
+
+
+def write_all(bag, typestore, serialise):
+    points = np.full((2000, 3), np.nan)  # on several pages, and all but one not measured
+    points[0] = 1.0
+    big = ros.point_cloud(points, {'id': np.arange(2000)})
+    if isinstance(bag, rosbag1.Writer):
+        big.header = typestore.types['std_msgs/msg/Header'](0, big.header.stamp, 'base_link')
+    twists = bag.add_connection('/twist', 'geometry_msgs/msg/Twist', typestore=typestore)
+    clouds = bag.add_connection('/landmarks', big.__msgtype__, typestore=typestore)
+    cloud = serialise(big)
+    random = np.random.default_rng(0)
+    for index in range(COUNT):
+        stamp_ns = ros.STAMP_NS + index * STEP_NS
+        if index % 3000 == 0:
+            bag.write(clouds, stamp_ns, cloud)
+        bag.write(twists, stamp_ns, serialise(ros.twist(random.normal(size=6).tolist())))
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """Recordings of 30 s by format."""
+    folder = tmp_path_factory.mktemp('whole')
+    writers = {'mcap': write_mcap, 'db3': write_db3, 'bag': write_bag}
+    return {name: write(folder / f'run.{name}') for name, write in writers.items()}
+
+
+@pytest.fixture
+def slam_observer(capsys):
+    """Run the command inside the test."""
+    return CommandLine(capsys)
+
+
+def read(path: Path):
+    with Recording(path) as recording:
+        velocities = [
+            event.receive_ns - ros.STAMP_NS
+            for event in recording.events(recording.find_topics())
+            if isinstance(event, VelocityEvent)
+        ]
+        return velocities, recording.loss, recording.warning
+
+
+@pytest.mark.parametrize('name', FORMATS)
+def test_of_a_whole_recording_nothing_is_lost_and_a_scan_finds_the_same(whole, name):
+    velocities, loss, warning = read(whole[name])
+    assert (len(velocities), bool(loss), warning) == (COUNT, False, None)
+    scanned = SalvagedSource(whole[name], SCANS[f'.{name}'])
+    with Recording(whole[name]) as recording:
+        assert set(scanned.topics) == set(recording.topics)
+        messages, found = (
+            sorted(
+                (raw.receive_stamp_ns, raw.topic.name, bytes(raw.data))
+                for raw in source.messages(source.topics)
+            )
+            for source in (recording._source, scanned)
+        )
+        assert messages == found
+    assert not scanned.loss
+
+
+@pytest.mark.parametrize('name', FORMATS)
+def test_a_recording_that_is_cut_off_is_read_up_to_there(whole, tmp_path, name):
+    data = whole[name].read_bytes()
+    path = tmp_path / whole[name].name
+    path.write_bytes(data[: len(data) * 2 // 3])
+    velocities, loss, warning = read(path)
+    assert COUNT // 3 < len(velocities) < COUNT
+    assert velocities == sorted(velocities)
+    assert loss.is_cut_off
+    assert 'cut off or damaged' in warning
+    assert f'{loss.byte_count} bytes' in warning
+
+
+@pytest.mark.parametrize('name', FORMATS)
+def test_behind_damage_in_the_middle_it_goes_on_with_what_is_whole(whole, tmp_path, name):
+    data = bytearray(whole[name].read_bytes())
+    path = tmp_path / whole[name].name
+    middle = len(data) // 2
+    data[middle : middle + 20_000] = bytes(20_000)
+    path.write_bytes(data)
+    velocities, loss, _ = read(path)
+    assert COUNT // 2 < len(velocities) < COUNT
+    assert velocities[-1] == (COUNT - 1) * STEP_NS
+    assert 10_000 < loss.byte_count < len(data) // 2
+    assert loss.seconds == pytest.approx(np.diff(velocities).max() * 1e-9, abs=0.01)
+    assert not loss.is_cut_off
+
+
+@pytest.mark.parametrize('name', FORMATS)
+def test_scripts_see_what_is_lost(slam_observer, whole, tmp_path, name):
+    options = ['--strict', '--json', '--gains', 'constant']
+    intact = slam_observer('replay', whole[name], *options)
+    assert intact.code == 0
+    assert not any(intact.json['lost'].values())
+    path = tmp_path / whole[name].name
+    data = bytearray(whole[name].read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 20_000] = bytes(20_000)
+    path.write_bytes(data)
+    ended = slam_observer('replay', path, *options)
+    assert ended.code == 3
+    assert ended.json['lost']['bytes'] > 0
+    assert 'a part of it was lost, which --strict does not allow' in ended.errors
+    assert 'bytes and' in ended.errors
+
+
+@pytest.mark.parametrize('name', FORMATS)
+@settings(max_examples=15)
+@given(data=st.data())
+def test_whatever_the_damage_a_scan_ends_and_raises_nothing(whole, tmp_path_factory, name, data):
+    damaged = bytearray(whole[name].read_bytes()[:300_000])
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(damaged) - 1))
+        size = data.draw(st.sampled_from([1, 1, 8, 5000]))
+        value = data.draw(st.sampled_from([b'\0', b'\xff', b'\x7f', b'\x06', b'\x05']))
+        damaged[at : at + size] = value * size
+    path = tmp_path_factory.mktemp('damaged') / f'run.{name}'
+    path.write_bytes(damaged)
+    try:
+        read(path)
+    except RecordingError as error:
+        assert '\n' not in str(error)
