@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ekf_slam import EkfSlam
 from estimators import EKF, observer
 import numpy as np
-from worlds import drive, Loop, simulated_settings, without_calibration, World
+from worlds import drive, Loop, simulated_settings, World
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
@@ -17,6 +17,7 @@ from slam_observer_ros.evaluation.consistency import (
 )
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.sensor_models.calibration import without_calibration
 
 CHECKPOINT_S = 5
 

@@ -159,19 +159,6 @@ def simulated_settings(config: str) -> Settings:
     return replace(shipped_settings(config), observation_correlation_time=0.0)
 
 
-def without_calibration(settings: Settings) -> Settings:
-    """Return settings that estimate neither scale, bias nor delay of the velocity."""
-    zero = (0.0, 0.0, 0.0)
-    return replace(
-        settings,
-        angular_scale_stddev=zero,
-        linear_scale_stddev=zero,
-        angular_bias_stddev=zero,
-        linear_bias_stddev=zero,
-        velocity_delay_stddev=0.0,
-    )
-
-
 def mrclam(robot: int) -> World:
     """Return a robot's run of MRCLAM 6."""
     folder = data_folder() / 'mrclam' / 'MRCLAM_Dataset6'

@@ -116,9 +116,9 @@ class EventWarnings:
             self._moved_ns = {}
             text = (
                 f'{len(lately)} landmarks seem to have moved within a minute: odometry may err by '
-                'more than is stated. Look for a bias or scale that is not estimated '
-                '(angular_bias_stddev and the like), noise that is set too small, and time '
-                'without messages (unknown_linear_motion, unknown_angular_motion)'
+                'more than is stated. Look for a bias or scale that is larger than stated, or not '
+                'estimated (angular_bias_stddev and the like), noise that is set too small, and '
+                'time without messages (unknown_linear_motion, unknown_angular_motion)'
             )
             self._warn('many_moved', text)
 

@@ -23,7 +23,7 @@ from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
 from slam_observer_ros.settings.estimator_settings import Settings
 
 PAPER_METRIC = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
@@ -52,7 +52,7 @@ class ConstantFilter(Filter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        self.calibration = Calibration(Settings(), self.axes)  # leaves the velocity as it is
+        self.calibration = Calibration(without_calibration(settings), self.axes)
         self._is_fixed = False
 
     def correct(self, residuals: Residuals) -> FloatArray:

@@ -6,6 +6,8 @@ a while to be obeyed, and an image a while to be stamped.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
@@ -124,6 +126,19 @@ class Calibration:
         self._all[self._estimated] += change
         self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)
         self.delay_ns = to_ns(float(self._all[DELAY]))
+
+
+def without_calibration(settings: Settings) -> Settings:
+    """Return settings that estimate neither scale, bias nor delay of the velocity."""
+    zero = (0.0, 0.0, 0.0)
+    return replace(
+        settings,
+        angular_scale_stddev=zero,
+        linear_scale_stddev=zero,
+        angular_bias_stddev=zero,
+        linear_bias_stddev=zero,
+        velocity_delay_stddev=0.0,
+    )
 
 
 def _moves(body_velocities: FloatArray) -> BoolArray:

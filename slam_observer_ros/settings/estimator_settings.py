@@ -212,9 +212,10 @@ class Settings(Immutable):
         minimum=0.0,
     )
     angular_bias_stddev: Vector3 = parameter(
-        (0.0, 0.0, 0.0),
+        (0.005, 0.005, 0.005),
         'Scheduled and Riccati gains: bias of the angular velocity x y z to be estimated: its '
-        'standard deviation',
+        "standard deviation; the default is that of a MEMS gyroscope's zero, or of wheels that "
+        'differ by a few thousandths; 0 for none',
         unit='rad/s',
         minimum=0.0,
     )

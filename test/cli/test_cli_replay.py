@@ -239,7 +239,17 @@ class TestReport:
         assert '…' not in values
 
     def test_without_an_unknown_calibration_none_is_reported(self, slam_observer, simulated):
-        assert slam_observer.succeed('replay', simulated, '--json').json['calibration'] == {}
+        options = ('--set', 'angular_bias_stddev=[0, 0, 0]', '--json')
+        assert slam_observer.succeed('replay', simulated, *options).json['calibration'] == {}
+
+    def test_a_bias_of_the_angular_velocity_is_reported_unasked(self, slam_observer, simulated):
+        ended = slam_observer.succeed('replay', simulated, '--json')
+        biases = {f'angular_bias_{axis}' for axis in 'xyz'}
+        assert set(ended.json['calibration']) == biases
+        assert biases <= set(slam_observer.succeed('replay', simulated).output.split())
+        constant = slam_observer.succeed('replay', simulated, '--gains', 'constant', '--json')
+        assert constant.json['calibration'] == {}
+        assert 'No effect' not in constant.errors
 
 
 class TestPoints:

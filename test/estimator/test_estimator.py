@@ -450,6 +450,7 @@ def test_what_is_unknown_of_a_gap_begins_where_it_leaves_the_robot():
         linear_velocity_noise=(0.0, 0.0, 0.0),
         unknown_angular_motion=np.sqrt(turn_variance),
         unknown_linear_motion=density,
+        angular_bias_stddev=(0.0, 0.0, 0.0),
     )
     estimator = Estimator(settings)
     for event in (velocity(0.0, [0, 0, 0, 4, 0, 0]), observation(2.0, [])):  # a second is unknown
@@ -642,6 +643,7 @@ def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):
         'gain_k': 2.0,
     }
     Estimator(Settings(gains='riccati', **asked))
+    Estimator(Settings(gains='constant'))
     assert not caplog.records
     Estimator(Settings(gains='riccati', gain_l=2.0, step_mode='paper'))
     assert caplog.messages == ['No effect on riccati gains: gain_l, step_mode.']

@@ -11,8 +11,13 @@ from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import Settings
 
-PLAIN = Settings(huber_threshold=0.0, rejection_threshold=1e9, relinearization_interval=0)
-"""No robustness, no relinearising: a plain filter."""
+PLAIN = Settings(
+    huber_threshold=0.0,
+    rejection_threshold=1e9,
+    relinearization_interval=0,
+    angular_bias_stddev=(0.0, 0.0, 0.0),
+)
+"""No robustness, no relinearising, no calibration: a plain filter."""
 
 DT_S = 0.1
 """Time between two observations of each landmark."""

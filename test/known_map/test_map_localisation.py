@@ -177,7 +177,10 @@ def test_the_velocitys_scale_is_estimated_in_a_map_that_is_known(mode):
     """As without one; in a fixed map, too."""
     world = World(3, is_planar=True)
     settings = world.settings(
-        localization_mode=mode, linear_scale_stddev=(0.2, 0.0, 0.0), relinearization_interval=0
+        localization_mode=mode,
+        linear_scale_stddev=(0.2, 0.0, 0.0),
+        angular_bias_stddev=(0.0, 0.0, 0.0),
+        relinearization_interval=0,
     )
     estimator = Estimator(settings)
     estimator.load_map(world.map(sigma_m=0.001), world.pose(0.0))

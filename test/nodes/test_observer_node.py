@@ -172,6 +172,7 @@ def test_outputs_follow_the_parameters_and_carry_true_stamps(ros, tmp_path):
         'base_frame': 'robot',
         'publish_tf': False,
         'landmarks_type': 'PointCloud',
+        'angular_bias_stddev': [0.0, 0.0, 0.0],
     }
     arguments = ('-r', '__ns:=/fresh')
     with (

@@ -22,6 +22,8 @@ from slam_observer_ros.sensor_models.calibration import Calibration, MIN_DELAY_S
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
+NO_BIAS = (0.0, 0.0, 0.0)
+
 EVERYTHING = Settings(
     angular_scale_stddev=(0.1, 0.1, 0.1),
     linear_scale_stddev=(0.1, 0.1, 0.1),
@@ -34,6 +36,7 @@ WHEELS = Settings(
     two_d_mode=True,
     angular_scale_stddev=(0.0, 0.0, 0.1),
     linear_scale_stddev=(0.1, 0.0, 0.0),
+    angular_bias_stddev=NO_BIAS,
 )
 WHEEL_SCALE = np.array([1.0, 1.0, 0.95, 1.05, 1.0, 1.0])
 
@@ -114,6 +117,7 @@ def test_a_delay_is_found_as_well_as_its_covariance_says(
         two_d_mode=two_d_mode,
         angular_velocity_noise=(0.005, 0.005, 0.005),
         velocity_delay_stddev=0.2,
+        angular_bias_stddev=NO_BIAS,
         relinearization_interval=relinearization_interval,
     )
     normalised_squared = []
@@ -159,7 +163,10 @@ def test_a_velocity_stamped_late_shows_as_a_negative_delay():
 
 def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
     settings = Settings(
-        two_d_mode=True, angular_velocity_noise=(0.0, 0.0, 0.005), velocity_delay_stddev=0.2
+        two_d_mode=True,
+        angular_velocity_noise=(0.0, 0.0, 0.005),
+        velocity_delay_stddev=0.2,
+        angular_bias_stddev=NO_BIAS,
     )
     for seed in range(4):
         estimator = estimate(drive(settings, 60.0, seed, delay_ns=-200_000_000), settings)
@@ -168,7 +175,9 @@ def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
 
 
 def test_a_delay_stays_within_what_is_made_up_for():
-    calibration = Calibration(Settings(velocity_delay_stddev=0.1), PLANAR)
+    calibration = Calibration(
+        Settings(velocity_delay_stddev=0.1, angular_bias_stddev=NO_BIAS), PLANAR
+    )
     for change_s, limit_s in ((-5.0, MIN_DELAY_S), (10.0, MAX_DELAY_S)):
         calibration.shift(np.array([change_s]))
         assert calibration.delay_ns == round(limit_s * 1e9)
@@ -185,7 +194,7 @@ def test_the_velocity_that_is_reported_is_the_one_that_moves_the_pose():
 
 def test_at_constant_velocity_nobody_can_know_the_delay():
     """Not even at the start, where no velocity is known yet."""
-    settings = Settings(two_d_mode=True, velocity_delay_stddev=0.2)
+    settings = Settings(two_d_mode=True, velocity_delay_stddev=0.2, angular_bias_stddev=NO_BIAS)
     world = drive(settings, 5.0)
     velocity = world.events[0].body_velocity
     estimator = Estimator(settings)
@@ -202,6 +211,7 @@ def test_a_robot_at_rest_again_is_where_its_velocities_say_whatever_their_delay(
         angular_velocity_noise=(0.0, 0.0, 0.0),
         linear_velocity_noise=(0.0, 0.0, 0.0),
         velocity_delay_stddev=0.2,
+        angular_bias_stddev=NO_BIAS,
         reorder_window=0.0,
     )
     rng = np.random.default_rng(0)
@@ -239,11 +249,73 @@ def test_calibration_makes_the_map_better_where_the_wheels_are_off(gains):
 @pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_without_stated_errors_nothing_is_estimated(gains, two_d_mode):
-    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+    settings = Settings(gains=gains, two_d_mode=two_d_mode, angular_bias_stddev=NO_BIAS)
     estimator = estimate(drive(settings, 10.0, scale=WHEEL_SCALE), settings)
     V = true_velocities(5, planar=False)
     np.testing.assert_array_equal(estimator._state.filter.calibration.apply(V), V)
     assert estimator._state.filter.calibration.delay_ns == 0
+
+
+def rms_error_and_moved(settings, worlds):
+    """Configuration error of some runs, and how many landmarks were taken to have moved."""
+    runs = [(estimate(world, settings), world) for world in worlds]
+    errors_m = [configuration_error_m(estimator, world) for estimator, world in runs]
+    moved = sum(estimator.counts['moved_landmark'] for estimator, _ in runs)
+    return np.sqrt(np.mean(np.square(errors_m))), moved
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_a_small_yaw_bias_is_estimated_unasked(gains):
+    settings = Settings(gains=gains, two_d_mode=True)
+    bias = np.array([0.0, 0.0, 0.001, 0.0, 0.0, 0.0])
+    worlds = [drive(settings, 60.0, seed, noise=0.0, bias=bias) for seed in range(2)]
+    error_m, moved = rms_error_and_moved(settings, worlds)
+    left_alone = replace(settings, angular_bias_stddev=NO_BIAS)
+    assert error_m < 0.5 * rms_error_and_moved(left_alone, worlds)[0]
+    assert moved == 0
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+def test_a_precise_robot_does_not_take_its_yaw_bias_for_moved_landmarks(gains):
+    settings = Settings(
+        gains=gains,
+        two_d_mode=True,
+        angular_velocity_noise=(0.001, 0.001, 0.001),
+        linear_velocity_noise=(0.005, 0.005, 0.005),
+        range_noise=0.02,
+        bearing_noise=0.005,
+    )
+    bias = np.array([0.0, 0.0, 0.005, 0.0, 0.0, 0.0])
+    worlds = [drive(settings, 60.0, seed, seen=2, bias=bias) for seed in range(2)]
+    error_m, moved = rms_error_and_moved(settings, worlds)
+    left_alone = replace(settings, angular_bias_stddev=NO_BIAS)
+    error_left_m, moved_left = rms_error_and_moved(left_alone, worlds)
+    assert error_m < 0.25 * error_left_m
+    assert moved == 0 < moved_left
+
+
+@pytest.mark.parametrize('gains', ['scheduled', 'riccati'])
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_where_there_is_no_bias_estimating_it_costs_next_to_nothing(gains, two_d_mode):
+    settings = Settings(gains=gains, two_d_mode=two_d_mode)
+    worlds = [drive(settings, 60.0, seed) for seed in range(6)]
+    error_m, moved = rms_error_and_moved(settings, worlds)
+    left_alone = replace(settings, angular_bias_stddev=NO_BIAS)
+    assert error_m < 1.01 * rms_error_and_moved(left_alone, worlds)[0]
+    assert moved == 0
+
+
+def test_constant_gains_estimate_none_of_them():
+    for settings in (Settings(), EVERYTHING):
+        estimator = estimate(drive(settings, 10.0), with_gains(settings, 'constant'))
+        assert estimator.calibration == []
+
+
+@pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 3), (PLANAR, 1)])
+def test_nothing_but_a_bias_of_the_angular_velocity_is_estimated_unasked(axes, count):
+    calibration = Calibration(Settings(), axes)
+    names = [part.name for part in calibration.estimates(np.ones(count))]
+    assert names == [f'angular_bias_{axis}' for axis in 'xyz'[3 - count :]]
 
 
 @pytest.mark.parametrize(('axes', 'count'), [(SPATIAL, 13), (PLANAR, 7)])
