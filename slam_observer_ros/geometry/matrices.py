@@ -41,7 +41,8 @@ def solve(S: FloatArray, right: FloatArray) -> FloatArray:
 def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
     """Kalman update of P, in place, in Joseph's form; return the gain K = P Cᵀ S⁻¹.
 
-    That is (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, with S = C P Cᵀ + R: P stays positive.
+    That is (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, with S = C P Cᵀ + R: P stays positive
+    but for rounding.
     """
     K: FloatArray = solve(S, CP).T
     half = K @ (0.5 * S @ K.T - CP)
