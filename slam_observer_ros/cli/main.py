@@ -15,10 +15,10 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
-    from slam_observer_ros import __version__
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
     from slam_observer_ros.common.errors import LossError, SlamObserverError
     from slam_observer_ros.common.threads import use_one_thread
+    from slam_observer_ros.common.version import VERSION
     from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2
@@ -71,7 +71,7 @@ def make_parser() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
+    parser.add_argument('--version', action='version', version=f'{PROGRAM} {VERSION}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for command in (simulate, convert, replay):
         command.add_parser(commands)

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from slam_observer_ros import __version__
 from slam_observer_ros.common.errors import MapError, shown, YamlError
 from slam_observer_ros.common.output_files import destination, keep_copy, unfinished_file
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.common.yaml_files import (
     constructed,
     FAST_LOADER,
@@ -82,7 +82,7 @@ def write_map(
         'format': FORMAT,
         'version': FORMAT_VERSION,
         'frame': landmark_map.frame_id,
-        'package_version': __version__,
+        'package_version': VERSION,
         'settings': {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(settings).items()
