@@ -87,18 +87,18 @@ class SalvagedSource:
         self._set_topics(counts)
 
     def _set_topics(self, counts: Counter[int]) -> None:
+        # Several channels may be of one topic.
+        keys = {
+            number: (channel.topic, channel.message_type)
+            for number, channel in self._channels.items()
+            if counts[number] and number not in self.other_encodings
+        }
         of_topic: Counter[tuple[str, str]] = Counter()
-        for number, channel in self._channels.items():
-            if number not in self.other_encodings and counts[number]:
-                of_topic[channel.topic, channel.message_type] += counts[number]
+        for number, key in keys.items():
+            of_topic[key] += counts[number]
         topics = {key: Topic(*key, count) for key, count in of_topic.items()}
         self.topics = tuple(topics.values())
-        self._topic_of = {
-            number: topics[channel.topic, channel.message_type]
-            for number, channel in self._channels.items()
-            if (channel.topic, channel.message_type) in topics
-            and number not in self.other_encodings
-        }
+        self._topic_of = {number: topics[key] for number, key in keys.items()}
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
