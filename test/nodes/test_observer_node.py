@@ -78,6 +78,7 @@ def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
     maps = ros.collect(PointCloud2, '/replayed/map', LATCHED_QOS)
     # A wide window, since a busy machine may deliver one topic well before the other.
     parameters = {'reorder_window': 1.0, 'publish_rate': 200.0, 'queue_depth': 1000}
+    parameters['landmarks_max_wait'] = 60.0
     parameters |= {'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
     arguments = ('-r', '__ns:=/replayed')
     with (
