@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.nodes.entities import Entities
@@ -33,6 +34,9 @@ OVERVIEW_PERIOD_S = 0.5
 DIAGNOSTICS_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
 RETRY_PERIOD_S = 0.02
+
+MOTION_INPUTS = ('twist', 'imu')
+"""Inputs that are cheap to use, and move the estimate on to the present."""
 
 CLOCK_JITTER_NS = 100_000_000
 """/clock may step back by less without having jumped, nanoseconds: messages are then just late."""
@@ -57,7 +61,9 @@ class ObserverCore:
             node, settings, self._estimator, BaseFrame(settings, self._transforms)
         )
         self._publisher = EstimatePublisher(node, settings, self._estimator, self._transforms)
+        self._feed.on_events = self._publish_if_due
         self._inputs = open_inputs(node, settings, self._feed)
+        self._is_catching_up = False
         _refuse_own_outputs(node, self._inputs)
         self._diagnostics = DiagnosticsPublisher(
             node, self._estimator, self._feed, self._inputs, self._publisher
@@ -125,6 +131,17 @@ class ObserverCore:
                 *((CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
             )
         ]
+
+    def _publish_if_due(self) -> None:
+        """Publish what is new once the velocities that wait are used, so that it is not old."""
+        if self._is_catching_up or not self._publisher.is_due:
+            return
+        self._is_catching_up = True  # their events come here, too
+        for source in self._inputs:
+            if source.name in MOTION_INPUTS:
+                source.read_until(MAX_STAMP_NS)
+        self._is_catching_up = False
+        self._publisher.publish_state()
 
     def _publish_state(self) -> None:
         self._publisher.publish_state()

@@ -68,7 +68,8 @@ class Settings(Immutable):
     )
     reorder_window: float = parameter(
         0.05,
-        'How long events are held back to be put in stamp order',
+        'How long events are held back to be put in stamp order, at most: after the first 10 s '
+        'twice as long as any was late in the last 10 s',
         unit='s',
         minimum=0.0,
         maximum=10.0,

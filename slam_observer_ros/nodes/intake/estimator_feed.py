@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 import time
 
@@ -47,6 +47,8 @@ class EstimatorFeed:
     ----------
     dropped : Counter
         Messages that did not become events, by reason.
+    on_events : callable
+        Called after events were used.
     clocks : dict of str to ClockOffset
         How far off the stamps are, by input.
     is_active : bool
@@ -83,6 +85,7 @@ class EstimatorFeed:
         self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
         self.is_active = False
         self.is_paused = False
+        self.on_events: Callable[[], None] = lambda: None
 
     def add(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Take what an input measures; without a stamp it has that of its reception."""
@@ -146,6 +149,8 @@ class EstimatorFeed:
             self._estimator.add(event)
             self._processing_s += time.perf_counter() - start_s
             self._processed += 1
+        if events:
+            self.on_events()
 
     def _in_own_time(self, event: Event) -> Event:
         stamp_ns = event.stamp_ns

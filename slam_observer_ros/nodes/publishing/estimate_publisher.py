@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+import time
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -26,6 +27,10 @@ from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
 """Topics of the estimate, before remapping."""
 
+EARLY = 0.5
+"""Part of the period by which a state may come early, so that one of an input of the same rate,
+which jitters, is never left for the next."""
+
 PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
 
@@ -48,6 +53,8 @@ class EstimatePublisher:
         self._node = node
         self._settings = settings
         self._estimator = estimator
+        self._period_s = 1.0 / settings.publish_rate
+        self._due_s = 0.0  # when the next state may be published, by a steady clock
         self._fast_stamp_ns: int | None = None
         self._slow_stamp_ns: int | None = None
         self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
@@ -70,13 +77,21 @@ class EstimatePublisher:
         """Why the transform is not published as it should be; empty while it is."""
         return '' if self._broadcaster is None else self._broadcaster.problem
 
+    @property
+    def is_due(self) -> bool:
+        """Whether ``publish_rate`` allows to publish a state now."""
+        return time.monotonic() >= self._due_s - EARLY * self._period_s
+
     def publish_state(self) -> None:
-        """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
+        """Publish odometry, pose, transform, Lyapunov value and landmarks if new and due."""
         if self._broadcaster is not None:
             self._broadcaster.retry()
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns in (None, self._fast_stamp_ns) or not self._estimator.is_localised:
+        if stamp_ns is None or stamp_ns == self._fast_stamp_ns or not self.is_due:
             return
+        if not self._estimator.is_localised:
+            return
+        self._due_s = max(self._due_s, time.monotonic()) + self._period_s
         self._fast_stamp_ns = stamp_ns
         pose = self._estimator.pose
         self._publish_pose(stamp_ns, pose)
