@@ -373,6 +373,23 @@ class Estimator:
         return np.zeros(6) if velocity is None else self._state.filter.calibration.apply(velocity)
 
     @property
+    def body_velocity_covariance(self) -> FloatArray | None:
+        """(6, 6) covariance of :attr:`body_velocity`, as stated with it or as the settings say.
+
+        That of no velocity is what the robot may do then. None before there are two messages.
+        """
+        held = self._timeline.velocity_in_force
+        if held is None:
+            return None
+        known, axes = self._state.filter, self._state.filter.axes
+        measured = self._state.motion_noise.velocity_covariance(held)
+        return known.calibration.apply_to_covariance(
+            axes.full_pose_covariance(measured[axes.pose, axes.pose]),
+            held.body_velocities[0],
+            known.calibration_variances,
+        )
+
+    @property
     def velocity_is_stale(self) -> bool:
         """Whether no velocity was in force at ``stamp_ns``, so that the pose is being held."""
         return self._timeline.body_velocity is None

@@ -11,6 +11,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
@@ -116,6 +117,11 @@ class Timeline:
     def body_velocity(self) -> FloatArray | None:
         """(6,) velocity (Ω, v) in force at ``stamp_ns``; None if none is or it has timed out."""
         return None if self.stamp_ns is None else self.velocities.latest(self.stamp_ns)
+
+    @property
+    def velocity_in_force(self) -> HeldVelocities | None:
+        """As :meth:`.VelocityHistory.in_force` at ``stamp_ns``; None before the first event."""
+        return None if self.stamp_ns is None else self.velocities.in_force(self.stamp_ns)
 
     @property
     def lead_s(self) -> float:

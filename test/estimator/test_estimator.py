@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.association.hypotheses import Hypotheses
@@ -1265,3 +1265,38 @@ def test_no_map_that_can_not_be_right_is_taken(changes, reason):
     with pytest.raises(MapError, match=reason):
         estimator.load_map(replace(good, **changes))
     assert estimator.is_localised
+
+
+def stated(stamp_s, body_velocity, covariance):
+    return replace(velocity(stamp_s, body_velocity), covariance=covariance)
+
+
+def test_a_velocity_has_the_covariance_that_came_with_it():
+    covariance = np.diag([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]) ** 2
+    covariance[2, 3] = covariance[3, 2] = 0.01
+    events = [stated(0.1 * k, BODY_VELOCITY, covariance) for k in range(5)]
+    assert_allclose(run(events, reorder_window=0.0).body_velocity_covariance, covariance)
+    planar = run(events, reorder_window=0.0, two_d_mode=True).body_velocity_covariance
+    assert_allclose(planar[2:5, 2:5], covariance[2:5, 2:5])
+    assert np.count_nonzero(planar) == 5, 'exactly zero out of the plane'
+
+
+def test_a_velocity_without_covariance_has_what_the_settings_say_of_one_message():
+    events = [velocity(0.1 * k) for k in range(5)]
+    settings = {'linear_velocity_noise': (0.2, 0.3, 0.4), 'reorder_window': 0.0}
+    assert run(events[:1], **settings).body_velocity_covariance is None
+    covariance = run(events, **settings).body_velocity_covariance
+    assert_allclose(np.sqrt(np.diag(covariance)[3:] * 0.1), [0.2, 0.3, 0.4])
+    settings |= {'velocity_timeout': 0.5, 'unknown_linear_motion': 5.0}
+    silent = run([*events, observation(3.0, [1])], **settings)
+    assert silent.velocity_is_stale
+    assert_allclose(np.sqrt(np.diag(silent.body_velocity_covariance)[3:] * 0.1), 5.0)
+
+
+def test_the_covariance_of_a_velocity_is_calibrated_as_the_velocity_is():
+    settings = {'linear_scale_error': (0.1, 0.0, 0.0), 'linear_bias_error': (0.0, 0.2, 0.0)}
+    covariance, speed = np.diag(np.full(6, 0.01)), np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0])
+    events = [stated(0.1 * k, speed, covariance) for k in range(5)]
+    estimator = run(events, reorder_window=0.0, **settings)
+    variances = np.diag(estimator.body_velocity_covariance)[3:]
+    assert_allclose(variances, [0.01 + (0.1 * 3.0) ** 2, 0.01 + 0.2**2, 0.01])

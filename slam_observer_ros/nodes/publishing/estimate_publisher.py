@@ -21,7 +21,7 @@ from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
-from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
+from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
@@ -60,7 +60,7 @@ class EstimatePublisher:
         self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
         self._path_stamp_ns: int | None = None
         self._odometry = node.create_publisher(Odometry, 'odometry', RELIABLE_QOS)
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', RELIABLE_QOS)
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', LATCHED_POSE_QOS)
         self._lyapunov = node.create_publisher(Float64, 'lyapunov', RELIABLE_QOS)
         self._estimates = node.create_publisher(PointCloud, 'landmark_estimates', RELIABLE_QOS)
         self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
@@ -144,14 +144,17 @@ class EstimatePublisher:
     def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
         header = MESSAGES.header(stamp_ns, self._settings.map_frame)
         uncertain = MESSAGES.pose_with_covariance(pose, self._estimator.pose_covariance)
-        twist = MESSAGES.twist_with_covariance(self._estimator.body_velocity, None)
+        estimator = self._estimator
+        uncertain_twist = MESSAGES.twist_with_covariance(
+            estimator.body_velocity, estimator.body_velocity_covariance
+        )
         self._pose.publish(PoseWithCovarianceStamped(header=header, pose=uncertain))
         self._odometry.publish(
             Odometry(
                 header=header,
                 child_frame_id=self._settings.base_frame,
                 pose=uncertain,
-                twist=twist,
+                twist=uncertain_twist,
             )
         )
 
