@@ -141,6 +141,7 @@ class ObserverCore:
             if source.name in MOTION_INPUTS:
                 source.read_until(MAX_STAMP_NS)
         self._is_catching_up = False
+        self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
         self._publisher.publish_state()
 
     def _publish_state(self) -> None:

@@ -40,9 +40,10 @@ class ObserverNodeSettings(InputSettings):
         maximum=60.0,
     )
     transform_tolerance: float = parameter(
-        0.1,
+        1.0,
         'How far map_frame to odom_frame is post-dated beyond reorder_window, to hold until the '
-        'next one: three periods of twist',
+        'next one, on a busy machine too; others see a correction that much later, and the motion '
+        'at once, from odom_frame',
         unit='s',
         minimum=0.0,
         maximum=10.0,

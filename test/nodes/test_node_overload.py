@@ -9,13 +9,14 @@ from nav_msgs.msg import Odometry
 from node_processes import running
 import numpy as np
 import pytest
-from robots import Robot, stamp_ns
+from robots import own_topics, Robot, stamp_ns, TransformSender
 
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.nodes.intake.load_shedding import LoadShedding, Waiting
+from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 
 pytestmark = pytest.mark.ros
 
@@ -74,7 +75,7 @@ def test_what_would_keep_up_is_said_while_many_are_dropped():
     assert not shedding.problem('/tags', 20.0)
 
 
-def drive(ros, robot, duration_s, count):
+def drive(ros, robot, duration_s, count, on_velocity=lambda stamp_ns: None):
     """Send 100 velocities a second, and 30 clouds; return the number of velocities."""
     rng, start_ns = np.random.default_rng(0), time.time_ns()
     world, ids = rng.uniform(-10.0, 10.0, (count, 3)), np.arange(count)
@@ -84,6 +85,7 @@ def drive(ros, robot, duration_s, count):
         ros.spin_for((start_ns + after_ns - time.time_ns()) * 1e-9)
         if is_velocity:
             robot.send(VelocityEvent(start_ns + after_ns, V))
+            on_velocity(start_ns + after_ns)
             continue
         points = se3.transform(se3.inverse(se3.exp(V * after_ns * 1e-9)), world)
         points += rng.normal(0.0, 0.03, points.shape)
@@ -115,3 +117,29 @@ def test_an_overloaded_node_drops_landmarks_and_its_output_stays_new(ros, tmp_pa
     assert np.median(ages_s) < 0.2
     assert int(values()['dropped: overload']) > 30
     assert 'dropped: too_late' not in values()
+
+
+def test_map_to_odom_is_never_in_the_past_while_the_node_is_loaded(ros, tmp_path):
+    if TFMessage is None:
+        pytest.skip('tf2_msgs is not installed')
+    newest_ns, left_s = [], []
+
+    def receive(message):
+        newest_ns.extend(stamp_ns(t) for t in message.transforms if t.header.frame_id == 'map')
+
+    ros.node.create_subscription(TFMessage, '/driven/tf', receive, 100)
+    sender = TransformSender(ros, '/driven')
+    with (
+        running('observer_node', tmp_path / 'log', *own_topics('/driven')),
+        Robot(ros, namespace='/driven') as robot,
+    ):
+        ros.wait_for_subscriber(sender.dynamic)
+
+        def send_odometry(stamp):
+            sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=stamp)
+            if newest_ns:
+                left_s.append((newest_ns[-1] - time.time_ns()) * 1e-9)
+
+        drive(ros, robot, duration_s=5.0, count=200, on_velocity=send_odometry)
+    assert len(left_s) > 200
+    assert min(left_s) > 0.0

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import re
+from typing import Protocol
 
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.subscription import Subscription
 from rclpy.time import Time
 
 from slam_observer_ros.common.errors import MessageError, TransformError
@@ -27,6 +29,13 @@ TF_QOS = QoSProfile(depth=100)
 TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+class LiveTransforms(TransformSource, Protocol):
+    """Transforms that come in while a node runs."""
+
+    def read_waiting(self) -> None:
+        """Take what has come on /tf: while the node was busy, it may be a lot."""
+
+
 class TopicTransforms:
     """A listener of /tf and /tf_static of our own; without tf2_msgs no transform is ever known.
 
@@ -43,11 +52,17 @@ class TopicTransforms:
         self.newest_ns = self._buffer.newest_ns
         self.parent_of = self._buffer.parent_of
         self.clear = self._buffer.clear
+        self._dynamic: Subscription | None = None
         if TFMessage is not None:
-            self._subscribe('/tf', TF_QOS, is_static=False)
+            self._dynamic = self._subscribe('/tf', TF_QOS, is_static=False)
             self._subscribe('/tf_static', TF_STATIC_QOS, is_static=True)
 
-    def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> None:
+    def read_waiting(self) -> None:
+        """As :meth:`LiveTransforms.read_waiting`."""
+        if self._dynamic is not None:
+            _read_waiting(self._dynamic)
+
+    def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> Subscription:
         def receive(raw: bytes) -> None:
             try:
                 transforms = decode_transforms(raw)
@@ -57,7 +72,7 @@ class TopicTransforms:
             others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
             insert_transforms(self._buffer, others, is_static=is_static)
 
-        self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
+        return self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
 
 
 class Tf2Transforms:
@@ -79,6 +94,10 @@ class Tf2Transforms:
             np.array([position.x, position.y, position.z]), np.array([q.x, q.y, q.z, q.w])
         )
 
+    def read_waiting(self) -> None:
+        """As :meth:`LiveTransforms.read_waiting`."""
+        _read_waiting(self._listener.tf_sub)
+
     def parent_of(self, frame: str) -> str | None:
         """As :meth:`TransformSource.parent_of`."""
         # Not by a YAML parser: a frame's name may be what that takes for an alias.
@@ -98,7 +117,17 @@ class Tf2Transforms:
         return newest_ns or ALWAYS_NS  # tf2 has zero for what is static
 
 
-def open_transforms(node: Node, own: tuple[str, str]) -> TransformSource:
+def _read_waiting(subscription: Subscription) -> None:
+    """Give a subscription's callback what waits, which an executor does one by one."""
+    for _ in range(TF_QOS.depth):
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return
+        subscription.callback(taken[0])
+
+
+def open_transforms(node: Node, own: tuple[str, str]) -> LiveTransforms:
     """Return tf2_ros's buffer where ROS provides it, else :class:`TopicTransforms`."""
     # tf2 keeps the parent of each stamp, so that one does not replace another.
     return TopicTransforms(node, own) if tf2_ros is None else Tf2Transforms(node)
