@@ -249,7 +249,7 @@ class Estimator:
         is untouched. The event's arrays are not copied: don't change them any more.
         """
         try:
-            check_event(event)
+            check_event(event, self.settings)
             jumped = self._queue.push(event)
         except InvalidEventError as error:
             self._drop(error)

@@ -90,6 +90,23 @@ class Settings(Immutable):
         minimum=0.1,
         maximum=1e9,
     )
+    max_linear_velocity: float = parameter(
+        100.0,
+        'Greatest speed that a message is believed: beyond it the velocity is refused (too_fast)',
+        unit='m/s',
+        minimum=1e-3,
+        maximum=1e6,
+        read_only=False,
+    )
+    max_angular_velocity: float = parameter(
+        50.0,
+        'Greatest rate of turn that a message is believed: beyond it the velocity is refused '
+        '(too_fast)',
+        unit='rad/s',
+        minimum=1e-3,
+        maximum=1e6,
+        read_only=False,
+    )
     on_time_jump: str = parameter(
         'reset',
         'What happens when the clock jumps, as in a recording that is looped: reset forgets the '

@@ -605,15 +605,55 @@ def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason,
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 @pytest.mark.parametrize('dtype', [np.float64, np.float32])
 def test_what_is_as_large_as_may_be_is_taken_and_what_is_larger_refused(sign, dtype):
+    settings = Settings(max_linear_velocity=MAX_MEASURED, max_angular_velocity=MAX_MEASURED)
     for size, is_taken in ((MAX_MEASURED, True), (1.001 * MAX_MEASURED, False)):
         entries = np.array([0.0, sign * size, 0.0], dtype=dtype)
-        estimator, ids = Estimator(Settings()), np.array([1])
+        estimator, ids = Estimator(settings), np.array([1])
         assert estimator.add(VelocityEvent(START_NS, np.tile(entries, 2))) == is_taken
         assert estimator.add(ObservationEvent(START_NS, ids, entries[None])) == is_taken
         velocities = entries[None] * np.ones((1, 3), dtype=dtype)
         moving = ObservationEvent(START_NS + 1, ids, np.ones((1, 3)), None, velocities)
         assert estimator.add(moving) == is_taken
         assert estimator.dropped == ({} if is_taken else {'too_large': 3})
+
+
+def test_a_velocity_that_no_robot_has_is_refused_counted_and_named(caplog):
+    fast, turning = np.zeros(6), np.zeros(6)
+    fast[4], turning[2] = -500.0, 60.0
+    estimator, untouched = Estimator(Settings()), Estimator(Settings())
+    for good in drive():
+        assert estimator.add(good)
+        untouched.add(good)
+    stamp_ns = estimator.newest_stamp_ns + 1
+    assert not estimator.add(VelocityEvent(stamp_ns, fast))
+    assert not estimator.add(VelocityEvent(stamp_ns, turning))
+    assert not estimator.add(AngularVelocityEvent(stamp_ns, turning[:3]))
+    assert estimator.dropped == {'too_fast': 3}
+    assert 'a velocity of 500.0 m/s is beyond max_linear_velocity (100 m/s)' in caplog.text
+    estimator.flush()
+    untouched.flush()
+    assert_same_state(estimator, untouched)
+    settings = Settings(max_linear_velocity=600.0, max_angular_velocity=61.0)
+    assert Estimator(settings).add(VelocityEvent(stamp_ns, fast + turning))
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('size', [1e155, -1e300, 1.7e308, np.inf, np.nan])
+def test_numbers_that_are_too_large_are_refused_without_a_warning_of_numpy(size):
+    huge, ids, points = np.full((6, 6), size), np.array([1]), np.ones((1, 3))
+    skew = np.triu(huge) - np.tril(huge, -1)
+    estimator = Estimator(Settings())
+    for event in (
+        VelocityEvent(START_NS, huge[0]),
+        AngularVelocityEvent(START_NS, huge[0, :3]),
+        ObservationEvent(START_NS, ids, huge[:1, :3]),
+        ObservationEvent(START_NS, ids, points, None, huge[:1, :3]),
+    ):
+        assert not estimator.add(event)
+    assert set(estimator.dropped) <= {'too_large', 'not_finite'}
+    # Covariances that large say 'unknown'.
+    estimator.add(VelocityEvent(START_NS, np.zeros(6), skew))
+    estimator.add(ObservationEvent(START_NS, ids, points, skew[None, :3, :3]))
 
 
 @pytest.mark.parametrize('gains', GAINS)
