@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -149,8 +149,13 @@ class ObserverCore:
         if self._feed.is_paused:
             self._publisher.repeat_transform()
 
-    def _on_clock_jump(self, _jump: object) -> None:
+    def _on_clock_jump(self, jump: TimeJump) -> None:
+        """Use what still waits of the run that has ended, and then what has come of the next."""
+        self._feed.begin_clock_jump(-jump.delta.nanoseconds)
+        for source in self._inputs:
+            source.read_until(MAX_STAMP_NS)
         self._estimator.handle_clock_jump()
+        self._feed.end_clock_jump()
 
     def _on_estimator_jump(self) -> None:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""

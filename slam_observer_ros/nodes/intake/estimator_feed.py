@@ -28,6 +28,7 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_problem
+from slam_observer_ros.nodes.intake.clock_change import ClockChange
 from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -74,6 +75,7 @@ class EstimatorFeed:
             estimator.settings.velocity_timeout,
             self._drop_measured,
         )
+        self._change = ClockChange()
         self._log = ThrottledLog(node)
         self._processing_s = 0.0
         self._processed = 0
@@ -89,6 +91,28 @@ class EstimatorFeed:
 
     def add(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Take what an input measures; without a stamp it has that of its reception."""
+        if self.is_active and self._is_simulated:
+            timed = with_receive_time(measured, receive_ns)
+            if self._change.hold((name, timed, receive_ns), self._usable_from_ns):
+                return
+            if self._change.is_over(timed.stamp_ns, receive_ns):
+                self.dropped['last_run'] += 1
+                return
+        self._use(name, measured, receive_ns)
+
+    def begin_clock_jump(self, back_ns: int) -> None:
+        """Use only what is of the time before /clock has jumped back, nanoseconds, until the end.
+
+        What is of the time since is kept.
+        """
+        self._change.begin(back_ns)
+
+    def end_clock_jump(self) -> None:
+        """Use what has been kept."""
+        for received in self._change.end():
+            self._use(*received)
+
+    def _use(self, name: str, measured: Measured, receive_ns: int) -> None:
         timed = with_receive_time(measured, receive_ns)
         if not self._is_usable(name, timed.stamp_ns, receive_ns):
             return
@@ -113,7 +137,9 @@ class EstimatorFeed:
             self.add_observation(each, receive_ns)
 
     def retry(self) -> None:
-        """Try again what waits for a transform; call it often."""
+        """Try again what waits for a transform, or for /clock to jump; call it often."""
+        for received in self._change.take_overdue():
+            self._use(*received)
         self._give(self._builder.retry(time.monotonic_ns()))
 
     def clear(self) -> None:
@@ -131,6 +157,13 @@ class EstimatorFeed:
             for name, clock in self.clocks.items()
             if clock.is_off
         ]
+
+    @property
+    def _usable_from_ns(self) -> int:
+        """Stamp before which an event is refused as too late, nanoseconds."""
+        settings = self._estimator.settings
+        reach_ns = to_ns(settings.reorder_window + settings.late_limit)
+        return (self._estimator.newest_stamp_ns or 0) - reach_ns
 
     @property
     def _is_simulated(self) -> bool:
