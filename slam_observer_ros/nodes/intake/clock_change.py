@@ -42,16 +42,15 @@ class ClockChange:
         self._is_jumping = False
         return self._take()
 
-    def hold(self, received: Received, usable_from_ns: int) -> bool:
+    def hold(self, received: Received, stamp_ns: int, usable_from_ns: int) -> bool:
         """Keep a message of the next run, or what may be one; return whether it is kept.
 
-        ``usable_from_ns`` is the stamp before which messages are too late.
+        ``stamp_ns`` is its stamp by /clock, ``usable_from_ns`` that before which it is too late.
         """
-        _, measured, receive_ns = received
         if self._is_jumping:
-            is_next = not self._is_before_jump(measured.stamp_ns, receive_ns)
+            is_next = not self._is_before_jump(stamp_ns, received[2])
         else:
-            is_next = measured.stamp_ns < usable_from_ns
+            is_next = stamp_ns < usable_from_ns
         if not is_next or len(self._held) >= MAX_HELD:
             return False
         if not self._held:

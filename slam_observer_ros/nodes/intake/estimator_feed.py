@@ -91,14 +91,8 @@ class EstimatorFeed:
 
     def add(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Take what an input measures; without a stamp it has that of its reception."""
-        if self.is_active and self._is_simulated:
-            timed = with_receive_time(measured, receive_ns)
-            if self._change.hold((name, timed, receive_ns), self._usable_from_ns):
-                return
-            if self._change.is_over(timed.stamp_ns, receive_ns):
-                self.dropped['last_run'] += 1
-                return
-        self._use(name, measured, receive_ns)
+        if not (self.is_active and self._is_of_another_run(name, measured, receive_ns)):
+            self._use(name, measured, receive_ns)
 
     def begin_clock_jump(self, back_ns: int) -> None:
         """Use only what is of the time before /clock has jumped back, nanoseconds, until the end.
@@ -111,6 +105,20 @@ class EstimatorFeed:
         """Use what has been kept."""
         for received in self._change.end():
             self._use(*received)
+
+    def _is_of_another_run(self, name: str, measured: Measured, receive_ns: int) -> bool:
+        """Return whether a message is of before a jump of /clock, or waits for one."""
+        is_corrected, clock = self._settings.correct_clock_offset, self.clocks[name]
+        if not self._is_simulated or (is_corrected and clock.offset_ns is None):
+            return False
+        timed = with_receive_time(measured, receive_ns)
+        stamp_ns = timed.stamp_ns + (clock.correction_ns if is_corrected else 0)
+        if self._change.hold((name, timed, receive_ns), stamp_ns, self._usable_from_ns):
+            return True
+        if self._change.is_over(stamp_ns, receive_ns):
+            self.dropped['last_run'] += 1
+            return True
+        return False
 
     def _use(self, name: str, measured: Measured, receive_ns: int) -> None:
         timed = with_receive_time(measured, receive_ns)
