@@ -134,24 +134,25 @@ class Estimator:
         self._clear_time()
         self.last_update = None
 
-    def handle_clock_jump(self) -> None:
-        """Go on after a jump of the clock, as ``on_time_jump`` says.
+    def handle_clock_jump(self, by_ns: int | None = None) -> None:
+        """Go on after a jump of the clock, by so many nanoseconds, as ``on_time_jump`` says.
 
         What is held back for late events is used before. ``reset`` starts again where the run
         began; in a loaded map where the settings say, or anywhere. ``hold`` keeps pose and map,
         and goes on from there.
         """
-        newest_ns = self.newest_stamp_ns
-        after = '' if newest_ns is None else f' after {to_s(newest_ns):.3f} s'
+        way = ''
+        if by_ns is not None:
+            way = f' {"back" if by_ns < 0 else "ahead"} by {to_s(abs(by_ns)):.3f} s'
         self.release()
         if self.settings.on_time_jump == 'reset':
             logger.warning(
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
-                after,
+                way,
             )
             self.reset(None if self._localiser.loaded else self._start_pose)
         else:
-            logger.warning('The clock has jumped%s; pose and map are held.', after)
+            logger.warning('The clock has jumped%s; pose and map are held.', way)
             self._timeline.catch_up()
             self._report_stamp()
             self._hypotheses.clear_time()
@@ -255,7 +256,7 @@ class Estimator:
             self._drop(error)
             return False
         if jumped:
-            self.handle_clock_jump()
+            self.handle_clock_jump(event.stamp_ns - (self.newest_stamp_ns or 0))
             self._queue.push(event)
         for ready in self._queue.pop_ready():
             self._process(ready)
@@ -483,11 +484,12 @@ class Estimator:
     def _process_observation(self, event: ObservationEvent) -> None:
         needs_ids = not self._state.filter.has_joint_covariance
         usable = usable_points(event, self.settings, needs_ids, self._counts, self._warnings)
+        is_late = bool(len(usable.ids)) and self._timeline.is_late(usable)
         event = self._timeline.synchronise(usable)
         outcome = self._hypotheses.observe(event)
         self._localise(outcome)
         self._counts['observation'] += 1
-        self._counts['late_observation'] += event.stamp_ns > usable.stamp_ns
+        self._counts['late_observation'] += is_late
         self._warn_of(event, outcome)
         self.last_update = self._update(event.stamp_ns, outcome)
         if self._on_update is not None:

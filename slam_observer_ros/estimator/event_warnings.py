@@ -43,7 +43,7 @@ class EventWarnings:
 
     def dropped(self, error: InvalidEventError) -> None:
         """Tell that an event is not used, and why."""
-        self._warn(error.reason, f'Dropped an event, {error.reason}: {error}')
+        self._warn(error.reason, f'Dropped a message, {error.reason}: {error}')
 
     def late_velocity(self) -> None:
         """Tell that a velocity came too late to be put in order."""

@@ -65,8 +65,14 @@ class ObserverCore:
         self._inputs = open_inputs(node, settings, self._feed)
         self._is_catching_up = False
         _refuse_own_outputs(node, self._inputs)
+        namespace = node.get_namespace()
         self._diagnostics = DiagnosticsPublisher(
-            node, self._estimator, self._feed, self._inputs, self._publisher
+            node,
+            self._estimator,
+            self._feed,
+            self._inputs,
+            self._publisher,
+            hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         # What others may do to the estimate
         self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
@@ -154,7 +160,7 @@ class ObserverCore:
         self._feed.begin_clock_jump(-jump.delta.nanoseconds)
         for source in self._inputs:
             source.read_until(MAX_STAMP_NS)
-        self._estimator.handle_clock_jump()
+        self._estimator.handle_clock_jump(jump.delta.nanoseconds)
         self._feed.end_clock_jump()
 
     def _on_estimator_jump(self) -> None:

@@ -1340,3 +1340,22 @@ def test_the_covariance_of_a_velocity_is_calibrated_as_the_velocity_is():
     estimator = run(events, reorder_window=0.0, **settings)
     variances = np.diag(estimator.body_velocity_covariance)[3:]
     assert_allclose(variances, [0.01 + (0.1 * 3.0) ** 2, 0.01 + 0.2**2, 0.01])
+
+
+def test_landmarks_that_always_come_after_their_velocities_are_counted_as_late():
+    estimator = Estimator(Settings())
+    for step in range(100):
+        estimator.add(velocity(0.05 * step))
+        if step >= 20:
+            estimator.add(observation(0.05 * step - 1.0))
+    estimator.flush()
+    assert estimator.counts['late_observation'] == estimator.counts['observation'] == 80
+
+
+@pytest.mark.parametrize(('by_s', 'text'), [(-300.0, 'back by 30'), (5000.0, 'ahead by 500')])
+def test_of_a_jump_of_the_clock_it_is_said_by_how_much_and_which_way(caplog, by_s, text):
+    estimator = Estimator(Settings())
+    for step in range(30):
+        estimator.add(velocity(400.0 + 0.05 * step + by_s * (step >= 20)))
+    assert caplog.text.count('The clock has jumped') == 1
+    assert f'The clock has jumped {text}' in caplog.text or 'back by 299' in caplog.text

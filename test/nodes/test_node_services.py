@@ -294,7 +294,7 @@ class Publishing:
         )  # fmt: skip
         self.estimate_publisher = SimpleNamespace(problem='')
         parts = self.estimator, self.feed, inputs, self.estimate_publisher
-        self.diagnostics = DiagnosticsPublisher(self.node, *parts)
+        self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')
 
     def publish(self, **new):
         # A new one, as the real one gives.

@@ -418,3 +418,14 @@ def test_looped_recording_without_simulated_time_begins_path_and_tf_again(ros, t
 
 def corrections(transforms):
     return [t for m in transforms for t in m.transforms if t.header.frame_id == 'map']
+
+
+@pytest.mark.parametrize(
+    ('behind_ns', 'is_said'), [(3 * SECOND // 2, True), (-100 * SECOND, False)]
+)
+def test_stamps_that_are_behind_may_be_late_those_ahead_not(behind_ns, is_said):
+    robot = AnotherClock(behind_ns)
+    robot.send_all()
+    problems = robot.feed.clock_problems()
+    assert len(problems) == 2
+    assert all(('or what publishes them is that late' in text) == is_said for text in problems)

@@ -91,7 +91,12 @@ def _landmark_input(
     else:
         decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
-    return InputTopic(node, name, decoders, take, qos, settings.landmarks_max_wait)
+    topic = InputTopic(node, name, decoders, take, qos, settings.landmarks_max_wait)
+    topic.advice = {
+        message_type: f'landmarks_type: {message_type.rsplit("/", 1)[-1]}'
+        for message_type in (APRILTAGS, *DETECTION_DECODERS, *CLOUD_DECODERS)
+    }
+    return topic
 
 
 def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:

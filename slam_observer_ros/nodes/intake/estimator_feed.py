@@ -235,4 +235,4 @@ class EstimatorFeed:
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
         count = self.dropped[reason]
-        self._log.warning(reason, f'dropped a message ({reason}, {count} so far): {text}')
+        self._log.warning(reason, f'Dropped a message, {reason}: {text} ({count} so far).')

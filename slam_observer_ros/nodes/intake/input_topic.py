@@ -57,6 +57,8 @@ class InputTopic(Generic[MessageT]):
         Messages so far, and those that could not be decoded.
     shedding : LoadShedding
         What is dropped, and how much was, as they come faster than they can be used.
+    advice : mapping of str to str
+        Which parameter would make other message types that may be found be read.
     read_first : sequence of InputTopic
         Other inputs, of which what was received before a message of this one is read before it.
         An executor reads one message of each topic in turn, so after the node was busy a slow
@@ -78,6 +80,7 @@ class InputTopic(Generic[MessageT]):
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
+        self.advice: Mapping[str, str] = {}
         self.read_first: Sequence[InputTopic[Any]] = ()
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
@@ -114,6 +117,8 @@ class InputTopic(Generic[MessageT]):
         if age_s > DISCOVERY_S:
             return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
         now_s = time.monotonic()
+        if doubt := getattr(self._decoders.get(self._type_name), 'problem', ''):
+            return str(doubt)
         return self.shedding.problem(self.topic, now_s) or self.backlog.problem(self.topic, now_s)
 
     def check_publishers(self) -> None:
@@ -211,7 +216,8 @@ class InputTopic(Generic[MessageT]):
             return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
         if not usable:
             found = ', '.join(sorted({publisher.topic_type for publisher in publishers}))
-            return f"'{self.topic}' carries {found}; {wanted} is needed"
+            hint = ''.join(f'; set {self.advice[t]}' for t in self.advice if t in found)
+            return f"'{self.topic}' carries {found}; {wanted} is needed{hint}"
         for publisher in publishers:
             compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
             if compatibility == QoSCompatibility.ERROR:

@@ -39,8 +39,10 @@ class DiagnosticsPublisher:
         feed: EstimatorFeed,
         inputs: Sequence[InputTopic[Any]],
         estimate_publisher: EstimatePublisher,
+        hardware_id: str,
     ) -> None:
         self._node = node
+        self._hardware_id = hardware_id
         self._estimator = estimator
         self._feed = feed
         self._inputs = inputs
@@ -67,8 +69,8 @@ class DiagnosticsPublisher:
         values = self._input_values() | self._estimator_values()
         status = DiagnosticStatus(
             level=level,
-            name=f'{self._node.get_name()}: estimate',
-            hardware_id=self._node.get_namespace(),
+            name=f'{self._node.get_fully_qualified_name().lstrip("/")}: estimate',
+            hardware_id=self._hardware_id,
             message='; '.join(warnings) or 'running',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
