@@ -8,7 +8,8 @@ import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-from geometry_msgs.msg import Pose, PoseArray, Twist, TwistWithCovarianceStamped
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Pose, PoseArray, Twist, TwistStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from node_processes import NodeProcess, running
 import numpy as np
@@ -470,3 +471,23 @@ def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_p
 def send_landmark(robot):
     robot.send(ObservationEvent(time.time_ns(), np.array([5]), np.ones((1, 3))))
     robot.send_zeros()
+
+
+def test_a_second_publisher_of_velocities_or_of_the_odometry_is_named(ros, tmp_path):
+    statuses = ros.collect(DiagnosticArray, '/diagnostics')
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/rivals') as node,
+        Robot(ros, namespace='/rivals') as robot,
+    ):
+        velocities = ros.node.create_publisher(TwistStamped, '/rivals/twist', 10)
+        node.wait_for_output(r"2 publishers \(/test_client, /test_client\) publish on '/rivals/tw")
+        ros.node.destroy_publisher(velocities)
+        estimates = ros.node.create_publisher(Odometry, '/rivals/odometry', 10)
+        node.wait_for_output(r"/rivals/observer_node, /test_client\) publish on '/rivals/odom")
+        ros.spin_until(
+            lambda: any("publish on '/rivals/odom" in m.status[0].message for m in statuses),
+            'its diagnostics',
+        )
+        ros.node.destroy_publisher(estimates)
+        assert "publish on '/rivals/landmarks'" not in node.output
+        robot.send_zeros()

@@ -292,7 +292,7 @@ class Publishing:
             dropped=Counter(), is_paused=False, clock_problems=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
-        self.estimate_publisher = SimpleNamespace(problem='')
+        self.estimate_publisher = SimpleNamespace(problem='', rivals=str)
         parts = self.estimator, self.feed, inputs, self.estimate_publisher
         self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')
 

@@ -92,6 +92,7 @@ def _landmark_input(
         decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
     topic = InputTopic(node, name, decoders, take, qos, settings.landmarks_max_wait)
+    topic.is_shared = True
     topic.advice = {
         message_type: f'landmarks_type: {message_type.rsplit("/", 1)[-1]}'
         for message_type in (APRILTAGS, *DETECTION_DECODERS, *CLOUD_DECODERS)

@@ -30,6 +30,14 @@ MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
 
 
+def several(publishers: Sequence[TopicEndpointInfo]) -> str:
+    """Return who publishes on a topic, if more than one does; else ''."""
+    if len(publishers) < 2:
+        return ''
+    names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
+    return f'{len(names)} publishers ({", ".join(names)})'
+
+
 class InputTopic(Generic[MessageT]):
     """Subscribes to a topic, decodes its messages and reports why none come.
 
@@ -59,6 +67,8 @@ class InputTopic(Generic[MessageT]):
         What is dropped, and how much was, as they come faster than they can be used.
     advice : mapping of str to str
         Which parameter would make other message types that may be found be read.
+    is_shared : bool
+        Whether several may publish on it, as several sensors of landmarks.
     read_first : sequence of InputTopic
         Other inputs, of which what was received before a message of this one is read before it.
         An executor reads one message of each topic in turn, so after the node was busy a slow
@@ -80,6 +90,7 @@ class InputTopic(Generic[MessageT]):
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
+        self.is_shared = False
         self.advice: Mapping[str, str] = {}
         self.read_first: Sequence[InputTopic[Any]] = ()
         self._received_ns = 0  # by DDS
@@ -218,6 +229,8 @@ class InputTopic(Generic[MessageT]):
             found = ', '.join(sorted({publisher.topic_type for publisher in publishers}))
             hint = ''.join(f'; set {self.advice[t]}' for t in self.advice if t in found)
             return f"'{self.topic}' carries {found}; {wanted} is needed{hint}"
+        if not self.is_shared and (rivals := several(publishers)):
+            return f"{rivals} publish on '{self.topic}': remap all but one"
         for publisher in publishers:
             compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
             if compatibility == QoSCompatibility.ERROR:

@@ -123,6 +123,7 @@ class DiagnosticsPublisher:
     def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
         warnings += self._feed.clock_problems()
+        warnings.append(self._estimate_publisher.rivals())
         if self._feed.is_paused:
             warnings.append('paused')
         elif dropped:

@@ -18,10 +18,12 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.nodes.intake.input_topic import several
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_QOS
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
@@ -52,6 +54,7 @@ class EstimatePublisher:
     ) -> None:
         self._node = node
         self._settings = settings
+        self._log = ThrottledLog(node)
         self._estimator = estimator
         self._period_s = 1.0 / settings.publish_rate
         self._due_s = 0.0  # when the next state may be published, by a steady clock
@@ -76,6 +79,16 @@ class EstimatePublisher:
     def problem(self) -> str:
         """Why the transform is not published as it should be; empty while it is."""
         return '' if self._broadcaster is None else self._broadcaster.problem
+
+    def rivals(self) -> str:
+        """Report other publishers of the odometry; empty if there are none. It is logged, too."""
+        topic = self._node.resolve_topic_name('odometry')
+        names = several(self._node.get_publishers_info_by_topic(topic))
+        if not names:
+            return ''
+        text = f"{names} publish on '{topic}': remap all but one"
+        self._log.warning(topic, text)
+        return text
 
     @property
     def is_due(self) -> bool:
