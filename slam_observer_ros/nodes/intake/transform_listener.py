@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import re
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from rclpy.node import Node
@@ -32,6 +32,9 @@ TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCA
 class LiveTransforms(TransformSource, Protocol):
     """Transforms that come in while a node runs."""
 
+    on_transform: Callable[[str, str, int], None]
+    """Called with parent, child and stamp, nanoseconds, of each transform on /tf."""
+
     def read_waiting(self) -> None:
         """Take what has come on /tf: while the node was busy, it may be a lot."""
 
@@ -47,6 +50,7 @@ class TopicTransforms:
         self._node = node
         self._own = own
         self._log = ThrottledLog(node)
+        self.on_transform: Callable[[str, str, int], None] = _ignore
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
         self.newest_ns = self._buffer.newest_ns
@@ -69,6 +73,9 @@ class TopicTransforms:
             except MessageError as error:
                 self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
                 return
+            if not is_static:
+                for each in transforms:
+                    self.on_transform(each.frame_id, each.child_frame_id, each.stamp_ns)
             others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
             insert_transforms(self._buffer, others, is_static=is_static)
 
@@ -79,9 +86,19 @@ class Tf2Transforms:
     """tf2_ros's buffer and listener."""
 
     def __init__(self, node: Node) -> None:
+        self.on_transform: Callable[[str, str, int], None] = _ignore
         self._buffer = tf2_ros.Buffer()
+        self._insert = self._buffer.set_transform
+        self._buffer.set_transform = self._set_transform
         self._listener = tf2_ros.TransformListener(self._buffer, node)
         self.clear: Callable[[], None] = self._buffer.clear
+
+    def _set_transform(self, stamped: Any, authority: str) -> None:
+        """Take a transform from the listener, which gives the buffer all of /tf this way."""
+        header = stamped.header
+        stamp_ns = Time.from_msg(header.stamp).nanoseconds
+        self.on_transform(header.frame_id, stamped.child_frame_id, stamp_ns)
+        self._insert(stamped, authority)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
         """As :meth:`TransformSource.lookup`."""
@@ -115,6 +132,10 @@ class Tf2Transforms:
         except tf2_ros.TransformException:
             return None
         return newest_ns or ALWAYS_NS  # tf2 has zero for what is static
+
+
+def _ignore(_parent: str, _child: str, _stamp_ns: int) -> None:
+    """Take no notice of a transform."""
 
 
 def _read_waiting(subscription: Subscription) -> None:

@@ -15,10 +15,10 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.intake.input_topic import several
+from slam_observer_ros.nodes.intake.transform_listener import LiveTransforms
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
@@ -50,7 +50,7 @@ class EstimatePublisher:
         node: Node,
         settings: ObserverNodeSettings,
         estimator: Estimator,
-        transforms: TransformSource,
+        transforms: LiveTransforms,
     ) -> None:
         self._node = node
         self._settings = settings
@@ -74,11 +74,14 @@ class EstimatePublisher:
             self._broadcaster = PoseBroadcaster(
                 node, settings, transforms, estimator.settings.reorder_window
             )
+            transforms.on_transform = self._broadcaster.hear
 
     @property
     def problem(self) -> str:
         """Why the transform is not published as it should be; empty while it is."""
-        return '' if self._broadcaster is None else self._broadcaster.problem
+        if self._broadcaster is None:
+            return ''
+        return self._broadcaster.problem or self._broadcaster.rival
 
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""
