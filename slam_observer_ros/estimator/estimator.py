@@ -484,12 +484,11 @@ class Estimator:
     def _process_observation(self, event: ObservationEvent) -> None:
         needs_ids = not self._state.filter.has_joint_covariance
         usable = usable_points(event, self.settings, needs_ids, self._counts, self._warnings)
-        is_late = bool(len(usable.ids)) and self._timeline.is_late(usable)
         event = self._timeline.synchronise(usable)
         outcome = self._hypotheses.observe(event)
         self._localise(outcome)
         self._counts['observation'] += 1
-        self._counts['late_observation'] += is_late
+        self._counts['late_observation'] += self._timeline.was_late
         self._warn_of(event, outcome)
         self.last_update = self._update(event.stamp_ns, outcome)
         if self._on_update is not None:

@@ -56,6 +56,8 @@ class Timeline:
         Stamp of the last event that was used, nanoseconds; None before the first.
     state_ns : int or None
         Instant that the hypotheses are of: velocities since then wait for an observation.
+    was_late : bool
+        Whether the last observation with points came after a velocity of a later stamp.
 
     """
 
@@ -71,6 +73,7 @@ class Timeline:
         self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
         self._pending = 0
+        self.was_late = False
         self._in_force_ns = 0  # no velocity of before can change what is in force
         self._newest_ns: dict[type, int] = {}
 
@@ -152,6 +155,7 @@ class Timeline:
         One without points, as an idle sensor sends, moves nothing: it would make others late.
         """
         state_ns = self._note_stamp(event.stamp_ns)
+        self.was_late = bool(len(event.ids)) and event.stamp_ns < self._in_force_ns
         if not len(event.ids):
             return replace(event, stamp_ns=state_ns)
         if event.stamp_ns < state_ns:
