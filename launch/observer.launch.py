@@ -48,6 +48,9 @@ def generate_launch_description():
                 'odometry', default_value='odometry', description='topic of the estimate'
             ),
             DeclareLaunchArgument(
+                'pose', default_value='pose', description='topic of the pose, as amcl_pose'
+            ),
+            DeclareLaunchArgument(
                 'namespace', default_value='', description='namespace of the robot'
             ),
             DeclareLaunchArgument(
@@ -69,6 +72,7 @@ def generate_launch_description():
                     ('imu', LaunchConfiguration('imu')),
                     ('map', LaunchConfiguration('map')),
                     ('odometry', LaunchConfiguration('odometry')),
+                    ('pose', LaunchConfiguration('pose')),
                 ],
                 output='screen',
             ),

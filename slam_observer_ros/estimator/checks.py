@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+import math
 
 import numpy as np
 
@@ -38,20 +39,23 @@ MAX_MEASURED = 1e6
 _INTEGERS = (int, np.int64)
 
 
-def check_event(event: Event) -> None:
-    """Check an event's shapes and values.
+def check_event(event: Event, settings: Settings) -> None:
+    """Check an event's shapes and values, velocities against those that settings allow.
 
     Raises
     ------
     InvalidEventError
         With the reason ``'wrong_type'``, ``'negative_stamp'``, ``'wrong_shape'``,
-        ``'not_finite'``, ``'too_large'``, ``'negative_id'`` or ``'bad_covariance'``.
+        ``'not_finite'``, ``'too_large'``, ``'too_fast'``, ``'negative_id'`` or
+        ``'bad_covariance'``.
 
     """
     if isinstance(event, VelocityEvent):
         _check_velocity(event.body_velocity, event.covariance, 6)
+        _check_speed(event.body_velocity, settings)
     elif isinstance(event, AngularVelocityEvent):
         _check_velocity(event.angular_velocity, event.covariance, 3)
+        _check_speed(event.angular_velocity, settings)
     elif isinstance(event, ObservationEvent):
         _check_observation(event)
     else:
@@ -122,6 +126,18 @@ def _check_velocity(velocity: FloatArray, covariance: FloatArray | None, size: i
         _check_definite('velocity covariance', covariance)
 
 
+def _check_speed(velocity: FloatArray, settings: Settings) -> None:
+    """Check a velocity (Ω, v), or Ω alone, against the greatest that a robot can have."""
+    for part, unit, name in (
+        (velocity[:3], 'rad/s', 'max_angular_velocity'),
+        (velocity[3:], 'm/s', 'max_linear_velocity'),
+    ):
+        size, most = math.sqrt(part.dot(part)), getattr(settings, name)
+        if size > most:
+            text = f'a velocity of {size:.1f} {unit} is beyond {name} ({most:g} {unit})'
+            raise InvalidEventError('too_fast', text)
+
+
 def _check_observation(event: ObservationEvent) -> None:
     is_stack = isinstance(event.points, np.ndarray) and event.points.ndim > 0
     m = len(event.points) if is_stack else 0
@@ -150,8 +166,9 @@ def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> 
     if type(array) is np.ndarray and array.shape == shape and array.dtype == np.float64:
         # Nothing wrong passes this one product, at a fifth of the cost of checking each entry.
         entries = array.ravel()
-        if entries.dot(entries) <= MAX_MEASURED**2:
-            return
+        with np.errstate(over='ignore'):
+            if entries.dot(entries) <= MAX_MEASURED**2:
+                return
     _check_array(name, array, shape)
     if np.abs(array).max(initial=0.0) > MAX_MEASURED:
         raise InvalidEventError('too_large', f'an entry of the {name} is beyond {MAX_MEASURED:g}')
@@ -175,8 +192,9 @@ def _is_plain(array: object) -> bool:
 def _check_definite(name: str, covariances: FloatArray) -> None:
     """Check that covariances (…, d, d) are symmetric and have no negative eigenvalue."""
     with np.errstate(over='ignore'):  # the largest number there is means 'unknown'
-        allowed = ROUNDING * np.trace(covariances, axis1=-2, axis2=-1)
-    skew = np.abs(covariances - transpose(covariances)).max(axis=(-2, -1))
+        diagonals = np.diagonal(covariances, axis1=-2, axis2=-1)
+        allowed = (ROUNDING * diagonals).sum(axis=-1)  # finite, whatever the trace is
+        skew = np.abs(covariances - transpose(covariances)).max(axis=(-2, -1))
     if np.any(skew > allowed) or np.any(np.linalg.eigvalsh(covariances)[..., 0] < -allowed):
         raise InvalidEventError(
             'bad_covariance', f'{name}: asymmetric, or with a negative eigenvalue'

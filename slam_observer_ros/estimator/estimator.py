@@ -97,24 +97,25 @@ class Estimator:
         self._clear_time()
         self.last_update = None
 
-    def handle_clock_jump(self) -> None:
-        """Go on after a jump of the clock, as ``on_time_jump`` says.
+    def handle_clock_jump(self, by_ns: int | None = None) -> None:
+        """Go on after a jump of the clock, by so many nanoseconds, as ``on_time_jump`` says.
 
         ``reset`` starts again where the run began; in a loaded map where the settings say, or
         at an unknown pose. ``hold`` keeps pose and map, and goes on from there.
         """
         # Events of before the jump that are held back are used first.
-        newest_ns = self.newest_stamp_ns
-        after = '' if newest_ns is None else f' after {to_s(newest_ns):.3f} s'
+        way = ''
+        if by_ns is not None:
+            way = f' {"back" if by_ns < 0 else "ahead"} by {to_s(abs(by_ns)):.3f} s'
         self.release()
         if self.settings.on_time_jump == 'reset':
             logger.warning(
                 'The clock has jumped%s; starting again (on_time_jump: hold keeps pose and map).',
-                after,
+                way,
             )
             self.reset(None if self._localiser.loaded else self._start_pose)
         else:
-            logger.warning('The clock has jumped%s; pose and map are held.', after)
+            logger.warning('The clock has jumped%s; pose and map are held.', way)
             self._timeline.catch_up()
             self._report_stamp()
             self._hypotheses.clear_time()
@@ -190,13 +191,13 @@ class Estimator:
         is untouched. The event's arrays are not copied: don't change them any more.
         """
         try:
-            check_event(event)
+            check_event(event, self.settings)
             jumped = self._queue.push(event)
         except InvalidEventError as error:
             self._drop(error)
             return False
         if jumped:
-            self.handle_clock_jump()
+            self.handle_clock_jump(event.stamp_ns - (self.newest_stamp_ns or 0))
             self._queue.push(event)
         for ready in self._queue.pop_ready():
             self._process(ready)
@@ -303,6 +304,23 @@ class Estimator:
         return np.zeros(6) if velocity is None else self._state.filter.calibration.apply(velocity)
 
     @property
+    def body_velocity_covariance(self) -> FloatArray | None:
+        """(6, 6) covariance of :attr:`body_velocity`, as stated with it or as the settings say.
+
+        That of no velocity is what the robot may do then. None before there are two messages.
+        """
+        held = self._timeline.velocity_in_force
+        if held is None:
+            return None
+        known, axes = self._state.filter, self._state.filter.axes
+        measured = self._state.motion_noise.velocity_covariance(held)
+        return known.calibration.apply_to_covariance(
+            axes.full_pose_covariance(measured[axes.pose, axes.pose]),
+            held.body_velocities[0],
+            known.calibration_variances,
+        )
+
+    @property
     def velocity_is_stale(self) -> bool:
         """Whether no velocity was in force at ``stamp_ns``, so that the pose is being held."""
         return self._timeline.body_velocity is None
@@ -399,7 +417,7 @@ class Estimator:
         outcome = self._hypotheses.observe(event)
         self._localise(outcome)
         self._counts['observation'] += 1
-        self._counts['late_observation'] += event.stamp_ns > usable.stamp_ns
+        self._counts['late_observation'] += self._timeline.was_late
         self._warn_of(event, outcome)
         self.last_update = self._update(event.stamp_ns, outcome)
         if self._on_update is not None:

@@ -23,12 +23,22 @@ More than inputs keep while the node is busy: those were received late, and show
 HELD_UP_NS = 250_000_000
 """Stamps far behind that are received so soon after one in time are of no jump of the clock."""
 
+LATENESS_NS = 10_000_000_000
+"""Time over which it is seen how late events are, nanoseconds."""
+
+LATENESS_MARGIN = 2
+"""How much later than the latest of that time an event may be and still be put in order."""
+
 MIN_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
 
 
 class EventQueue:
     """Holds events back for a reorder window, then returns them in stamp order.
+
+    The window is as long as events are late: ``LATENESS_MARGIN`` times the most that one was in
+    the last ``LATENESS_NS``, ``window_ns`` at most, and that while so much time has not passed.
+    It depends on stamps and their order alone, so that a replay has the same.
 
     Of two events with one stamp the velocity comes first, and two observations are ordered by
     a digest of their ids and points, so the order does not depend on which arrived first. A
@@ -46,12 +56,13 @@ class EventQueue:
     late goes on from its own last stamp, and not right after an event that is in time: then they
     were held up on the way, and come in a burst.
 
-    An event is returned ``window_ns`` behind the newest stamp, and may be ``late_limit_ns`` behind
-    that; ``max_jump_ns`` is the longest pause, beyond which stamps are refused.
+    An event is returned at most ``window_ns`` behind the newest stamp, and may be
+    ``late_limit_ns`` behind that; ``max_jump_ns`` is the longest pause, beyond which stamps are
+    refused.
     """
 
     def __init__(self, window_ns: int, max_jump_ns: int, late_limit_ns: int) -> None:
-        self._window_ns = window_ns
+        self._window = _Window(window_ns)
         self._max_jump_ns = max_jump_ns
         self._reach_ns = window_ns + late_limit_ns
         self._near_ns = max(self._reach_ns, NEAR_NS)
@@ -94,7 +105,7 @@ class EventQueue:
 
     def pop_ready(self) -> list[Event]:
         """Return, in order, the events that have left the window."""
-        return self._events.pop_until((self.newest_ns or 0) - self._window_ns)
+        return self._events.pop_until((self.newest_ns or 0) - self._window.length_ns)
 
     def pop_believed(self) -> list[Event]:
         """Return, in order, all events but those with a stamp that waits for others."""
@@ -107,6 +118,7 @@ class EventQueue:
     def _take_in_time(self, event: Event, newest_ns: int) -> None:
         self._events.insert(event, newest_ns - self._reach_ns)
         self._reception.note(event)
+        self._window.note(event.stamp_ns, newest_ns)
         self._is_newest_of_kind(event)
         self._strays.clear()
         self._believe(max(newest_ns, event.stamp_ns), newest_ns)
@@ -152,6 +164,30 @@ class EventQueue:
             if not (same_side and abs(stamp_ns - last_ns) <= self._max_jump_ns):
                 self._strays.clear()
         return self._strays.add(stamp_ns)
+
+
+class _Window:
+    """How long events are held back, by how late those of the recent past were."""
+
+    def __init__(self, longest_ns: int) -> None:
+        self._longest_ns = longest_ns
+        self._begin_ns: int | None = None
+        self._late: deque[tuple[int, int]] = deque()  # when, and by how much: ever less
+        self.length_ns = longest_ns
+
+    def note(self, stamp_ns: int, newest_ns: int) -> None:
+        """Take the stamp of an event, and the newest one of those before it, nanoseconds."""
+        if self._begin_ns is None:
+            self._begin_ns = newest_ns
+        oldest_ns = newest_ns - LATENESS_NS
+        late_ns = max(newest_ns - stamp_ns, 0)
+        while self._late and self._late[-1][1] <= late_ns:
+            self._late.pop()
+        self._late.append((newest_ns, late_ns))
+        while self._late[0][0] < oldest_ns:
+            self._late.popleft()
+        if self._begin_ns <= oldest_ns:
+            self.length_ns = min(LATENESS_MARGIN * self._late[0][1], self._longest_ns)
 
 
 class _SortedEvents:

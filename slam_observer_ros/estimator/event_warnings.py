@@ -43,8 +43,8 @@ class EventWarnings:
         self._moved_ns: dict[int, int] = {}
 
     def dropped(self, error: InvalidEventError) -> None:
-        """Warn that an event is not used, and why."""
-        self._warn(error.reason, f'Dropped an event, {error.reason}: {error}')
+        """Warn that a message is not used, and why."""
+        self._warn(error.reason, f'Dropped a message, {error.reason}: {error}')
 
     def late_velocity(self) -> None:
         """Warn that a velocity came too late to be put in order."""
@@ -71,22 +71,19 @@ class EventWarnings:
 
     def large_map(self, count: int, limit: int, is_slow: bool) -> None:
         """Say once that a map is full, with 0 < ``limit``, and once that it takes long."""
-        if 0 < limit <= count and not self._counts['full_map']:
-            self._counts['full_map'] = 1
-            logger.warning(
-                'The map has %d landmarks, and max_landmarks is %d: from now on a new one '
-                'replaces the one seen least often. If so many are right, set it higher; if not, '
-                'look for ids that the sensor makes up.',
-                count,
-                limit,
+        if 0 < limit <= count:
+            self._warn_once(
+                'full_map',
+                f'The map has {count} landmarks, and max_landmarks is {limit}: from now on a new '
+                'one replaces the one seen least often. If so many are right, set it higher; if '
+                'not, look for ids that the sensor makes up.',
             )
-        if is_slow and count >= MANY_LANDMARKS and not self._counts['large_map']:
-            self._counts['large_map'] = 1
-            logger.warning(
-                'The map has %d landmarks, and the time that riccati gains take grows with their '
-                'square: scheduled gains take many more, if points have ids, and max_landmarks '
-                'limits them.',
-                count,
+        if is_slow and count >= MANY_LANDMARKS:
+            self._warn_once(
+                'large_map',
+                f'The map has {count} landmarks, and the time that riccati gains take grows with '
+                'their square: scheduled gains take many more, if points have ids, and '
+                'max_landmarks limits them.',
             )
 
     def loaded_map(self, count: int, limit: int) -> None:
@@ -128,6 +125,11 @@ class EventWarnings:
             if count(name) > self._reported[name]:
                 self._warn(name, text)
                 self._reported[name] = count(name)
+
+    def _warn_once(self, kind: str, text: str) -> None:
+        self._counts[kind] += 1
+        if self._counts[kind] == 1:
+            logger.warning(text)
 
     def _warn(self, kind: str, text: str) -> None:
         """Count one more of a kind; ``text`` is logged if their number is a power of ten."""

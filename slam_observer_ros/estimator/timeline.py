@@ -11,6 +11,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
@@ -54,6 +55,7 @@ class Timeline:
         self._kept_ns = to_ns(settings.late_limit + 2.0 * MAX_DELAY_S)
         self._on_motion = on_motion
         self._pending = 0
+        self.was_late = False
         self._in_force_ns = 0  # no velocity of before can change what is in force
         self._newest_ns: dict[type, int] = {}
 
@@ -99,6 +101,11 @@ class Timeline:
         return None if self.stamp_ns is None else self.velocities.latest(self.stamp_ns)
 
     @property
+    def velocity_in_force(self) -> HeldVelocities | None:
+        """As :meth:`.VelocityHistory.in_force` at ``stamp_ns``; None before the first event."""
+        return None if self.stamp_ns is None else self.velocities.in_force(self.stamp_ns)
+
+    @property
     def lead_s(self) -> float:
         """Seconds from ``state_ns`` to ``stamp_ns``."""
         return to_s((self.stamp_ns or 0) - (self.state_ns or 0))
@@ -127,6 +134,7 @@ class Timeline:
         One without points, as an idle sensor sends, moves nothing: it would make others late.
         """
         state_ns = self._note_stamp(event.stamp_ns)
+        self.was_late = bool(len(event.ids)) and event.stamp_ns < self._in_force_ns
         if not len(event.ids):
             return replace(event, stamp_ns=state_ns)
         if event.stamp_ns < state_ns:

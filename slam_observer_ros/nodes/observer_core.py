@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.nodes.entities import Entities
@@ -33,6 +34,9 @@ OVERVIEW_PERIOD_S = 0.5
 DIAGNOSTICS_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
 RETRY_PERIOD_S = 0.02
+
+MOTION_INPUTS = ('twist', 'imu')
+"""Inputs that are cheap to use, and move the estimate on to the present."""
 
 CLOCK_JITTER_NS = 100_000_000
 """/clock may step back by less without having jumped, nanoseconds: messages are then just late."""
@@ -57,10 +61,18 @@ class ObserverCore:
             node, settings, self._estimator, BaseFrame(settings, self._transforms)
         )
         self._publisher = EstimatePublisher(node, settings, self._estimator, self._transforms)
+        self._feed.on_events = self._publish_if_due
         self._inputs = open_inputs(node, settings, self._feed)
+        self._is_catching_up = False
         _refuse_own_outputs(node, self._inputs)
+        namespace = node.get_namespace()
         self._diagnostics = DiagnosticsPublisher(
-            node, self._estimator, self._feed, self._inputs, self._publisher
+            node,
+            self._estimator,
+            self._feed,
+            self._inputs,
+            self._publisher,
+            hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         # What others may do to the estimate
         self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
@@ -134,13 +146,30 @@ class ObserverCore:
             )
         ]
 
+    def _publish_if_due(self) -> None:
+        """Publish what is new once the velocities that wait are used, so that it is not old."""
+        if self._is_catching_up or not self._publisher.is_due:
+            return
+        self._is_catching_up = True  # their events come here, too
+        for source in self._inputs:
+            if source.name in MOTION_INPUTS:
+                source.read_until(MAX_STAMP_NS)
+        self._is_catching_up = False
+        self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
+        self._publisher.publish_state()
+
     def _publish_state(self) -> None:
         self._publisher.publish_state()
         if self._feed.is_paused:
             self._publisher.repeat_transform()
 
-    def _on_clock_jump(self, _jump: object) -> None:
-        self._estimator.handle_clock_jump()
+    def _on_clock_jump(self, jump: TimeJump) -> None:
+        """Use what still waits of the run that has ended, and then what has come of the next."""
+        self._feed.begin_clock_jump(-jump.delta.nanoseconds)
+        for source in self._inputs:
+            source.read_until(MAX_STAMP_NS)
+        self._estimator.handle_clock_jump(jump.delta.nanoseconds)
+        self._feed.end_clock_jump()
 
     def _on_estimator_jump(self) -> None:
         """Forget what is of the time before a jump, which /clock or the stamps have shown."""

@@ -91,6 +91,19 @@ class Calibration:
         biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
         return body_velocities * self._all[:6] + biases
 
+    def apply_to_covariance(
+        self, covariance: FloatArray, body_velocity: FloatArray, variances: FloatArray
+    ) -> FloatArray:
+        """Return the covariance (6, 6) of a calibrated velocity from that of the velocity (6,).
+
+        ``variances`` (c,) are what the filter knows of the estimates.
+        """
+        of_all = np.zeros(len(NAMES))
+        of_all[self._estimated] = variances
+        of_velocity = of_all[:6] * body_velocity**2 + of_all[6:DELAY] * _moves(body_velocity)
+        scales = self._all[:6]
+        return scales[:, None] * covariance * scales + np.diag(of_velocity)
+
     def sensitivity(
         self,
         Ad: FloatArray,

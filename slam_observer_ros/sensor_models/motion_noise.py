@@ -65,6 +65,11 @@ class MotionNoise(Immutable):
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
 
+    def velocity_covariance(self, held: HeldVelocities) -> FloatArray:
+        """Return what a single velocity may be off by: (6, 6), rad²/s² and m²/s²."""
+        covariance: FloatArray = self.covariances(held)[0] / (held.dt_s[0] + held.gap_s[0]) ** 2
+        return covariance
+
 
 @lru_cache(maxsize=8)
 def _squares(angular: Vector3, linear: Vector3) -> FloatArray:

@@ -75,6 +75,29 @@ class VelocityHistory:
             return None
         return self._counting(joined.body_velocities[row])
 
+    def in_force(self, stamp_ns: int) -> HeldVelocities | None:
+        """Return the velocity in force at ``stamp_ns``, held for as long as messages usually are.
+
+        It is in the gap between messages if it has timed out; None if no two are known yet.
+        """
+        row, joined = bisect_right(self._stamps_ns, stamp_ns) - 1, self._written()
+        period_s = self._periods.usual_s
+        if math.isinf(period_s):  # of means over time, which have none
+            period_s = to_s(self._stamps_ns[row] - self._stamps_ns[row - 1])
+        if row < 2 or period_s <= 0.0:
+            return None
+        one = slice(row, row + 1)
+        timed_out = stamp_ns - joined.since_ns[row, 1] > self._timeout_ns
+        return HeldVelocities(
+            body_velocities=self._counting(joined.body_velocities[one]),
+            covariances=joined.covariances[one],
+            is_stated=joined.is_stated[one],
+            dt_s=np.array([0.0 if timed_out else period_s]),
+            gap_s=np.array([period_s if timed_out else 0.0]),
+            before_s=np.zeros((1, 2)),
+            usual_s=self._usual_s(),
+        )
+
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
         rows, begins, stops, ends = self._pieces(start_ns, end_ns)

@@ -68,7 +68,8 @@ class Settings(Immutable):
     )
     reorder_window: float = parameter(
         0.05,
-        'How long events are held back to be put in stamp order',
+        'How long events are held back to be put in stamp order, at most: after the first 10 s '
+        'twice as long as any was late in the last 10 s',
         unit='s',
         minimum=0.0,
         maximum=10.0,
@@ -88,6 +89,23 @@ class Settings(Immutable):
         unit='s',
         minimum=0.1,
         maximum=1e9,
+    )
+    max_linear_velocity: float = parameter(
+        100.0,
+        'Greatest speed that a message is believed: beyond it the velocity is refused (too_fast)',
+        unit='m/s',
+        minimum=1e-3,
+        maximum=1e6,
+        read_only=False,
+    )
+    max_angular_velocity: float = parameter(
+        50.0,
+        'Greatest rate of turn that a message is believed: beyond it the velocity is refused '
+        '(too_fast)',
+        unit='rad/s',
+        minimum=1e-3,
+        maximum=1e6,
+        read_only=False,
     )
     on_time_jump: str = parameter(
         'reset',

@@ -31,10 +31,19 @@ class ObserverNodeSettings(InputSettings):
     queue_depth: int = parameter(
         100, 'Messages of each input kept while the node is busy', minimum=1, maximum=10_000
     )
+    landmarks_max_wait: float = parameter(
+        0.05,
+        'Overload: once a message on landmarks has waited longer than this to be read, only the '
+        'newest of each sensor is used, the others are dropped; velocities are all used',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
+    )
     transform_tolerance: float = parameter(
-        0.1,
+        1.0,
         'How far map_frame to odom_frame is post-dated beyond reorder_window, to hold until the '
-        'next one: three periods of twist',
+        'next one, on a busy machine too; others see a correction that much later, and the motion '
+        'at once, from odom_frame',
         unit='s',
         minimum=0.0,
         maximum=10.0,

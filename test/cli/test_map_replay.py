@@ -350,7 +350,7 @@ def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_reported(
     ended = slam_observer(
         'replay', path, '--tum', poses, '--json', '--set', f'on_time_jump={jump}', *SETTINGS
     )
-    assert ended.errors.count('The clock has jumped after 4.900 s') == 1
+    assert ended.errors.count('The clock has jumped ahead by 1000.') == 1
     assert ('on_time_jump: hold' in ended.errors) == resets
     assert ('after the last jump of the clock (1 in all)' in ended.errors) == resets
     assert (read_tum(poses).stamps_ns[0] > 10**12) == resets

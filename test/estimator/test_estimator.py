@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 from slam_observer_ros.association.hypotheses import Hypotheses
@@ -357,7 +357,8 @@ def test_empty_observations_make_no_others_late():
             for estimator in (alone, beside_empty_ones):
                 estimator.add(waiting[-1])
     assert beside_empty_ones.counts['observation'] == 306
-    assert beside_empty_ones.counts['late_observation'] == 0
+    for estimator in (alone, beside_empty_ones):
+        assert estimator.counts['late_observation'] == 6, 'those that waited, none of the empty'
     np.testing.assert_array_equal(beside_empty_ones.pose, alone.pose)
     np.testing.assert_array_equal(beside_empty_ones.pose_covariance, alone.pose_covariance)
 
@@ -537,6 +538,8 @@ def bad_events():
     points, eyes = good.points, np.tile(np.eye(3), (2, 1, 1))
     one_is_negative, one_is_skew = eyes.copy(), eyes.copy()
     one_is_negative[1, 0, 0] = one_is_skew[1, 0, 1] = -0.5
+    large_and_skew = np.diag([1.7e308] * 6)
+    large_and_skew[0, 1] = 1e308
     return [
         ('negative_stamp', VelocityEvent(-1, BODY_VELOCITY)),
         ('wrong_type', VelocityEvent(stamp_ns * 1e-9, BODY_VELOCITY)),
@@ -568,6 +571,7 @@ def bad_events():
         ('not_finite', VelocityEvent(stamp_ns, BODY_VELOCITY * np.nan)),
         ('not_finite', VelocityEvent(stamp_ns, np.array([np.inf, 0, 0, -np.inf, 0, 0]))),
         ('bad_covariance', VelocityEvent(stamp_ns, BODY_VELOCITY, -np.eye(6))),
+        ('bad_covariance', VelocityEvent(stamp_ns, BODY_VELOCITY, large_and_skew)),
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids, points[:, :2])),
         ('wrong_shape', ObservationEvent(stamp_ns, good.ids[:1], points)),
         ('not_finite', ObservationEvent(stamp_ns, good.ids, points * np.inf)),
@@ -606,15 +610,55 @@ def test_a_bad_event_is_dropped_whole_counted_and_leaves_the_state_alone(reason,
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 @pytest.mark.parametrize('dtype', [np.float64, np.float32])
 def test_what_is_as_large_as_may_be_is_taken_and_what_is_larger_refused(sign, dtype):
+    settings = Settings(max_linear_velocity=MAX_MEASURED, max_angular_velocity=MAX_MEASURED)
     for size, is_taken in ((MAX_MEASURED, True), (1.001 * MAX_MEASURED, False)):
         entries = np.array([0.0, sign * size, 0.0], dtype=dtype)
-        estimator, ids = Estimator(Settings()), np.array([1])
+        estimator, ids = Estimator(settings), np.array([1])
         assert estimator.add(VelocityEvent(START_NS, np.tile(entries, 2))) == is_taken
         assert estimator.add(ObservationEvent(START_NS, ids, entries[None])) == is_taken
         velocities = entries[None] * np.ones((1, 3), dtype=dtype)
         moving = ObservationEvent(START_NS + 1, ids, np.ones((1, 3)), None, velocities)
         assert estimator.add(moving) == is_taken
         assert estimator.dropped == ({} if is_taken else {'too_large': 3})
+
+
+def test_a_velocity_that_no_robot_has_is_refused_counted_and_named(caplog):
+    fast, turning = np.zeros(6), np.zeros(6)
+    fast[4], turning[2] = -500.0, 60.0
+    estimator, untouched = Estimator(Settings()), Estimator(Settings())
+    for good in drive():
+        assert estimator.add(good)
+        untouched.add(good)
+    stamp_ns = estimator.newest_stamp_ns + 1
+    assert not estimator.add(VelocityEvent(stamp_ns, fast))
+    assert not estimator.add(VelocityEvent(stamp_ns, turning))
+    assert not estimator.add(AngularVelocityEvent(stamp_ns, turning[:3]))
+    assert estimator.dropped == {'too_fast': 3}
+    assert 'a velocity of 500.0 m/s is beyond max_linear_velocity (100 m/s)' in caplog.text
+    estimator.flush()
+    untouched.flush()
+    assert_same_state(estimator, untouched)
+    settings = Settings(max_linear_velocity=600.0, max_angular_velocity=61.0)
+    assert Estimator(settings).add(VelocityEvent(stamp_ns, fast + turning))
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('size', [1e155, -1e300, 1.7e308, np.inf, np.nan])
+def test_numbers_that_are_too_large_are_refused_without_a_warning_of_numpy(size):
+    huge, ids, points = np.full((6, 6), size), np.array([1]), np.ones((1, 3))
+    skew = np.triu(huge) - np.tril(huge, -1)
+    estimator = Estimator(Settings())
+    for event in (
+        VelocityEvent(START_NS, huge[0]),
+        AngularVelocityEvent(START_NS, huge[0, :3]),
+        ObservationEvent(START_NS, ids, huge[:1, :3]),
+        ObservationEvent(START_NS, ids, points, None, huge[:1, :3]),
+    ):
+        assert not estimator.add(event)
+    assert set(estimator.dropped) <= {'too_large', 'not_finite'}
+    # Covariances that large say 'unknown'.
+    estimator.add(VelocityEvent(START_NS, np.zeros(6), skew))
+    estimator.add(ObservationEvent(START_NS, ids, points, skew[None, :3, :3]))
 
 
 @pytest.mark.parametrize('gains', GAINS)
@@ -1328,3 +1372,58 @@ def test_no_map_that_can_not_be_right_is_taken(changes, reason):
     with pytest.raises(MapError, match=reason):
         estimator.load_map(replace(good, **changes))
     assert estimator.is_localised
+
+
+def stated(stamp_s, body_velocity, covariance):
+    return replace(velocity(stamp_s, body_velocity), covariance=covariance)
+
+
+def test_a_velocity_has_the_covariance_that_came_with_it():
+    covariance = np.diag([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]) ** 2
+    covariance[2, 3] = covariance[3, 2] = 0.01
+    events = [stated(0.1 * k, BODY_VELOCITY, covariance) for k in range(5)]
+    settings = {'reorder_window': 0.0, 'angular_bias_stddev': (0.0,) * 3}
+    assert_allclose(run(events, **settings).body_velocity_covariance, covariance)
+    planar = run(events, **settings, two_d_mode=True).body_velocity_covariance
+    assert_allclose(planar[2:5, 2:5], covariance[2:5, 2:5])
+    assert np.count_nonzero(planar) == 5, 'exactly zero out of the plane'
+
+
+def test_a_velocity_without_covariance_has_what_the_settings_say_of_one_message():
+    events = [velocity(0.1 * k) for k in range(5)]
+    settings = {'linear_velocity_noise': (0.2, 0.3, 0.4), 'reorder_window': 0.0}
+    assert run(events[:1], **settings).body_velocity_covariance is None
+    covariance = run(events, **settings).body_velocity_covariance
+    assert_allclose(np.sqrt(np.diag(covariance)[3:] * 0.1), [0.2, 0.3, 0.4])
+    settings |= {'velocity_timeout': 0.5, 'unknown_linear_motion': 5.0}
+    silent = run([*events, observation(3.0, [1])], **settings)
+    assert silent.velocity_is_stale
+    assert_allclose(np.sqrt(np.diag(silent.body_velocity_covariance)[3:] * 0.1), 5.0)
+
+
+def test_the_covariance_of_a_velocity_is_calibrated_as_the_velocity_is():
+    settings = {'linear_scale_stddev': (0.1, 0.0, 0.0), 'linear_bias_stddev': (0.0, 0.2, 0.0)}
+    covariance, speed = np.diag(np.full(6, 0.01)), np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0])
+    events = [stated(0.1 * k, speed, covariance) for k in range(5)]
+    estimator = run(events, reorder_window=0.0, **settings)
+    variances = np.diag(estimator.body_velocity_covariance)[3:]
+    assert_allclose(variances, [0.01 + (0.1 * 3.0) ** 2, 0.01 + 0.2**2, 0.01])
+
+
+def test_landmarks_that_always_come_after_their_velocities_are_counted_as_late():
+    estimator = Estimator(Settings())
+    for step in range(100):
+        estimator.add(velocity(0.05 * step))
+        if step >= 20:
+            estimator.add(observation(0.05 * step - 1.0))
+    estimator.flush()
+    assert estimator.counts['late_observation'] == estimator.counts['observation'] == 80
+
+
+@pytest.mark.parametrize(('by_s', 'text'), [(-300.0, 'back by 30'), (5000.0, 'ahead by 500')])
+def test_of_a_jump_of_the_clock_it_is_said_by_how_much_and_which_way(caplog, by_s, text):
+    estimator = Estimator(Settings())
+    for step in range(30):
+        estimator.add(velocity(400.0 + 0.05 * step + by_s * (step >= 20)))
+    assert caplog.text.count('The clock has jumped') == 1
+    assert f'The clock has jumped {text}' in caplog.text or 'back by 299' in caplog.text

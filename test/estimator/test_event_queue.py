@@ -385,3 +385,31 @@ def test_a_looped_recording_is_a_jump_of_the_clock_within_half_a_second():
         assert not queue.push(received(event, event.stamp_ns))
     again = [received(event, event.stamp_ns + 10 * SECOND) for event in lap[:25]]
     assert True in [push_or_reason(queue, event) for event in again]
+
+
+def delays_ns(queue, events):
+    """Return how far behind the newest stamp each event is given out, in order of arrival."""
+    given_out = {}
+    for event in events:
+        queue.push(event)
+        given_out |= {id(ready): queue.newest_ns for ready in queue.pop_ready()}
+    return [given_out.get(id(event), queue.newest_ns) - event.stamp_ns for event in events]
+
+
+def test_events_that_come_in_order_are_not_held_back_for_long():
+    delays = delays_ns(make_queue(window_ns=SECOND // 20), dense(12 * SECOND))
+    assert min(delays[:400]) >= SECOND // 20, 'it is not known yet how late they are'
+    assert set(delays[-50:]) == {0}
+
+
+def test_an_event_that_is_late_opens_the_window_as_far_as_allowed():
+    queue = make_queue(window_ns=SECOND // 20)
+    delays_ns(queue, dense(12 * SECOND))
+    step_ns = SECOND // 50
+    after = [velocity(12 * SECOND + k * step_ns) for k in range(1000)]
+    late = [observation(12 * SECOND + step_ns // 2), observation(12 * SECOND + 2 * step_ns)]
+    arrivals = [*after[:2], late[0], *after[2:10], late[1], *after[10:]]
+    delays = delays_ns(queue, arrivals)
+    assert delays[3:6] == [step_ns, step_ns, step_ns], 'twice the lateness of 10 ms'
+    assert min(delays[13:100]) >= SECOND // 20, 'no further than its setting'
+    assert set(delays[-50:]) == {0}, 'none was late for long'

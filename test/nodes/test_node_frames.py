@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -232,6 +233,9 @@ class FakeBuffer:
     def clear(self):
         """Forget nothing."""
 
+    def set_transform(self, stamped, authority):
+        """Take nothing."""
+
 
 def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
     fake = SimpleNamespace(
@@ -251,6 +255,13 @@ def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
     assert transforms.parent_of('*eye') == 'a: b'
     assert transforms.parent_of('mast') is None
     transforms.clear()
+    transforms.on_transform = Mock()
+    header = MESSAGES.header(SECOND, 'map')
+    # As its listener does.
+    fake.TransformListener.call_args.args[0].set_transform(
+        TransformStamped(header=header, child_frame_id='odom'), 'default_authority'
+    )
+    transforms.on_transform.assert_called_once_with('map', 'odom', SECOND)
 
 
 def test_the_nodes_own_transform_takes_no_other_ones_place():
@@ -263,3 +274,22 @@ def test_the_nodes_own_transform_takes_no_other_ones_place():
         receive(serialize_message(TFMessage(transforms=[transform])))
     assert transforms.newest_ns('odom', 'base_link') == SECOND
     assert transforms.newest_ns('map', 'base_link') is None
+
+
+def test_a_second_localisation_on_tf_is_named(ros, tmp_path):
+    sender = TransformSender(ros, '/second')
+    with (
+        running('observer_node', tmp_path / 'log', *own_topics('/second')) as node,
+        Robot(ros, namespace='/second') as robot,
+    ):
+        ros.wait_for_subscriber(sender.dynamic)
+        for step in range(100):
+            stamp = time.time_ns()
+            robot.send(VelocityEvent(stamp, np.zeros(6)))
+            sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=stamp)
+            if step == 50:
+                assert 'another node' not in node.output
+            if step > 50:
+                sender.send(('map', 'odom', np.eye(4)), stamp_ns=stamp)
+            ros.spin_for(0.02)
+        node.wait_for_output(r"another node publishes 'map' to 'odom' on /tf")

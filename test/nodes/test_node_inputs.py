@@ -8,7 +8,8 @@ import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
-from geometry_msgs.msg import Pose, PoseArray, Twist, TwistWithCovarianceStamped
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Pose, PoseArray, Twist, TwistStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from node_processes import NodeProcess, running
 import numpy as np
@@ -26,7 +27,7 @@ from sensor_msgs.msg import Imu, PointCloud2
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.messages.message_types import IMU
+from slam_observer_ros.messages.message_types import IMU, ODOMETRY
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
 from slam_observer_ros.nodes.intake import warning_decoders
@@ -213,6 +214,31 @@ def test_an_odometry_with_poses_alone_is_reported_once(velocity, speed, is_logge
     assert len(logged) == is_logged
     assert all("all velocities on '/robot/twist' are zero" in text for text in logged)
     assert all("velocity_source to 'pose_differences'" in text for text in logged)
+
+
+def test_that_the_velocities_of_an_odometry_are_missing_is_said_until_they_come():
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    node.get_clock.return_value = FakeClock()
+    decode = warning_decoders.OdometryDecoder(node)
+    source = InputTopic(node, 'twist', {ODOMETRY: decode}, Mock(), QOS)
+    receive = node.create_subscription.call_args.args[2]
+    for step in range(5):
+        message = odometry(step * SECOND, 0, np.zeros(6))
+        receive(serialize_message(message), {'received_timestamp': 0})
+    assert source.problem.startswith("all velocities on '/robot/twist' are zero")
+    receive(serialize_message(odometry(5 * SECOND, 0)), {'received_timestamp': 0})
+    assert not source.problem
+
+
+def test_a_detection_type_that_is_found_under_auto_is_said_how_to_read():
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/{topic}'
+    publisher = Mock(topic_type='apriltag_msgs/msg/AprilTagDetectionArray', qos_profile=QOS)
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    _, landmarks = open_inputs(node, ObserverNodeSettings(), Mock())
+    landmarks.check_publishers()
+    assert landmarks.problem.endswith('; set landmarks_type: AprilTagDetectionArray')
 
 
 def test_an_odometry_without_an_attitude_has_a_velocity():
@@ -445,3 +471,23 @@ def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_p
 def send_landmark(robot):
     robot.send(ObservationEvent(time.time_ns(), np.array([5]), np.ones((1, 3))))
     robot.send_zeros()
+
+
+def test_a_second_publisher_of_velocities_or_of_the_odometry_is_named(ros, tmp_path):
+    statuses = ros.collect(DiagnosticArray, '/diagnostics')
+    with (
+        running('observer_node', tmp_path / 'log', '-r', '__ns:=/rivals') as node,
+        Robot(ros, namespace='/rivals') as robot,
+    ):
+        velocities = ros.node.create_publisher(TwistStamped, '/rivals/twist', 10)
+        node.wait_for_output(r"2 publishers \(/test_client, /test_client\) publish on '/rivals/tw")
+        ros.node.destroy_publisher(velocities)
+        estimates = ros.node.create_publisher(Odometry, '/rivals/odometry', 10)
+        node.wait_for_output(r"/rivals/observer_node, /test_client\) publish on '/rivals/odom")
+        ros.spin_until(
+            lambda: any("publish on '/rivals/odom" in m.status[0].message for m in statuses),
+            'its diagnostics',
+        )
+        ros.node.destroy_publisher(estimates)
+        assert "publish on '/rivals/landmarks'" not in node.output
+        robot.send_zeros()

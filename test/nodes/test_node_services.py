@@ -293,9 +293,9 @@ class Publishing:
             dropped=Counter(), is_paused=False, clock_problems=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
-        self.estimate_publisher = SimpleNamespace(problem='')
+        self.estimate_publisher = SimpleNamespace(problem='', rivals=str)
         parts = self.estimator, self.feed, inputs, self.estimate_publisher
-        self.diagnostics = DiagnosticsPublisher(self.node, *parts)
+        self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')
 
     def publish(self, **new):
         # A new one, as the real one gives.
@@ -385,7 +385,7 @@ def test_an_input_is_judged_by_what_came_since_the_last_time(monkeypatch):
     monkeypatch.setattr(node_diagnostics.time, 'monotonic', lambda: now_s[0])
     source = SimpleNamespace(
         name='twist', topic='/twist', received=0, age_s=None, malformed=0, problem='',
-        backlog=SimpleNamespace(wait_s=0.0),
+        backlog=SimpleNamespace(wait_s=0.0), shedding=SimpleNamespace(shed=0),
     )  # fmt: skip
     publishing, messages, rates = Publishing(source), [], []
     for received, malformed, age_s in [(0, 0, None), (40, 2, 0.1), (60, 2, 0.1), (60, 2, 3.0)]:
@@ -407,7 +407,7 @@ def test_an_input_of_which_nothing_was_ever_used_is_an_error():
     """As landmarks in a frame that /tf does not have, beside good odometry."""
     source = SimpleNamespace(
         name='landmarks', topic='/tags', received=MANY_UNUSED, age_s=0.1, malformed=0, problem='',
-        backlog=SimpleNamespace(wait_s=0.0),
+        backlog=SimpleNamespace(wait_s=0.0), shedding=SimpleNamespace(shed=0),
     )  # fmt: skip
     publishing = Publishing(source)
     assert publishing.publish(velocity=5).message == 'running', 'they may have come during a pause'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 import time
 from unittest.mock import Mock
 
@@ -109,6 +110,56 @@ def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
         else:
             assert landmark_count(maps[choice]) == 4
             assert 'pose and map are held' in output
+
+
+@pytest.mark.parametrize('clock_late_s', [-0.03, 0.03])
+def test_a_recording_that_is_looped_without_a_pause_is_reset_once_and_loses_nothing(
+    ros, tmp_path, clock_late_s
+):
+    namespace = f'/seamless_{"late" if clock_late_s > 0.0 else "early"}'
+    statuses = ros.collect(DiagnosticArray, '/diagnostics')
+    own_clock = ros.node.create_publisher(Clock, f'{namespace}/clock', 100)
+    arguments = ('-r', f'__ns:={namespace}', '-r', f'/clock:={namespace}/clock')
+    parameters = {'use_sim_time': True, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
+    deliveries = list(Simulation(replace(RUN, duration=3.0), SECOND).deliveries())
+    length_s, loops, sent = 3.0, 3, 0
+    clocks = [(k * 0.025 + max(clock_late_s, 0.0), k * SECOND // 40) for k in range(120)]
+
+    def values():
+        found = [m.status[0] for m in statuses if m.status[0].hardware_id == namespace]
+        return {v.key: v.value for status in found[-1:] for v in status.values}
+
+    with (
+        running('observer_node', tmp_path / 'log', *arguments, **parameters) as node,
+        Robot(ros, namespace=namespace) as robot,
+    ):
+        ros.wait_for_subscriber(own_clock)
+        own_clock.publish(Clock(clock=MESSAGES.time(SECOND)))
+        ros.spin_for(0.2)
+        early_s = max(-clock_late_s, 0.0)  # of the clock, before the last messages of a loop
+        due = [
+            (loop * length_s + at_s, sent_ns, None)
+            for loop in range(loops)
+            for at_s, sent_ns in clocks
+        ] + [
+            (loop * length_s + to_s(d.arrival_ns - SECOND) + early_s, 0, d.event)
+            for loop in range(loops)
+            for d in deliveries
+        ]
+        begin_s = time.monotonic()
+        for due_s, sent_ns, event in sorted(due, key=lambda each: each[0]):
+            ros.spin_for(begin_s + due_s - time.monotonic())
+            if event is None:
+                own_clock.publish(Clock(clock=MESSAGES.time(SECOND + sent_ns)))
+            else:
+                robot.send(event)
+                sent += isinstance(event, VelocityEvent)
+        ros.spin_until(lambda: int(values().get('used: velocity', 0)) >= sent - 10, 'velocities')
+    assert node.output.count('The clock has jumped') == loops - 1
+    assert 'ropped' not in node.output
+    # What comes after /clock has jumped and is of the time before is of no use any more.
+    dropped = {key for key in values() if key.startswith('dropped')}
+    assert dropped <= ({'dropped: last_run'} if clock_late_s < 0.0 else set())
 
 
 def test_unstamped_velocity_waits_for_the_clock_to_begin(ros, clock, tmp_path):
@@ -310,6 +361,7 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
     end_ns = max(event.stamp_ns for event in events)
     # A wide window, since a busy machine may deliver one topic well before the other.
     parameters = {'reorder_window': 1.0, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
+    parameters['landmarks_max_wait'] = 60.0
     with ExitStack() as stack:
         maps, robots = {}, {}
         for name in orders:
@@ -366,3 +418,14 @@ def test_looped_recording_without_simulated_time_begins_path_and_tf_again(ros, t
 
 def corrections(transforms):
     return [t for m in transforms for t in m.transforms if t.header.frame_id == 'map']
+
+
+@pytest.mark.parametrize(
+    ('behind_ns', 'is_said'), [(3 * SECOND // 2, True), (-100 * SECOND, False)]
+)
+def test_stamps_that_are_behind_may_be_late_those_ahead_not(behind_ns, is_said):
+    robot = AnotherClock(behind_ns)
+    robot.send_all()
+    problems = robot.feed.clock_problems()
+    assert len(problems) == 2
+    assert all(('or what publishes them is that late' in text) == is_said for text in problems)

@@ -238,3 +238,16 @@ def test_no_odometry_is_looked_for_unless_its_frame_is_named(robot):
     robot.broadcaster = PoseBroadcaster(robot.node, settings, robot.buffer, WINDOW_S)
     robot.run(0.1, lag_s=0.0)
     assert children(robot.take()) == {'base_link'}
+
+
+def test_another_publisher_of_the_same_transform_is_named_until_it_ends(robot):
+    robot.run(1.0, lag_s=0.0)
+    for transform in robot.take():
+        robot.broadcaster.hear('map', 'odom', stamp_ns(transform))
+    robot.broadcaster.hear('odom', 'base_link', robot.now_ns)
+    assert not robot.broadcaster.rival, 'its own, heard back'
+    robot.broadcaster.hear('map', 'odom', robot.now_ns + 7)
+    assert robot.broadcaster.rival.startswith("another node publishes 'map' to 'odom' on /tf")
+    assert robot.logged.count('another node publishes') == 1
+    robot.run(10.0, lag_s=0.0)
+    assert not robot.broadcaster.rival

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -77,19 +77,27 @@ def _velocity_input(
 def _landmark_input(
     node: Node, settings: ObserverNodeSettings, feed: EstimatorFeed
 ) -> InputTopic[Any]:
-    qos = _qos(settings.landmarks_qos, settings.queue_depth)
+    name = 'landmarks'
+    take: Callable[[Any, int], None] = feed.add_observation
+    decoders: dict[str, Any]
     if settings.landmarks_type == ON_TF:
-        decoder = TagDecoder(node, settings.tag_frame_prefix)
-        return InputTopic(node, '/tf', {TRANSFORMS: decoder}, feed.add_observations, qos)
-    if settings.landmarks_type == 'AprilTagDetectionArray':
-        decoders: dict[str, Any] = {APRILTAGS: decode_apriltags}
-        return InputTopic(node, 'landmarks', decoders, partial(feed.add, 'landmarks'), qos)
-    if settings.landmarks_type == AUTO:
+        name, take = '/tf', feed.add_observations
+        decoders = {TRANSFORMS: TagDecoder(node, settings.tag_frame_prefix)}
+    elif settings.landmarks_type == 'AprilTagDetectionArray':
+        take, decoders = partial(feed.add, 'landmarks'), {APRILTAGS: decode_apriltags}
+    elif settings.landmarks_type == AUTO:
         # Not detections: their package, which need not be installed, would be imported unasked.
         decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
-        return InputTopic(node, 'landmarks', decoders, feed.add_observation, qos)
-    decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
-    return InputTopic(node, 'landmarks', decoders, feed.add_observation, qos)
+    else:
+        decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
+    qos = _qos(settings.landmarks_qos, settings.queue_depth)
+    topic = InputTopic(node, name, decoders, take, qos, settings.landmarks_max_wait)
+    topic.is_shared = True
+    topic.advice = {
+        message_type: f'landmarks_type: {message_type.rsplit("/", 1)[-1]}'
+        for message_type in (APRILTAGS, *DETECTION_DECODERS, *CLOUD_DECODERS)
+    }
+    return topic
 
 
 def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:

@@ -51,7 +51,10 @@ class ClockOffset:
         advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
         if is_simulated:
             advice = 'does what publishes it use /clock, and does this machine keep up with it'
-        return f'stamps on {topic} are {self}: {advice}, or set correct_clock_offset'
+        late = ''
+        if (self.offset_ns or 0) < 0:
+            late = ', or what publishes them is that late: then make it faster; otherwise'
+        return f'stamps on {topic} are {self}{late or ":"} {advice}, or set correct_clock_offset'
 
     def add(self, stamp_ns: int, receive_ns: int) -> None:
         """Take the stamp and the time of reception of a message."""

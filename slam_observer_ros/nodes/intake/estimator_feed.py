@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 import time
 
@@ -28,6 +28,7 @@ from slam_observer_ros.inputs.event_builder import (
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_problem
+from slam_observer_ros.nodes.intake.clock_change import ClockChange
 from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -47,6 +48,8 @@ class EstimatorFeed:
     ----------
     dropped : Counter
         Messages that did not become events, by reason.
+    on_events : callable
+        Called after events were used.
     clocks : dict of str to ClockOffset
         How far off the stamps are, by input.
     is_active : bool
@@ -72,6 +75,7 @@ class EstimatorFeed:
             estimator.settings.velocity_timeout,
             self._drop_measured,
         )
+        self._change = ClockChange()
         self._log = ThrottledLog(node)
         self._processing_s = 0.0
         self._processed = 0
@@ -83,9 +87,40 @@ class EstimatorFeed:
         self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
         self.is_active = False
         self.is_paused = False
+        self.on_events: Callable[[], None] = lambda: None
 
     def add(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Take what an input measures; without a stamp it has that of its reception."""
+        if not (self.is_active and self._is_of_another_run(name, measured, receive_ns)):
+            self._use(name, measured, receive_ns)
+
+    def begin_clock_jump(self, back_ns: int) -> None:
+        """Use only what is of the time before /clock has jumped back, nanoseconds, until the end.
+
+        What is of the time since is kept.
+        """
+        self._change.begin(back_ns)
+
+    def end_clock_jump(self) -> None:
+        """Use what has been kept."""
+        for received in self._change.end():
+            self._use(*received)
+
+    def _is_of_another_run(self, name: str, measured: Measured, receive_ns: int) -> bool:
+        """Return whether a message is of before a jump of /clock, or waits for one."""
+        is_corrected, clock = self._settings.correct_clock_offset, self.clocks[name]
+        if not self._is_simulated or (is_corrected and clock.offset_ns is None):
+            return False
+        timed = with_receive_time(measured, receive_ns)
+        stamp_ns = timed.stamp_ns + (clock.correction_ns if is_corrected else 0)
+        if self._change.hold((name, timed, receive_ns), stamp_ns, self._usable_from_ns):
+            return True
+        if self._change.is_over(stamp_ns, receive_ns):
+            self.dropped['last_run'] += 1
+            return True
+        return False
+
+    def _use(self, name: str, measured: Measured, receive_ns: int) -> None:
         timed = with_receive_time(measured, receive_ns)
         if not self._is_usable(name, timed.stamp_ns, receive_ns):
             return
@@ -110,7 +145,9 @@ class EstimatorFeed:
             self.add_observation(each, receive_ns)
 
     def retry(self) -> None:
-        """Try again what waits for a transform; call it often."""
+        """Try again what waits for a transform, or for /clock to jump; call it often."""
+        for received in self._change.take_overdue():
+            self._use(*received)
         self._give(self._builder.retry(time.monotonic_ns()))
 
     def clear(self) -> None:
@@ -130,6 +167,13 @@ class EstimatorFeed:
         ]
 
     @property
+    def _usable_from_ns(self) -> int:
+        """Stamp before which an event is refused as too late, nanoseconds."""
+        settings = self._estimator.settings
+        reach_ns = to_ns(settings.reorder_window + settings.late_limit)
+        return (self._estimator.newest_stamp_ns or 0) - reach_ns
+
+    @property
     def _is_simulated(self) -> bool:
         return bool(self._node.get_clock().ros_time_is_active)
 
@@ -146,6 +190,8 @@ class EstimatorFeed:
             self._estimator.add(event)
             self._processing_s += time.perf_counter() - start_s
             self._processed += 1
+        if events:
+            self.on_events()
 
     def _in_own_time(self, event: Event) -> Event:
         stamp_ns = event.stamp_ns
@@ -189,4 +235,4 @@ class EstimatorFeed:
     def _drop(self, reason: str, text: str) -> None:
         self.dropped[reason] += 1
         count = self.dropped[reason]
-        self._log.warning(reason, f'dropped a message ({reason}, {count} so far): {text}')
+        self._log.warning(reason, f'Dropped a message, {reason}: {text} ({count} so far).')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import math
 import time
 from typing import Any, Generic, TypeVar
 
@@ -15,6 +16,7 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.intake.backlog import Backlog
+from slam_observer_ros.nodes.intake.load_shedding import LoadShedding, Waiting
 from slam_observer_ros.nodes.message_classes import message_class
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
@@ -26,6 +28,14 @@ Where an announcement was lost, as on a busy machine, DDS repeats it after 3 s o
 
 MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
+
+
+def several(publishers: Sequence[TopicEndpointInfo]) -> str:
+    """Return who publishes on a topic, if more than one does; else ''."""
+    if len(publishers) < 2:
+        return ''
+    names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
+    return f'{len(names)} publishers ({", ".join(names)})'
 
 
 class InputTopic(Generic[MessageT]):
@@ -43,6 +53,9 @@ class InputTopic(Generic[MessageT]):
     on_message : callable
         Called with each decoded message and the ROS time of its reception in nanoseconds.
     qos : QoSProfile
+    max_wait_s : float, optional
+        How long messages may wait before only the newest of each sensor is used, seconds; by
+        default all are used.
 
     Attributes
     ----------
@@ -50,6 +63,12 @@ class InputTopic(Generic[MessageT]):
         Topic name after remapping.
     received, malformed : int
         Messages so far, and those that could not be decoded.
+    shedding : LoadShedding
+        What is dropped, and how much was, as they come faster than they can be used.
+    advice : mapping of str to str
+        Which parameter would make other message types that may be found be read.
+    is_shared : bool
+        Whether several may publish on it, as several sensors of landmarks.
     read_first : sequence of InputTopic
         Other inputs, of which what was received before a message of this one is read before it.
         An executor reads one message of each topic in turn, so after the node was busy a slow
@@ -65,11 +84,14 @@ class InputTopic(Generic[MessageT]):
         decoders: Mapping[str, Decoder[MessageT]],
         on_message: Callable[[MessageT, int], None],
         qos: QoSProfile,
+        max_wait_s: float = math.inf,
     ) -> None:
         self._node = node
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
+        self.is_shared = False
+        self.advice: Mapping[str, str] = {}
         self.read_first: Sequence[InputTopic[Any]] = ()
         self._received_ns = 0  # by DDS
         self._subscription: Subscription | None = None
@@ -80,6 +102,8 @@ class InputTopic(Generic[MessageT]):
         self.malformed = 0
         self._fault = ''
         self.backlog = Backlog()
+        self.shedding = LoadShedding(max_wait_s)
+        self._is_shedding = max_wait_s < math.inf
         self.last_received_s: float | None = None
         self._log = ThrottledLog(node, DISCOVERY_S)
         if len(decoders) == 1:
@@ -103,7 +127,10 @@ class InputTopic(Generic[MessageT]):
         age_s = self.age_s or 0.0
         if age_s > DISCOVERY_S:
             return f"no message on '{self.topic}' for {age_s:.0f} s, though it has a publisher"
-        return self.backlog.problem(self.topic, time.monotonic())
+        now_s = time.monotonic()
+        if doubt := getattr(self._decoders.get(self._type_name), 'problem', ''):
+            return str(doubt)
+        return self.shedding.problem(self.topic, now_s) or self.backlog.problem(self.topic, now_s)
 
     def check_publishers(self) -> None:
         """See what the topic carries; subscribe to it, or report why nothing comes."""
@@ -132,21 +159,46 @@ class InputTopic(Generic[MessageT]):
 
     def read_until(self, received_ns: int) -> None:
         """Read what waits, up to what DDS has received at a time, nanoseconds."""
-        subscription = self._subscription
         for _ in range(self._qos.depth):
-            if subscription is None or self._received_ns >= received_ns:
+            if self._received_ns >= received_ns:
                 return
-            with subscription.handle:
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            taken = self._take()
             if taken is None:
                 return
             self._receive(*taken)
 
+    def _take(self) -> tuple[bytes, Mapping[str, int]] | None:
+        """Take the next message that waits, with what DDS knows of it; None if there is none."""
+        subscription = self._subscription
+        if subscription is None:
+            return None
+        with subscription.handle:
+            taken: tuple[bytes, Mapping[str, int]] | None = subscription.handle.take_message(
+                subscription.msg_type, subscription.raw
+            )
+        return taken
+
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
+        for waiting in self._newest(raw, info) if self._is_shedding else self._decode(raw, info):
+            if waiting.received_ns:
+                for other in self.read_first:
+                    other.read_until(waiting.received_ns)
+            self._on_message(waiting.message, waiting.receive_ns)
+
+    def _newest(self, raw: bytes, info: Mapping[str, int]) -> list[Waiting]:
+        """Decode a message and those behind it; return those to be used."""
+        waiting = self._decode(raw, info)
+        for _ in range(self._qos.depth):
+            taken = self._take()
+            if taken is None:
+                break
+            waiting += self._decode(*taken)
+        return self.shedding.newest(waiting, time.time_ns(), time.monotonic())
+
+    def _decode(self, raw: bytes, info: Mapping[str, int]) -> list[Waiting]:
+        """Return a message, decoded, in a list; none if it can't be."""
         self._received_ns = info['received_timestamp']
-        for other in self.read_first:
-            other.read_until(self._received_ns)
-        receive_ns = self._reception_ns(info['received_timestamp'])
+        receive_ns = self._reception_ns(self._received_ns)
         self.received += 1
         self.last_received_s = time.monotonic()
         try:
@@ -154,8 +206,8 @@ class InputTopic(Generic[MessageT]):
         except MessageError as error:
             self.malformed += 1
             self._log.warning(self.topic, f"malformed message on '{self.topic}' dropped: {error}")
-            return
-        self._on_message(message, receive_ns)
+            return []
+        return [Waiting(message, self._received_ns, receive_ns)]
 
     def _reception_ns(self, received_ns: int) -> int:
         """Return when a message was received, by the ROS clock."""
@@ -175,7 +227,10 @@ class InputTopic(Generic[MessageT]):
             return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
         if not usable:
             found = ', '.join(sorted({publisher.topic_type for publisher in publishers}))
-            return f"'{self.topic}' carries {found}; {wanted} is needed"
+            hint = ''.join(f'; set {self.advice[t]}' for t in self.advice if t in found)
+            return f"'{self.topic}' carries {found}; {wanted} is needed{hint}"
+        if not self.is_shared and (rivals := several(publishers)):
+            return f"{rivals} publish on '{self.topic}': remap all but one"
         for publisher in publishers:
             compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
             if compatibility == QoSCompatibility.ERROR:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import re
+from typing import Any, Protocol
 
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.subscription import Subscription
 from rclpy.time import Time
 
 from slam_observer_ros.common.errors import MessageError, TransformError
@@ -27,6 +29,16 @@ TF_QOS = QoSProfile(depth=100)
 TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+class LiveTransforms(TransformSource, Protocol):
+    """Transforms that come in while a node runs."""
+
+    on_transform: Callable[[str, str, int], None]
+    """Called with parent, child and stamp, nanoseconds, of each transform on /tf."""
+
+    def read_waiting(self) -> None:
+        """Take what has come on /tf: while the node was busy, it may be a lot."""
+
+
 class TopicTransforms:
     """A listener of /tf and /tf_static of our own; without tf2_msgs no transform is ever known.
 
@@ -38,35 +50,55 @@ class TopicTransforms:
         self._node = node
         self._own = own
         self._log = ThrottledLog(node)
+        self.on_transform: Callable[[str, str, int], None] = _ignore
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
         self.newest_ns = self._buffer.newest_ns
         self.parent_of = self._buffer.parent_of
         self.clear = self._buffer.clear
+        self._dynamic: Subscription | None = None
         if TFMessage is not None:
-            self._subscribe('/tf', TF_QOS, is_static=False)
+            self._dynamic = self._subscribe('/tf', TF_QOS, is_static=False)
             self._subscribe('/tf_static', TF_STATIC_QOS, is_static=True)
 
-    def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> None:
+    def read_waiting(self) -> None:
+        """As :meth:`LiveTransforms.read_waiting`."""
+        if self._dynamic is not None:
+            _read_waiting(self._dynamic)
+
+    def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> Subscription:
         def receive(raw: bytes) -> None:
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
                 self._log.warning(topic, f"malformed message on '{topic}' dropped: {error}")
                 return
+            if not is_static:
+                for each in transforms:
+                    self.on_transform(each.frame_id, each.child_frame_id, each.stamp_ns)
             others = [t for t in transforms if (t.frame_id, t.child_frame_id) != self._own]
             insert_transforms(self._buffer, others, is_static=is_static)
 
-        self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
+        return self._node.create_subscription(TFMessage, topic, receive, qos, raw=True)
 
 
 class Tf2Transforms:
     """tf2_ros's buffer and listener."""
 
     def __init__(self, node: Node) -> None:
+        self.on_transform: Callable[[str, str, int], None] = _ignore
         self._buffer = tf2_ros.Buffer()
+        self._insert = self._buffer.set_transform
+        self._buffer.set_transform = self._set_transform
         self._listener = tf2_ros.TransformListener(self._buffer, node)
         self.clear: Callable[[], None] = self._buffer.clear
+
+    def _set_transform(self, stamped: Any, authority: str) -> None:
+        """Take a transform from the listener, which gives the buffer all of /tf this way."""
+        header = stamped.header
+        stamp_ns = Time.from_msg(header.stamp).nanoseconds
+        self.on_transform(header.frame_id, stamped.child_frame_id, stamp_ns)
+        self._insert(stamped, authority)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
         """As :meth:`TransformSource.lookup`."""
@@ -78,6 +110,10 @@ class Tf2Transforms:
         return pose_matrices(
             np.array([position.x, position.y, position.z]), np.array([q.x, q.y, q.z, q.w])
         )
+
+    def read_waiting(self) -> None:
+        """As :meth:`LiveTransforms.read_waiting`."""
+        _read_waiting(self._listener.tf_sub)
 
     def parent_of(self, frame: str) -> str | None:
         """As :meth:`TransformSource.parent_of`."""
@@ -98,7 +134,21 @@ class Tf2Transforms:
         return newest_ns or ALWAYS_NS  # tf2 has zero for what is static
 
 
-def open_transforms(node: Node, own: tuple[str, str]) -> TransformSource:
+def _ignore(_parent: str, _child: str, _stamp_ns: int) -> None:
+    """Take no notice of a transform."""
+
+
+def _read_waiting(subscription: Subscription) -> None:
+    """Give a subscription's callback what waits, which an executor does one by one."""
+    for _ in range(TF_QOS.depth):
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return
+        subscription.callback(taken[0])
+
+
+def open_transforms(node: Node, own: tuple[str, str]) -> LiveTransforms:
     """Return tf2_ros's buffer where ROS provides it, else :class:`TopicTransforms`."""
     # tf2 keeps the parent of each stamp, so that one does not replace another.
     return TopicTransforms(node, own) if tf2_ros is None else Tf2Transforms(node)

@@ -57,18 +57,27 @@ class CloudDecoder:
 
 
 class OdometryDecoder:
-    """Decodes velocities of odometries; warns once if these are zero though the poses move."""
+    """Decodes velocities of odometries; warns if all of these are zero though the poses move.
+
+    Attributes
+    ----------
+    problem : str
+        What is wrong with them; empty until it is seen, and once a velocity is not zero.
+
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._is_checked = False
+        self.problem = ''
         self._first: FloatArray | None = None
 
     def __call__(self, raw: Buffer, receive_ns: int) -> Measurement[VelocityEvent]:
         """Decode the velocity of a nav_msgs/Odometry."""
         message = decode_odometry_twist(raw, receive_ns)
         # One that has given a velocity will do so again.
-        self._is_checked = self._is_checked or bool(message.event.body_velocity.any())
+        if (self.problem or not self._is_checked) and message.event.body_velocity.any():
+            self._is_checked, self.problem = True, ''
         if not self._is_checked:
             self._check(raw)
         return message
@@ -83,10 +92,11 @@ class OdometryDecoder:
         if np.linalg.norm(position - self._first) > MOVED_M:
             self._is_checked = True
             topic = self._node.resolve_topic_name('twist')
-            self._node.get_logger().warning(
+            self.problem = (
                 f"all velocities on '{topic}' are zero, but its poses move: set velocity_source "
                 "to 'pose_differences'"
             )
+            self._node.get_logger().warning(self.problem)
 
 
 class TagDecoder:

@@ -39,8 +39,10 @@ class DiagnosticsPublisher:
         feed: EstimatorFeed,
         inputs: Sequence[InputTopic[Any]],
         estimate_publisher: EstimatePublisher,
+        hardware_id: str,
     ) -> None:
         self._node = node
+        self._hardware_id = hardware_id
         self._estimator = estimator
         self._feed = feed
         self._inputs = inputs
@@ -67,8 +69,8 @@ class DiagnosticsPublisher:
         values = self._input_values() | self._estimator_values()
         status = DiagnosticStatus(
             level=level,
-            name=f'{self._node.get_name()}: estimate',
-            hardware_id=self._node.get_namespace(),
+            name=f'{self._node.get_fully_qualified_name().lstrip("/")}: estimate',
+            hardware_id=self._hardware_id,
             message='; '.join(warnings) or 'running',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
@@ -95,7 +97,7 @@ class DiagnosticsPublisher:
     def _estimator_values(self) -> dict[str, str]:
         estimator, update = self._estimator, self._estimator.last_update
         values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
-        dropped = estimator.dropped + self._feed.dropped
+        dropped = self._dropped()
         values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
         values['landmarks known'] = str(len(estimator.landmark_ids))
         values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
@@ -106,16 +108,22 @@ class DiagnosticsPublisher:
 
     def _progress(self) -> tuple[Counter[str], Counter[str]]:
         """Return why messages were dropped since the last time, and what else was counted."""
-        dropped = self._estimator.dropped + self._feed.dropped
+        dropped = self._dropped()
         dropped['malformed'] += sum(source.malformed for source in self._inputs)
         counts = self._estimator.counts
         since_last = dropped - self._last_dropped, counts - self._last_counts
         self._last_dropped, self._last_counts = dropped, counts
         return since_last
 
+    def _dropped(self) -> Counter[str]:
+        """Return why messages that could be read were not used."""
+        shed = Counter(overload=sum(source.shedding.shed for source in self._inputs))
+        return self._estimator.dropped + self._feed.dropped + shed
+
     def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
         warnings += self._feed.clock_problems()
+        warnings.append(self._estimate_publisher.rivals())
         if self._feed.is_paused:
             warnings.append('paused')
         elif dropped:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+import time
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -14,17 +15,23 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.nodes.intake.input_topic import several
+from slam_observer_ros.nodes.intake.transform_listener import LiveTransforms
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
-from slam_observer_ros.nodes.qos import LATCHED_QOS, RELIABLE_QOS
+from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_QOS
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
 """Topics of the estimate, before remapping."""
+
+EARLY = 0.5
+"""Part of the period by which a state may come early, so that one of an input of the same rate,
+which jitters, is never left for the next."""
 
 PATH_SPACING_NS = 100_000_000
 """Least time between two poses of the path, nanoseconds."""
@@ -43,17 +50,20 @@ class EstimatePublisher:
         node: Node,
         settings: ObserverNodeSettings,
         estimator: Estimator,
-        transforms: TransformSource,
+        transforms: LiveTransforms,
     ) -> None:
         self._node = node
         self._settings = settings
+        self._log = ThrottledLog(node)
         self._estimator = estimator
+        self._period_s = 1.0 / settings.publish_rate
+        self._due_s = 0.0  # when the next state may be published, by a steady clock
         self._fast_stamp_ns: int | None = None
         self._slow_stamp_ns: int | None = None
         self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
         self._path_stamp_ns: int | None = None
         self._odometry = node.create_publisher(Odometry, 'odometry', RELIABLE_QOS)
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', RELIABLE_QOS)
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', LATCHED_POSE_QOS)
         self._lyapunov = node.create_publisher(Float64, 'lyapunov', RELIABLE_QOS)
         self._estimates = node.create_publisher(PointCloud, 'landmark_estimates', RELIABLE_QOS)
         self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
@@ -64,19 +74,40 @@ class EstimatePublisher:
             self._broadcaster = PoseBroadcaster(
                 node, settings, transforms, estimator.settings.reorder_window
             )
+            transforms.on_transform = self._broadcaster.hear
 
     @property
     def problem(self) -> str:
         """Why the transform is not published as it should be; empty while it is."""
-        return '' if self._broadcaster is None else self._broadcaster.problem
+        if self._broadcaster is None:
+            return ''
+        return self._broadcaster.problem or self._broadcaster.rival
+
+    def rivals(self) -> str:
+        """Report other publishers of the odometry; empty if there are none. It is logged, too."""
+        topic = self._node.resolve_topic_name('odometry')
+        names = several(self._node.get_publishers_info_by_topic(topic))
+        if not names:
+            return ''
+        text = f"{names} publish on '{topic}': remap all but one"
+        self._log.warning(topic, text)
+        return text
+
+    @property
+    def is_due(self) -> bool:
+        """Whether ``publish_rate`` allows to publish a state now."""
+        return time.monotonic() >= self._due_s - EARLY * self._period_s
 
     def publish_state(self) -> None:
-        """Publish odometry, pose, transform, Lyapunov value and landmarks if they are new."""
+        """Publish odometry, pose, transform, Lyapunov value and landmarks if new and due."""
         if self._broadcaster is not None:
             self._broadcaster.retry()
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns in (None, self._fast_stamp_ns) or not self._estimator.is_localised:
+        if stamp_ns is None or stamp_ns == self._fast_stamp_ns or not self.is_due:
             return
+        if not self._estimator.is_localised:
+            return
+        self._due_s = max(self._due_s, time.monotonic()) + self._period_s
         self._fast_stamp_ns = stamp_ns
         pose = self._estimator.pose
         self._publish_pose(stamp_ns, pose)
@@ -129,14 +160,17 @@ class EstimatePublisher:
     def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
         header = MESSAGES.header(stamp_ns, self._settings.map_frame)
         uncertain = MESSAGES.pose_with_covariance(pose, self._estimator.pose_covariance)
-        twist = MESSAGES.twist_with_covariance(self._estimator.body_velocity, None)
+        estimator = self._estimator
+        uncertain_twist = MESSAGES.twist_with_covariance(
+            estimator.body_velocity, estimator.body_velocity_covariance
+        )
         self._pose.publish(PoseWithCovarianceStamped(header=header, pose=uncertain))
         self._odometry.publish(
             Odometry(
                 header=header,
                 child_frame_id=self._settings.base_frame,
                 pose=uncertain,
-                twist=twist,
+                twist=uncertain_twist,
             )
         )
 

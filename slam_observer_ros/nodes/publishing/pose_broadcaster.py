@@ -20,6 +20,8 @@ from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 DISCOVERY_S = 2.0  # from the first pose on, before the base is taken to have no parent on /tf
 MAX_WAITING_NS = 10_000_000_000  # a pose waits for odometry as long as tf keeps transforms
 LATE_NS = 500_000_000  # odometry that is further behind the poses is reported
+OWN_STAMPS = 2000  # of what was published here, by which it is known when it is heard back
+RIVAL_S = 5.0  # how long another publisher of the same transform is reported
 CHECK_PERIOD_S = 0.5  # between two searches for another parent of the base
 
 
@@ -69,6 +71,8 @@ class PoseBroadcaster:
         self._waiting: deque[tuple[int, FloatArray]] = deque()
         self._correction: FloatArray | None = None
         self._last_ns: int | None = None
+        self._own_ns: deque[int] = deque(maxlen=OWN_STAMPS)
+        self._rival_s = -RIVAL_S
         self.problem = ''
 
     def add(self, stamp_ns: int, pose: FloatArray) -> None:
@@ -79,6 +83,26 @@ class PoseBroadcaster:
         while self._waiting[0][0] < stamp_ns - MAX_WAITING_NS:
             self._waiting.popleft()
         self.retry()
+
+    def hear(self, parent: str, child: str, stamp_ns: int) -> None:
+        """Take a transform that was heard on /tf: nobody else may give the same frame a parent."""
+        ends = [self._settings.map_frame, self._child]
+        if [parent, child] != (ends[::-1] if self._settings.invert_tf else ends):
+            return
+        if stamp_ns not in self._own_ns:
+            self._rival_s = time.monotonic()
+            self._log.warning('another', self.rival)
+
+    @property
+    def rival(self) -> str:
+        """Report another publisher of the transform that goes out here; empty if there is none."""
+        if not self._child or time.monotonic() - self._rival_s > RIVAL_S:
+            return ''
+        return (
+            f"another node publishes '{self._settings.map_frame}' to '{self._child}' on /tf, too: "
+            'end it, as another localisation, give each robot its own frames, or set publish_tf '
+            'to false'
+        )
 
     def retry(self) -> None:
         """Publish the newest pose that can be."""
@@ -189,6 +213,7 @@ class PoseBroadcaster:
         if stamp_ns == self._last_ns:
             return
         self._last_ns = stamp_ns
+        self._own_ns.append(stamp_ns)
         if self._settings.invert_tf:
             self._publisher.publish(
                 stamp_ns, self._child, self._settings.map_frame, se3.inverse(pose)
