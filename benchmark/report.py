@@ -427,7 +427,9 @@ def _draw_ratios(axes: Axes, table: Table) -> None:
     axes.yaxis.set_major_locator(FixedLocator(RATIO_TICKS))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter('{x:g}')
-    axes.set_xticks(positions, [fill(world, 12) for world in table], fontsize=8)
+    axes.set_xticks(
+        positions, [fill(world, 12, break_long_words=False) for world in table], fontsize=8
+    )
     axes.set_xlim(-0.5, len(table) - 0.5)
     axes.set_title('Configuration error as a multiple of that of iSAM2')
     axes.legend(ncols=len(DRAWN), fontsize=8)
