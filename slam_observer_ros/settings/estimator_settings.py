@@ -255,8 +255,7 @@ class Settings(Immutable):
     calibration_drift: float = parameter(
         0.0,
         'Scheduled and Riccati gains: how fast scale, bias and delay of the velocity drift, as a '
-        'share of the standard deviation of each; above 0, where any of them is estimated, '
-        'Riccati gains do not relinearise',
+        'share of the standard deviation of each',
         unit='1/√s',
         minimum=0.0,
     )

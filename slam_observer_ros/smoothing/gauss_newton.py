@@ -8,7 +8,8 @@ c ← c + dc. Landmarks and calibration together are called the border. The norm
     [ Bᵀ  D ] [ dc, dp ] = − [ h ]
 
 have a block-tridiagonal T, since odometry links each pose to the next one only; so an iteration
-costs O(S n²), not O(S³). Outliers are reweighted in each iteration (Huber).
+costs O(S n²), not O(S³). Where the calibration drifts, each pose has one of its own, in T.
+Outliers are reweighted in each iteration (Huber).
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ class Keyframes:
     motion_covariances: FloatArray  # (S, d, d) of each motion as a right perturbation
     sensitivities: FloatArray  # (S, d, c) derivative of each motion by the calibration, so too
     calibrations: FloatArray  # (S, c) with which each motion was computed
+    drift_covariances: FloatArray  # (S, c, c) of what the calibration drifted by meanwhile
     keyframes: IntArray  # (M,) in which keyframe each point was observed
     landmarks: IntArray  # (M,) which landmark it is
     points: FloatArray  # (M, 3) where it was seen, metres, body frame
@@ -67,6 +69,7 @@ def no_keyframes(d: int, c: int, k: int) -> Keyframes:
         motion_covariances=np.empty((0, d, d)),
         sensitivities=np.empty((0, d, c)),
         calibrations=np.empty((0, c)),
+        drift_covariances=np.empty((0, c, c)),
         keyframes=none,
         landmarks=none,
         points=np.empty((0, 3)),
@@ -80,7 +83,7 @@ class Solution:
     """Smoothed estimates."""
 
     poses: FloatArray  # (S + 1, 4, 4) of the prior, then of each keyframe
-    calibration: FloatArray  # (c,) of the velocity
+    calibrations: FloatArray  # (S + 1, c) of the velocity; all the same unless it drifts
     points: FloatArray  # (n, 3) landmarks, metres
 
 
@@ -93,7 +96,7 @@ class Step:
     factors: Factors  # of the equations at ``start``
 
     def marginal(self) -> FloatArray:
-        """Return the covariance of (η, dc, dp) at ``start``, η being that of the last pose."""
+        """Return the covariance of (η, dc, dp) at ``start``, η and dc being the last ones."""
         return self.factors.marginal()
 
 
@@ -101,7 +104,8 @@ class Smoother:
     """Gauss–Newton iterations over a prior and the keyframes since.
 
     ``axes`` are the d of the pose and k of a point that are estimated; of the settings,
-    ``huber_threshold`` and ``rejection_threshold`` weigh outliers.
+    ``huber_threshold`` and ``rejection_threshold`` weigh outliers, and ``calibration_drift`` says
+    whether there is one calibration, of the border, or one at each of the chain's poses.
     """
 
     def __init__(
@@ -111,7 +115,9 @@ class Smoother:
         self._prior = prior
         self._keyframes = keyframes
         self._settings = settings
-        self._motion_information = _inverse(keyframes.motion_covariances)
+        drifts, c = settings.calibration_drift > 0.0, len(prior.calibration)
+        self._chained, self._shared = (c, 0) if drifts else (0, c)
+        self._link_information = _link_information(keyframes, drifts)
         self._prior_information = _inverse(prior.covariance)
 
     def smooth(self, start: Solution, iterations: int, tolerance: float) -> Step:
@@ -132,18 +138,19 @@ class Smoother:
     def _moved(
         self, solution: Solution, change: FloatArray, border_change: FloatArray
     ) -> Solution:
-        c = len(solution.calibration)
+        d, c = self._axes.p, self._shared
         eta = np.zeros((len(change), 6))
-        eta[:, self._axes.pose] = change
+        eta[:, self._axes.pose] = change[:, :d]
         return Solution(
             solution.poses @ se3.exp(eta),
-            solution.calibration + border_change[:c],
+            solution.calibrations + (border_change[:c] if c else change[:, d:]),
             solution.points + self._axes.full_points(border_change[c:]),
         )
 
     def _linearise(self, solution: Solution) -> Equations:
-        c, k, keyframes = len(solution.calibration), self._axes.point, self._keyframes
-        S, d, b = len(solution.poses), self._axes.p, c + k * len(solution.points)
+        c, k, keyframes = self._shared, self._axes.point, self._keyframes
+        S, b = len(solution.poses), c + k * len(solution.points)
+        d = self._axes.p + self._chained
         # What the observations say of poses, landmarks, and of both together.
         H, gradient = self._observations(solution)
         poses, landmarks, n = keyframes.keyframes + 1, keyframes.landmarks, len(solution.points)
@@ -172,10 +179,10 @@ class Smoother:
             self._axes,
             self._prior_information,
             solution.poses[0],
-            solution.calibration,
+            solution.calibrations[0],
             solution.points,
         )
-        d = self._axes.p
+        d = self._axes.p + self._chained
         known = len(gradient) - d
         equations.diagonal[0] += information[:d, :d]
         equations.first[:, :known] += information[:d, d:]
@@ -185,24 +192,9 @@ class Smoother:
 
     def _add_motions(self, equations: Equations, solution: Solution) -> None:
         """Add e_s = log((M_s exp(F_s (c − c_s)))⁻¹ Â_{s−1}⁻¹ Â_s) of each motion M_s."""
-        keyframes, pose = self._keyframes, self._axes.pose
-        d, c = self._axes.p, len(solution.calibration)
-        # The motions, had they been computed with this calibration, and their errors.
-        eta = np.zeros((len(keyframes.motions), 6))
-        off = solution.calibration - keyframes.calibrations
-        eta[:, pose] = (keyframes.sensitivities @ off[:, :, None])[:, :, 0]
-        back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
-        motions = keyframes.motions @ se3.exp(eta)
-        error = se3.log(se3.inverse(back @ motions))
-        # Derivatives by the pose after a motion, by that before, and by the calibration.
-        J_to = self._estimated(se3.left_jacobian_inverse(-error))
-        J_from = -J_to @ self._estimated(se3.adjoint(back))
-        F = keyframes.sensitivities
-        if c:
-            J_off = -J_to @ self._estimated(se3.adjoint(back @ motions) @ se3.left_jacobian(-eta))
-            F = J_off @ F
-        J = np.concatenate([J_from, J_to, F], axis=2)
-        H, gradient = _normal(J, self._motion_information, error[:, pose])
+        d, c = self._axes.p + self._chained, self._shared
+        J, error = self._links(solution)
+        H, gradient = _normal(J, self._link_information, error)
         # The blocks of the poses before (:-1) and after (1:), and of the calibration.
         equations.diagonal[:-1] += H[:, :d, :d]
         equations.diagonal[1:] += H[:, d : 2 * d, d : 2 * d]
@@ -214,6 +206,39 @@ class Smoother:
         equations.gradient[1:] += gradient[:, d : 2 * d]
         equations.border_gradient[:c] += np.sum(gradient[:, 2 * d :], axis=0)
 
+    def _links(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives of e_s by both poses and the calibration, and e_s (S, d).
+
+        Where the calibration drifts, e_s (S, d + c) ends in c_s − c_{s−1}.
+        """
+        keyframes, pose = self._keyframes, self._axes.pose
+        # The motions, had they been computed with this calibration, and their errors.
+        eta = np.zeros((len(keyframes.motions), 6))
+        off = solution.calibrations[:-1] - keyframes.calibrations
+        eta[:, pose] = (keyframes.sensitivities @ off[:, :, None])[:, :, 0]
+        back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
+        motions = keyframes.motions @ se3.exp(eta)
+        error = se3.log(se3.inverse(back @ motions))
+        # Derivatives by the pose after a motion, by that before, and by the calibration.
+        J_to = self._estimated(se3.left_jacobian_inverse(-error))
+        J_from = -J_to @ self._estimated(se3.adjoint(back))
+        F = keyframes.sensitivities
+        if F.shape[2]:
+            J_off = -J_to @ self._estimated(se3.adjoint(back @ motions) @ se3.left_jacobian(-eta))
+            F = J_off @ F
+        if not self._chained:
+            return np.concatenate([J_from, J_to, F], axis=2), error[:, pose]
+        drift = np.diff(solution.calibrations, axis=0)
+        return self._chained_links(J_from, J_to, F), np.hstack([error[:, pose], drift])
+
+    def _chained_links(self, J_from: FloatArray, J_to: FloatArray, F: FloatArray) -> FloatArray:
+        """Return (S, d + c, 2 d + 2 c), the derivatives by both poses and their calibrations."""
+        d, c = F.shape[1:]
+        J = np.zeros((len(F), d + c, 2 * (d + c)))
+        J[:, :d, :d], J[:, :d, d : d + c], J[:, :d, d + c : -c] = J_from, F, J_to
+        J[:, d:, d : d + c], J[:, d:, -c:] = -np.eye(c), np.eye(c)
+        return J
+
     def _estimated(self, matrices: FloatArray) -> FloatArray:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""
         pose = self._axes.pose
@@ -222,7 +247,8 @@ class Smoother:
     def _observations(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return the normal equations of R_Âᵀ (p_i − x_Â) − y, with Huber's weight.
 
-        They are (M, d + k, d + k) and (M, d + k), for the pose and the landmark of each point.
+        They are (M, q + k, q + k) and (M, q + k), for the q unknowns of the chain's pose and the
+        landmark of each point.
         """
         keyframes, k = self._keyframes, self._axes.point
         poses = solution.poses[keyframes.keyframes + 1]
@@ -231,7 +257,8 @@ class Smoother:
         predicted = (transpose(R) @ arms[:, :, None])[:, :, 0]
         error = (predicted - keyframes.points)[:, :k]
         J_point = transpose(R)[:, :k, :k]
-        J = np.concatenate([-self._axes.output_matrix(predicted), J_point], axis=2)
+        C, unseen = self._axes.output_matrix(predicted), np.zeros((len(error), k, self._chained))
+        J = np.concatenate([-C, unseen, J_point], axis=2)
         counted = keyframes.shares * self._weights(error)
         return _normal(J, keyframes.information * counted[:, None, None], error)
 
@@ -249,6 +276,18 @@ def _normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray
     """Return Jᵀ W J (M, q, q) and Jᵀ W e (M, q) for J (M, k, q), W (M, k, k) and e (M, k)."""
     JW = transpose(J) @ W
     return JW @ J, (JW @ error[:, :, None])[:, :, 0]
+
+
+def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:
+    """Return the information (S, d, d) of motions, or (S, d + c, d + c) with that of a drift."""
+    of_motions = _inverse(keyframes.motion_covariances)
+    if not drifts:
+        return of_motions
+    d, c = keyframes.sensitivities.shape[1:]
+    information = np.zeros((len(of_motions), d + c, d + c))
+    information[:, :d, :d] = of_motions
+    information[:, d:, d:] = _inverse(keyframes.drift_covariances)
+    return information
 
 
 def _inverse(covariances: FloatArray) -> FloatArray:

@@ -39,6 +39,7 @@ class _Step:
     end: FloatArray
     noise: FloatArray
     sensitivity: FloatArray
+    drift: FloatArray
     calibration: FloatArray
     keyframe: Keyframe
 
@@ -59,10 +60,11 @@ class History:
         self.since = since
         self.stamps_ns: list[int] = []  # of the keyframes
         self.poses: list[FloatArray] = [prior.pose]  # estimates, then those of the keyframes
+        self.calibrations = [prior.calibration]  # likewise
         self._calibration = prior.calibration
         self._start: FloatArray | None = None
         self._end = prior.pose
-        self._motion_noise, self._sensitivity = self._at_rest()
+        self._motion_noise, self._sensitivity, self._drift = self._at_rest()
         # Keyframes as arrays: those that are summarised, in pieces, and those that are not.
         self._none = no_keyframes(axes.p, len(prior.calibration), axes.point)
         self._summarised: list[Keyframes] = []
@@ -84,17 +86,19 @@ class History:
         self._end = motion.path[-1].copy()  # not a view, which would keep all of the path
         self._motion_noise = self._motion_noise + motion.noise
         self._sensitivity = self._sensitivity + motion.sensitivity
+        self._drift = self._drift + motion.drift
         self._calibration = motion.calibration.values
 
-    def add(self, keyframe: Keyframe, pose: FloatArray) -> None:
-        """Append a keyframe, seen from ``pose`` (4, 4)."""
+    def add(self, keyframe: Keyframe, pose: FloatArray, calibration: FloatArray) -> None:
+        """Append a keyframe, seen from ``pose`` (4, 4), with what is known of (c,) then."""
         self.stamps_ns.append(keyframe.stamp_ns)
         self.poses.append(pose)
+        self.calibrations.append(calibration)
         start = self._end if self._start is None else self._start
-        motion = (self._motion_noise, self._sensitivity, self._calibration)
+        motion = (self._motion_noise, self._sensitivity, self._drift, self._calibration)
         self._new.append(_Step(start, self._end, *motion, keyframe))
         self._start = None
-        self._motion_noise, self._sensitivity = self._at_rest()
+        self._motion_noise, self._sensitivity, self._drift = self._at_rest()
 
     def summarise(self, known: Prior) -> None:
         """Let ``known`` stand for all that the keyframes up to now say."""
@@ -169,6 +173,7 @@ class History:
             motion_covariances=to_body @ noises @ transpose(to_body),
             sensitivities=to_body @ np.array([step.sensitivity for step in steps]),
             calibrations=np.array([step.calibration for step in steps]),
+            drift_covariances=np.array([step.drift for step in steps]),
             keyframes=np.repeat(numbers, [len(part.rows) for part in seen]),
             landmarks=np.concatenate([part.rows for part in seen]),
             points=np.concatenate([part.points for part in seen]),
@@ -189,7 +194,7 @@ class History:
             )
         return covariances
 
-    def _at_rest(self) -> tuple[FloatArray, FloatArray]:
-        """Return the covariance and the sensitivity of no motion."""
-        d = self._axes.p
-        return np.zeros((d, d)), np.zeros((d, len(self._calibration)))
+    def _at_rest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the covariance, the sensitivity and the drift of no motion."""
+        d, c = self._axes.p, len(self._calibration)
+        return np.zeros((d, d)), np.zeros((d, c)), np.zeros((c, c))

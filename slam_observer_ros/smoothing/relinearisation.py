@@ -83,8 +83,8 @@ class Relinearisation:
 
     @property
     def is_active(self) -> bool:
-        """Whether there is a history: the smoother takes the calibration for constant."""
-        return self._settings.relinearization_interval > 0 and not self._calibration.drifts
+        """Whether there is a history."""
+        return self._settings.relinearization_interval > 0
 
     def reset(self, since: str) -> None:
         """Forget all but what is known now; ``since`` is why, in words."""
@@ -115,7 +115,7 @@ class Relinearisation:
         """
         if not len(keyframe.rows):  # says nothing: the motions before and after it add up
             return
-        self.history.add(keyframe, self._observer.A)
+        self.history.add(keyframe, self._observer.A, self._calibration.values)
         self._seen += 1
         self._observations += 1
         if in_doubt:
@@ -155,10 +155,6 @@ class Relinearisation:
         if self._settings.relinearization_interval == 0:
             raise ParameterError(
                 "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
-            )
-        if self._calibration.drifts:
-            raise ParameterError(
-                "smoothing takes the calibration to stay: 'calibration_drift' must be 0"
             )
         if self._observer.have_moved:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
@@ -218,6 +214,7 @@ class Relinearisation:
             return False
         # … and let filter and history go on from the result.
         history.poses[first:] = list(step.end.poses)
+        history.calibrations[first:] = list(step.end.calibrations)
         self._take_over(step, covariance)
         return True
 
@@ -234,14 +231,17 @@ class Relinearisation:
         P = _with_pose_error_by(observer.A, covariance, self._axes)
         self._joint.set_of_positions(P, start.points)
         # The step, as any correction.
-        self._calibration.shift(end.calibration - self._calibration.values)
+        self._calibration.shift(end.calibrations[-1] - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)
 
     def _solution_from(self, first: int) -> Solution:
         """Return the present estimates, of poses those from before keyframe ``first`` on."""
         poses = np.array(self.history.poses[first:])
-        return Solution(poses, self._calibration.values, self._observer.points)
+        calibrations = np.tile(self._calibration.values, (len(poses), 1))
+        if self._calibration.drifts:
+            calibrations = np.array(self.history.calibrations[first:])
+        return Solution(poses, calibrations, self._observer.points)
 
     def _known(self) -> Prior:
         """Return what is known now."""

@@ -51,13 +51,17 @@ def random_covariances(rng, count, size, scale):
 class Problem:
     """A random smoothing problem whose residuals are far from zero, and its dense solution.
 
-    Its unknowns are x = (η_0 … η_S, dc, dp) as in the module's text.
+    Its unknowns are x = (η_0 … η_S, dc, dp) as in the module's text, or, where the calibration
+    drifts, (η_0, dc_0 … η_S, dc_S, dp).
     """
 
-    def __init__(self, axes, calibrations, seed, is_relative=False, known_landmarks=2):
+    def __init__(
+        self, axes, calibrations, seed, is_relative=False, known_landmarks=2, drifts=False
+    ):
         rng = np.random.default_rng(seed)
         d, k, c = axes.p, axes.point, calibrations
-        self.axes, self.d, self.k, self.c = axes, d, k, c
+        self.axes, self.d, self.k, self.c, self.drifts = axes, d, k, c, drifts
+        self.settings = replace(LEAST_SQUARES, calibration_drift=float(drifts))
         motions = se3.exp(self._tangents(0.3 * rng.normal(size=(KEYFRAMES, d))))
         prior_size = d + c + k * known_landmarks
         points = axes.full_points(rng.normal(scale=3.0, size=(LANDMARKS, k)))
@@ -82,6 +86,7 @@ class Problem:
             random_covariances(rng, KEYFRAMES, d, 0.1),
             0.2 * rng.normal(size=(KEYFRAMES, d, c)),
             0.1 * rng.normal(size=(KEYFRAMES, c)),
+            random_covariances(rng, KEYFRAMES, c, 0.1) if c else np.empty((KEYFRAMES, 0, 0)),
             keyframes,
             landmarks,
             seen,
@@ -89,7 +94,7 @@ class Problem:
             rng.uniform(0.1, 1.0, len(keyframes)),
         )
         eta = self._tangents(0.1 * rng.normal(size=(KEYFRAMES + 1, d)))
-        self.start = Solution(poses @ se3.exp(eta), np.zeros(c), points)
+        self.start = Solution(poses @ se3.exp(eta), np.zeros((KEYFRAMES + 1, c)), points)
 
     def _tangents(self, coordinates):
         full = np.zeros((len(coordinates), 6))
@@ -97,12 +102,15 @@ class Problem:
         return full
 
     def moved(self, solution, x):
-        poses = (KEYFRAMES + 1) * self.d
-        eta = self._tangents(x[:poses].reshape(-1, self.d))
+        chained = self.d + (self.c if self.drifts else 0)
+        end = (KEYFRAMES + 1) * chained
+        chain = x[:end].reshape(-1, chained)
+        shared = 0 if self.drifts else self.c
+        calibrations = chain[:, self.d :] if self.drifts else x[end : end + shared]
         return Solution(
-            solution.poses @ se3.exp(eta),
-            solution.calibration + x[poses : poses + self.c],
-            solution.points + self.axes.full_points(x[poses + self.c :]),
+            solution.poses @ se3.exp(self._tangents(chain[:, : self.d])),
+            solution.calibrations + calibrations,
+            solution.points + self.axes.full_points(x[end + shared :]),
         )
 
     def residuals(self, solution):
@@ -114,18 +122,21 @@ class Problem:
             prior_points = se3.transform(se3.inverse(self.prior.pose), prior_points)
         off = [
             se3.log(se3.inverse(self.prior.pose) @ solution.poses[0])[pose],
-            solution.calibration - self.prior.calibration,
+            solution.calibrations[0] - self.prior.calibration,
             (known - prior_points)[:, : self.k].ravel(),
         ]
         whitened = [whiten(np.linalg.inv(self.prior.covariance), np.concatenate(off))]
         for s in range(KEYFRAMES):
             by_calibration = keyframes.sensitivities[s] @ (
-                solution.calibration - keyframes.calibrations[s]
+                solution.calibrations[s] - keyframes.calibrations[s]
             )
             motion = keyframes.motions[s] @ se3.exp(self._tangents(by_calibration[None])[0])
             step = se3.inverse(solution.poses[s]) @ solution.poses[s + 1]
             error = se3.log(se3.inverse(motion) @ step)[pose]
             whitened.append(whiten(np.linalg.inv(keyframes.motion_covariances[s]), error))
+            if self.drifts:
+                drift = solution.calibrations[s + 1] - solution.calibrations[s]
+                whitened.append(whiten(np.linalg.inv(keyframes.drift_covariances[s]), drift))
         counted = keyframes.information * keyframes.shares[:, None, None]
         seen = keyframes.keyframes, keyframes.landmarks, keyframes.points
         for keyframe, landmark, point, information in zip(*seen, counted, strict=True):
@@ -135,7 +146,8 @@ class Problem:
         return np.concatenate(whitened)
 
     def jacobian(self, solution, h=1e-6):
-        size = (KEYFRAMES + 1) * self.d + self.c + self.k * LANDMARKS
+        calibrations = (KEYFRAMES + 1 if self.drifts else 1) * self.c
+        size = (KEYFRAMES + 1) * self.d + calibrations + self.k * LANDMARKS
         columns = [
             self.residuals(self.moved(solution, h * x))
             - self.residuals(self.moved(solution, -h * x))
@@ -151,9 +163,9 @@ def whiten(information, error):
 problems = pytest.mark.parametrize(
     'problem',
     [
-        Problem(axes, c, seed, is_relative)
+        Problem(axes, c, seed, is_relative, drifts=drifts)
         for axes in (PLANAR, SPATIAL)
-        for c in (0, 2)
+        for c, drifts in ((0, False), (2, False), (2, True))
         for seed in (0, 1)
         for is_relative in (False, True)
     ],
@@ -164,16 +176,16 @@ problems = pytest.mark.parametrize(
 def test_one_iteration_is_the_dense_gauss_newton_step(problem):
     J, r = problem.jacobian(problem.start), problem.residuals(problem.start)
     expected = problem.moved(problem.start, -np.linalg.solve(J.T @ J, J.T @ r))
-    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, LEAST_SQUARES)
+    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, problem.settings)
     solution = smoother.smooth(problem.start, 1, 0.0).end
     np.testing.assert_allclose(solution.poses, expected.poses, atol=1e-6)
-    np.testing.assert_allclose(solution.calibration, expected.calibration, atol=1e-6)
+    np.testing.assert_allclose(solution.calibrations, expected.calibrations, atol=1e-6)
     np.testing.assert_allclose(solution.points, expected.points, atol=1e-6)
 
 
 @problems
 def test_the_solution_is_where_the_gradient_of_the_cost_vanishes(problem):
-    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, LEAST_SQUARES)
+    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, problem.settings)
     solution = smoother.smooth(problem.start, 200, 1e-10).end
     gradient = problem.jacobian(solution).T @ problem.residuals(solution)
     np.testing.assert_allclose(gradient, 0.0, atol=1e-5)
@@ -181,9 +193,9 @@ def test_the_solution_is_where_the_gradient_of_the_cost_vanishes(problem):
 
 @problems
 def test_marginal_is_that_of_the_dense_inverse(problem):
-    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, LEAST_SQUARES)
+    smoother = Smoother(problem.axes, problem.prior, problem.keyframes, problem.settings)
     J = problem.jacobian(problem.start)
-    first = KEYFRAMES * problem.d
+    first = KEYFRAMES * (problem.d + (problem.c if problem.drifts else 0))
     np.testing.assert_allclose(
         smoother.smooth(problem.start, 1, 0.0).marginal(),
         np.linalg.inv(J.T @ J)[first:, first:],
@@ -243,7 +255,7 @@ def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
         for a, b in pairwise((0, *cuts, k)):
             pieces = path[a : b + 1], V[a:b], dt_s[a:b], covariances[a:b]
             history.move(Motion(*pieces, float(dt_s[a:b].sum()), np.zeros((2, 6)), calibration))
-        history.add(Keyframe(0, *NOTHING), path[-1])
+        history.add(Keyframe(0, *NOTHING), path[-1], calibration.values)
         return history.keyframes()
 
     whole, parts = keyframes(), keyframes(1, 3)
@@ -273,11 +285,12 @@ def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
             path=path[part : part + 2],
             noise=noises[part],
             sensitivity=sensitivities[part],
+            drift=np.diag(np.full(c, 0.1)),
             calibration=calibration,
         )
         history.move(motion)
-    history.add(Keyframe(0, *NOTHING), path[-1])
-    history.add(Keyframe(1, *NOTHING), path[-1])  # nothing has moved since
+    history.add(Keyframe(0, *NOTHING), path[-1], calibration.values)
+    history.add(Keyframe(1, *NOTHING), path[-1], calibration.values)  # nothing has moved since
     keyframes = history.keyframes()
     to_body = se3.adjoint(se3.inverse(path[-1]))[axes.pose, axes.pose]
     np.testing.assert_allclose(
@@ -286,6 +299,7 @@ def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     expected = to_body @ noises.sum(axis=0) @ to_body.T
     np.testing.assert_allclose(keyframes.motion_covariances[0], expected, atol=1e-9)
     np.testing.assert_array_equal(keyframes.motion_covariances[1], 0.0)
+    np.testing.assert_allclose(keyframes.drift_covariances, [0.3 * np.eye(c), np.zeros((c, c))])
 
 
 @pytest.mark.parametrize('two_d_mode', [False, True])
@@ -553,7 +567,6 @@ def test_an_estimator_that_has_seen_nothing_has_nothing_to_smooth():
         {'gains': 'scheduled'},
         {'relinearization_interval': 0},
         {'landmark_velocity_stddev': 0.1},
-        {'linear_scale_stddev': (0.1, 0.0, 0.0), 'calibration_drift': 0.1},
     ],
 )
 def test_designs_that_keep_no_history_say_that_they_cannot_smooth(changes):
@@ -561,6 +574,38 @@ def test_designs_that_keep_no_history_say_that_they_cannot_smooth(changes):
     estimator = estimate(drive(settings, 2.0), settings)
     with pytest.raises(ParameterError, match='smooth'):
         estimator.smooth()
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_a_bias_that_drifts_is_followed_online_and_smoothed(two_d_mode):
+    """Taken for constant, it bends the smoothed path; relinearising goes on, and helps."""
+    drifting = Settings(
+        two_d_mode=two_d_mode,
+        angular_bias_stddev=(0.0, 0.0, 0.05),
+        calibration_drift=0.3,
+        relinearization_interval=3,
+        relinearization_angle=0.0,
+    )
+    world = drive(drifting, 60.0, noise=0.2, landmarks=20, seen=3)
+    start_ns, end_ns = world.events[0].stamp_ns, world.events[-1].stamp_ns
+
+    def biased(event):
+        if not isinstance(event, VelocityEvent):
+            return event
+        bias = 0.1 * (event.stamp_ns - start_ns) / (end_ns - start_ns) - 0.05
+        return replace(event, body_velocity=event.body_velocity - bias * np.eye(6)[2])
+
+    world = replace(world, events=[biased(event) for event in world.events])
+    estimator = estimate(world, drifting)
+    constant = estimate(world, replace(drifting, calibration_drift=0.0))
+    (bias,) = estimator.calibration
+    assert abs(bias.value - 0.05) < 3.0 * bias.deviation < 0.09
+
+    def error_m(estimator):
+        smoothed = estimator.smooth()
+        return np.abs(smoothed.poses - world.poses[::OBSERVED_EVERY])[:, :3, 3].max()
+
+    assert error_m(estimator) < 0.5 * error_m(constant)
 
 
 def test_forgotten_landmarks_leave_the_history_too():
