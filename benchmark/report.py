@@ -140,7 +140,11 @@ nothing is seen for 4 s. A robot that is carried is put down 1 to 3 m further, t
 Landmarks that move do so straight on at 0.05 to 0.3 m/s, and the truth with them.
 
 The aims of the first table are for Starry Night and the mean of MRCLAM 6, in bold where they are
-missed; the other columns are single worlds.
+missed; the other columns are single worlds. Errors on Starry Night are at the floor of its truth,
+so no error there is held against an aim: an oracle that is given the true landmarks and fits each
+pose to the points of that image alone errs by 0.033 m, as the recorded attitude and the camera
+disagree. Where four points or more are seen `riccati` errs by 0.031 m against the recorded poses,
+and by 0.017 m against the fitted ones (`python benchmark/oracle.py`).
 
 ANEES: every 5 s, the mean over the Monte Carlo runs of the squared error of the pose (or the
 landmarks) normalised by its covariance and its degrees of freedom; then the mean and the range
@@ -370,7 +374,8 @@ def _summary(tables: Tables) -> dict[str, dict[str, str]]:
             world: (getattr(columns[top], metric), getattr(columns[bottom], metric))
             for world, columns in clean.items()
         }
-        rows[f'{title}: {top} / {bottom}'] = _with_aim(_ratios(values), aim)
+        judged = {MRCLAM_MEAN} if metric != 'cpu_s' else {STARRY_NIGHT, MRCLAM_MEAN}
+        rows[f'{title}: {top} / {bottom}'] = _with_aim(_ratios(values), aim, judged)
     for variant, column, label, aim in (
         (OUTLIERS, 'riccati', 'with outliers / without', '≤ 1.2'),
         (OUTLIERS, 'riccati' + WORST, 'with outliers, worst draw / without', ''),
@@ -385,7 +390,8 @@ def _summary(tables: Tables) -> dict[str, dict[str, str]]:
             )
             for world, columns in tables[variant].items()
         }
-        rows[f'Configuration error: riccati, {label}'] = _with_aim(_ratios(values), aim)
+        ratios = _ratios(values)
+        rows[f'Configuration error: riccati, {label}'] = _with_aim(ratios, aim, {MRCLAM_MEAN})
     return rows
 
 
@@ -403,12 +409,12 @@ def _ratios(values: dict[str, tuple[float, float]]) -> dict[str, float]:
     return cells
 
 
-def _with_aim(ratios: dict[str, float], aim: str) -> dict[str, str]:
-    """Return ratios with what was aimed at, and in bold where its first bound is missed."""
+def _with_aim(ratios: dict[str, float], aim: str, judged: set[str]) -> dict[str, str]:
+    """Return ratios with what was aimed at, those ``judged`` in bold where they miss it."""
     cells = {name: _number(ratio, 3) for name, ratio in ratios.items()}
     if bound := re.search(r'([≤≥]) ([\d.]+)', aim):
         sign = 1.0 if bound[1] == '≤' else -1.0
-        for name in {STARRY_NIGHT, MRCLAM_MEAN} & ratios.keys():
+        for name in judged & ratios.keys():
             if sign * ratios[name] > sign * float(bound[2]):
                 cells[name] = f'**{cells[name]}**'
     return {**cells, 'aim': aim}

@@ -6,14 +6,16 @@ from collections.abc import Sequence
 import mmap
 from pathlib import Path, PurePath
 
-import yaml
-
-from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.common.errors import RecordingError, YamlError
+from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.recording.salvage import MendedSource, SalvagedSource
 from slam_observer_ros.recording.salvage_formats import is_intact_mcap, SCANS
 from slam_observer_ros.recording.sources import BagSource, Loss, MessageSource, SplitSource
 
 FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
+
+MAX_METADATA_BYTES = 10_000_000
+"""Bytes of a metadata.yaml that is read; that of a thousand files has a tenth of them."""
 
 _ZSTD_SUFFIX = '.zstd'
 _ZSTD_MAGIC = bytes.fromhex('28b52ffd')
@@ -96,12 +98,17 @@ def _open_parts(files: Sequence[Path]) -> tuple[MessageSource, str | None]:
 
 
 def _listed_files(directory: Path) -> list[Path]:
-    """List the files that metadata.yaml names; none if it is damaged, which rosbags reports."""
+    """List the files that metadata.yaml names; none if it is damaged, which rosbags reports.
+
+    Raises a RecordingError if it can't be read, or has more bytes than any recording's.
+    """
     try:
-        metadata = yaml.safe_load((directory / 'metadata.yaml').read_text(encoding='utf-8'))
+        metadata = load_yaml(directory / 'metadata.yaml', MAX_METADATA_BYTES, plain_value)
         names = metadata['rosbag2_bagfile_information']['relative_file_paths']
         return [directory / PurePath(name).name for name in names]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError, yaml.YAMLError):
+    except OSError as error:
+        raise RecordingError(f'{directory}: can not read metadata.yaml: {error}') from error
+    except (YamlError, ValueError, LookupError, TypeError):
         return []
 
 
