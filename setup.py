@@ -17,7 +17,7 @@ setup(
     license='Apache-2.0',
     keywords=['ROS', 'SLAM', 'nonlinear observer', 'Lie group', 'localisation', 'mapping'],
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['py.typed']},
+    package_data={PACKAGE: ['py.typed', 'report/assets/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
