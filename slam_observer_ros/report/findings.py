@@ -16,6 +16,9 @@ MAX_GROWTHS = 3
 GROWTH_SHARE = 0.25
 """Part of the largest error that a growth must reach to be named."""
 
+NOTABLE_GAP_S = 0.5
+"""Time without a used landmark that is named where the error grew."""
+
 TOO_CONFIDENT = 1.5
 """NIS or NEES per degree of freedom beyond which the noise that is stated does not fit."""
 
@@ -48,7 +51,13 @@ def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int,
             break
         if all(end <= other_start or start >= other_end for other_start, other_end in found):
             found.append((start, end))
-    return found
+    return [_trimmed(errors_m, start, end) for start, end in found]
+
+
+def _trimmed(errors_m: FloatArray, start: int, end: int) -> tuple[int, int]:
+    """Return the rows of the largest error in a window, and of the least one before it."""
+    largest = start + int(np.argmax(errors_m[start : end + 1]))
+    return start + int(np.argmin(errors_m[start : largest + 1])), largest
 
 
 def _growths(run: ReportedRun) -> list[Finding]:
@@ -90,15 +99,15 @@ def _circumstances(run: ReportedRun, errors: TrajectoryErrors, start: int, end: 
 
 
 def _blind(run: ReportedRun, start_s: float, end_s: float) -> str:
-    """Say which gap between observations covers most of a time; '' if none covers half of it."""
-    if not len(run.gaps_s):
-        return ''
-    overlaps_s = np.ptp(np.clip(run.gaps_s, start_s, end_s), axis=1)
-    longest = int(np.argmax(overlaps_s))
-    if overlaps_s[longest] < 0.5 * (end_s - start_s):
-        return ''
-    first_s, last_s = run.gaps_s[longest]
-    return f' (none for {last_s - first_s:.0f} s, from {first_s:.0f} to {last_s:.0f} s)'
+    """Say how long nothing was used at a time, between two times; '' if that is usual."""
+    if len(run.gaps_s):
+        overlaps_s = np.ptp(np.clip(run.gaps_s, start_s, end_s), axis=1)
+        first_s, last_s = run.gaps_s[int(np.argmax(overlaps_s))]
+        if overlaps_s.max() >= 0.5 * (end_s - start_s):
+            return f' (none for {last_s - first_s:.0f} s, from {first_s:.0f} to {last_s:.0f} s)'
+    used_s = run.used_s[(run.used_s > start_s) & (run.used_s < end_s)]
+    longest_s = float(np.diff(np.concatenate([[start_s], used_s, [end_s]])).max())
+    return f' (none for up to {longest_s:.1f} s)' if longest_s >= NOTABLE_GAP_S else ''
 
 
 def mean_nis(run: ReportedRun) -> float | None:

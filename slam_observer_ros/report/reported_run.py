@@ -51,11 +51,15 @@ class ReportedRun:
         return self.seconds(np.array([instant.stamp_ns for instant in self.instants], np.int64))
 
     @property
+    def used_s(self) -> FloatArray:
+        """(u,) times at which landmarks were used, seconds."""
+        innovations = self.innovations
+        return np.unique(self.seconds(innovations.stamps_ns[innovations.weights > 0.0]))
+
+    @property
     def gaps_s(self) -> FloatArray:
         """(g, 2) beginnings and ends of the stretches in which no landmark was used, seconds."""
-        innovations, end_s = self.innovations, self.instants_s[-1:]
-        used_s = np.unique(self.seconds(innovations.stamps_ns[innovations.weights > 0.0]))
-        edges_s = np.concatenate([[0.0], used_s, end_s])
+        edges_s = np.concatenate([[0.0], self.used_s, self.instants_s[-1:]])
         is_gap = np.diff(edges_s) >= MIN_GAP_S
         return np.column_stack([edges_s[:-1][is_gap], edges_s[1:][is_gap]])
 

@@ -87,7 +87,7 @@ function drawMap(id, plane, second) {
     margin: { l: 50, r: 10, t: 10, b: 40 }, legend: { orientation: 'h', y: 1.02, yanchor: 'bottom', x: 0.5, xanchor: 'center' },
     xaxis: { ...axis, title: { text: 'x [m]' }, constrain: 'domain' },
     yaxis: { ...axis, title: { text: second === 1 ? 'y [m]' : 'z [m]' }, scaleanchor: 'x', constrain: 'domain' },
-    hovermode: 'closest', uirevision: 'kept',
+    hovermode: 'closest', uirevision: 'kept', showlegend: plane === 0,
   }, { responsive: true, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches ? undefined : false });
   element(id).dataset.still = String(still);
   /** @type {any} */ (element(id)).on('plotly_click', (/** @type {any} */ event) => {
@@ -226,7 +226,7 @@ function update() {
   const error = run.path.error_m ? run.path.error_m[near] : null;
   const bound = run.errors.bound_m[run.errors.t.indexOf(t)];
   const parts = [`${t.toFixed(1)} s`, `${run.instants.ids[i].length} landmarks`];
-  if (error !== null && error !== undefined) parts.push(`position ${error.toFixed(2)} m off (aligned)`);
+  if (error !== null && error !== undefined) parts.push(`position ${error.toPrecision(2)} m off (aligned)`);
   if (bound !== null && bound !== undefined) parts.push(`stated 95 %: ${bound.toFixed(2)} m`);
   if (run.gaps.some((/** @type {number[]} */ gap) => gap[0] <= t && t <= gap[1])) parts.push('sees no landmark it can use');
   element('readout').textContent = parts.join(' · ');
@@ -265,6 +265,7 @@ function write() {
   });
   if (!run.findings.length) element('findings').hidden = true;
   element('map-note').textContent = run.path.true_xyz ? 'The estimate as it was at each moment; its colour is the distance from the truth, aligned with the whole run.' : 'The estimate as it was at each moment. The recording holds no truth to compare it with.';
+  if (run.errors.bound_m.some((/** @type {number|null} */ b) => b !== null)) element('map-note').textContent += ' Ellipses hold 95 %; they count from the first pose, from where everything is mapped.';
   fillTable('landmarks', ['id', 'observed', 'rejected', 'down-weighted', 'residual RMS [m]', 'residual RMS [σ]', 'stated σ [m]', 'error [m]'], run.landmarks);
   fillTable('figures', [], run.figures);
   fillTable('settings', ['name', 'value', 'default'], run.settings);
