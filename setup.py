@@ -24,6 +24,7 @@ setup(
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
         (f'share/{PACKAGE}/config', glob('config/*.yaml')),
         (f'share/{PACKAGE}/rviz', glob('rviz/*.rviz')),
+        (f'share/{PACKAGE}/samples', glob('samples/*.mcap')),
         (f'share/{PACKAGE}/foxglove', glob('foxglove/*.json')),
     ],
     zip_safe=True,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
+import numpy as np
+
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate
 
@@ -40,3 +42,9 @@ class Innovations:
     nis: FloatArray  # (u,) NaN where no joint covariance is known, or nothing was used
     degrees_of_freedom: IntArray  # (u,)
     lyapunov: FloatArray  # (u,)
+
+    @property
+    def mean_nis(self) -> float | None:
+        """NIS per degree of freedom over the run, 1 is consistent; None if none is known."""
+        total = int(self.degrees_of_freedom.sum())
+        return float(np.nansum(self.nis) / total) if total else None

@@ -67,7 +67,7 @@ def _growths(run: ReportedRun) -> list[Finding]:
     errors_m = np.linalg.norm(run.errors.errors[:, 3:], axis=1)
     return [
         Finding(
-            f'The position error grew from {errors_m[start]:.2f} to {errors_m[end]:.2f} m at '
+            f'The position error grew from {errors_m[start]:.2g} to {errors_m[end]:.2g} m at '
             f'{seconds[start]:.0f} to {seconds[end]:.0f} s: '
             f'{_circumstances(run, run.errors, start, end)}.',
             float(seconds[start]),
@@ -89,7 +89,7 @@ def _circumstances(run: ReportedRun, errors: TrajectoryErrors, start: int, end: 
     driven_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
     turns = so3.log(poses[1:, :3, :3] @ poses[:-1, :3, :3].swapaxes(-1, -2))
     turned_deg = np.degrees(np.linalg.norm(turns, axis=1).sum())
-    seen = f'{used} observed landmarks were used' if used else 'no landmark was used'
+    seen = f'{used} observations of landmarks were used' if used else 'no landmark was used'
     blind = _blind(run, *bounds_s.tolist())
     rejected = f', {gated} rejected' if gated else ''
     return (
@@ -110,16 +110,9 @@ def _blind(run: ReportedRun, start_s: float, end_s: float) -> str:
     return f' (none for up to {longest_s:.1f} s)' if longest_s >= NOTABLE_GAP_S else ''
 
 
-def mean_nis(run: ReportedRun) -> float | None:
-    """Return the NIS per degree of freedom over the run; None if no innovation is known."""
-    known = run.innovations.degrees_of_freedom > 0
-    degrees = int(run.innovations.degrees_of_freedom[known].sum())
-    return float(run.innovations.nis[known].sum() / degrees) if degrees else None
-
-
 def _consistency(run: ReportedRun) -> list[Finding]:
     found = []
-    nis = mean_nis(run)
+    nis = run.innovations.mean_nis
     if nis is not None and nis > TOO_CONFIDENT:
         found.append(
             Finding(

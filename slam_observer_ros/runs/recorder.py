@@ -60,6 +60,11 @@ class RunRecorder:
         return tuple(by_stamp[stamp_ns] for stamp_ns in sorted(by_stamp))
 
     @property
+    def mean_nis(self) -> float | None:
+        """As :attr:`.Innovations.mean_nis`."""
+        return self.innovations.mean_nis
+
+    @property
     def innovations(self) -> Innovations:
         """What was noted of all observations."""
         judged = [(update, update.innovation) for update in self._updates if update.innovation]
@@ -82,6 +87,33 @@ class RunRecorder:
             ),
             lyapunov=np.array([update.lyapunov for update in updates]),
         )
+
+
+class NisTally:
+    """Sums up the normalised innovations of a run, and keeps nothing else of it."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all: the run has started again."""
+        self._nis, self._degrees_of_freedom = 0.0, 0
+
+    def note_stamp(self, estimator: Estimator) -> None:
+        """Take no notice: innovations come with observations."""
+
+    def note_update(self, update: Update) -> None:
+        """Take in an observation, of which the estimator has judged the innovation."""
+        innovation = update.innovation
+        if innovation is not None and innovation.nis is not None:
+            self._nis += innovation.nis
+            self._degrees_of_freedom += innovation.degrees_of_freedom
+
+    @property
+    def mean_nis(self) -> float | None:
+        """As :attr:`.Innovations.mean_nis`."""
+        total = self._degrees_of_freedom
+        return self._nis / total if total else None
 
 
 def _instant(estimator: Estimator, stamp_ns: int) -> Instant:

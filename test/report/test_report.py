@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 import re
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 from recordings import write_mcap
 
+from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.report.ellipses import ellipses
 from slam_observer_ros.report.findings import growth_windows
 
+SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 MEGABYTE = 1_000_000
 
 
@@ -60,6 +63,33 @@ def test_settings_that_differ_are_listed(slam_observer, tmp_path):
     recording, report = write_mcap(tmp_path / 'run.mcap'), tmp_path / 'run.html'
     slam_observer.succeed('replay', recording, '--set', 'point_noise=0.03', '--report', report)
     assert ['point_noise', '0.03'] in [row[:2] for row in numbers_of(report)['settings']]
+
+
+def test_json_says_what_was_replayed_and_how(slam_observer, tmp_path):
+    recording = write_mcap(tmp_path / 'run.mcap')
+    ended = slam_observer.succeed('replay', recording, '--set', 'range_noise=0.2', '--json')
+    figures = ended.json
+    assert figures['recording'] == str(recording)
+    assert figures['recording_sha256'] == hashlib.sha256(recording.read_bytes()).hexdigest()
+    assert figures['settings'] == {'range_noise': 0.2}
+    assert (figures['version'], figures['warnings']) == (VERSION, [])
+    assert figures['nis'] >= 0.0
+
+
+def test_nis_is_the_same_with_a_report(slam_observer, tmp_path):
+    recording = write_mcap(tmp_path / 'run.mcap')
+    plain = slam_observer.succeed('replay', recording, '--json').json
+    report = ('--report', tmp_path / 'run.html')
+    assert slam_observer.succeed('replay', recording, '--json', *report).json[
+        'nis'
+    ] == pytest.approx(plain['nis'])
+
+
+def test_the_sample_is_small_and_replays_with_default_settings(slam_observer):
+    assert SAMPLE.stat().st_size < 2 * MEGABYTE
+    figures = slam_observer.succeed('replay', SAMPLE, '--json').json
+    assert figures['landmarks'] > 5
+    assert 0.5 < figures['nis'] < 1.5
 
 
 def test_no_report_is_replaced_unless_forced(slam_observer, report):

@@ -12,6 +12,7 @@ from slam_observer_ros.cli.console import kept_warnings, print_json, show_progre
 from slam_observer_ros.cli.options import add_settings_options, read_settings
 from slam_observer_ros.cli.outputs import add_force_option, add_result_options
 from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
+from slam_observer_ros.cli.replay.identity import identity
 from slam_observer_ros.cli.replay.input_options import (
     add_input_options,
     check_frames,
@@ -36,7 +37,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.runs.recorder import RunRecorder
+from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -141,7 +142,7 @@ def _replay(
             'replaying',
             recording.event_count(selected),
         )
-        recorder = None if args.report is None else RunRecorder()
+        recorder = _recorder(args)
         is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
         needs_poses = is_drawn or len(truth.stamps_ns) > 0
         result = replay(events, settings, truth, landmark_map, needs_poses, recorder)
@@ -155,6 +156,12 @@ def _replay(
     if recorder is not None:
         outcome = replace(outcome, recorder=recorder)
     return with_smoothed(outcome) if args.smooth else outcome
+
+
+def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
+    if args.report is not None:
+        return RunRecorder()
+    return NisTally() if args.json else None
 
 
 def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
@@ -174,7 +181,7 @@ def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame
     """Write and print all that can be, and only then say what could not be written."""
     written, errors = write_files(args, outcome, map_frame, summary_rows(outcome))
     if args.json:
-        print_json(as_json(outcome))
+        print_json(identity(args.recording, outcome) | as_json(outcome))
     else:
         print_summary(args.recording, outcome, written)
     if errors:

@@ -25,6 +25,7 @@ from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.report.page import write_report
 from slam_observer_ros.report.reported_run import ReportedRun
+from slam_observer_ros.runs.recorder import RunRecorder
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +84,7 @@ def _write_report(
     args: argparse.Namespace, outcome: ReplayOutcome, summary: Mapping[str, str], path: Path
 ) -> None:
     recorder = outcome.recorder
-    if recorder is None:
+    if not isinstance(recorder, RunRecorder):
         return
     estimator = outcome.result.estimator
     write_report(

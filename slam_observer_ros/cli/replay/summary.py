@@ -62,6 +62,7 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'configuration_rmse_m': accuracy.configuration_rmse_m,
         'anees': accuracy.anees,
         'configuration_anees': accuracy.configuration_anees,
+        'nis': None if outcome.recorder is None else outcome.recorder.mean_nis,
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
         'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
         'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,

@@ -19,6 +19,8 @@ const element = (id) => /** @type {HTMLElement} */ (document.getElementById(id))
 const slider = /** @type {HTMLInputElement} */ (element('slider'));
 
 function ink() { return dark.matches && !printing ? '#e6e9ee' : '#1b1f24'; }
+/* From blue to yellow, as Cividis; small values stay visible on paper and in the dark. */
+function scale() { return dark.matches && !printing ? [[0, '#4a74b5'], [0.5, '#9c9a8e'], [1, '#ffe945']] : [[0, '#f0d84a'], [0.5, '#7c7b78'], [1, '#00204d']]; }
 function grid() { return dark.matches && !printing ? '#39404a' : '#d5d9de'; }
 
 /** Points of an ellipse, then a gap. @param {number} x @param {number} y @param {number[]} shape @param {Curve} xs @param {Curve} ys */
@@ -63,8 +65,8 @@ function drawMap(id, plane, second) {
     traces.push({ x: path.true_xyz[0], y: path.true_xyz[second], mode: 'lines', name: 'truth, aligned', line: { color: ink(), width: 1, dash: 'dot' }, hoverinfo: 'skip' });
   }
   const colours = path.error_m
-    ? { color: path.error_m, colorscale: 'Cividis', reversescale: !dark.matches, size: 4, colorbar: { title: { text: 'error [m]', side: 'right' }, thickness: 12, len: 0.8 } }
-    : { color: path.t, colorscale: 'Cividis', size: 4, colorbar: { title: { text: 'time [s]', side: 'right' }, thickness: 12, len: 0.8 } };
+    ? { color: path.error_m, colorscale: scale(), size: 4, colorbar: { title: { text: 'error [m]', side: 'right' }, thickness: 12, len: 0.8 } }
+    : { color: path.t, colorscale: scale(), size: 4, colorbar: { title: { text: 'time [s]', side: 'right' }, thickness: 12, len: 0.8 } };
   traces.push({
     x: path.xyz[0], y: path.xyz[second], mode: 'markers', name: 'estimate', marker: colours, customdata: path.t,
     text: path.error_m ? path.error_m.map((/** @type {number|null} */ e) => (e === null ? 'no truth' : `${e.toFixed(2)} m off`)) : path.t,
