@@ -14,7 +14,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 def recorded(**settings):
     recorder = RunRecorder()
-    return replay(events(), Settings(**settings), recorder=recorder), recorder
+    return replay(events(), Settings(**settings), recorders=[recorder]), recorder
 
 
 @pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])

@@ -11,6 +11,10 @@ from pathlib import Path
 from slam_observer_ros.cli.console import kept_warnings, print_json, show_progress
 from slam_observer_ros.cli.options import add_settings_options, read_settings
 from slam_observer_ros.cli.outputs import add_force_option, add_result_options
+from slam_observer_ros.cli.replay.estimate_recording import (
+    add_recording_options,
+    estimate_writer,
+)
 from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
 from slam_observer_ros.cli.replay.identity import identity
 from slam_observer_ros.cli.replay.input_options import (
@@ -89,6 +93,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help='one page for any browser, without a network: map, residuals, consistency and '
         'calibration over time',
     )
+    add_recording_options(outputs)
     add_result_options(outputs, FIGURES)
     parser.add_argument(
         '--strict',
@@ -143,14 +148,19 @@ def _replay(
             recording.event_count(selected),
         )
         recorder = _recorder(args)
+        map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
         is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
         needs_poses = is_drawn or len(truth.stamps_ns) > 0
-        result = replay(events, settings, truth, landmark_map, needs_poses, recorder)
-        warn_of_resets(result)
-        check_used(args, recording, selected, inputs, result)
-        if landmark_map is not None:
-            check_localised(args, result, landmark_map)
-        outcome = outcome_of(recording, selected, result, truth)
+        with estimate_writer(args, recording, selected, inputs, map_frame) as writer:
+            recorders = [noter for noter in (recorder, writer) if noter is not None]
+            result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
+            warn_of_resets(result)
+            check_used(args, recording, selected, inputs, result)
+            if landmark_map is not None:
+                check_localised(args, result, landmark_map)
+            outcome = outcome_of(recording, selected, result, truth)
+            if writer is not None:
+                writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
         warn_of_input(recording, selected, result)
         warn_of_timing(recording, selected)
     if recorder is not None:

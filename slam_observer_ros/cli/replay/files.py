@@ -38,10 +38,10 @@ def check_files(args: argparse.Namespace) -> None:
     if args.config is not None:
         read['the file of --config'] = [find_config(args.config)]
     loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
-    kept = {'--tum': args.tum, '--report': args.report}
+    kept = {'--tum': args.tum, '--report': args.report, '--mcap': args.mcap}
     check_inputs_are_kept(kept, read | loaded)
     check_inputs_are_kept({'--map': args.map}, read)
-    check_outputs([args.tum, args.map, args.report], args.force)
+    check_outputs([args.tum, args.map, args.report, args.mcap], args.force)
     check_plots(args.plot, FIGURES, args.force)
 
 
@@ -55,7 +55,7 @@ def write_files(
         ('report', args.report, lambda path: _write_report(args, outcome, summary, path)),
         ('figures', args.plot, lambda path: _draw_figures(outcome, path)),
     )
-    written: dict[str, Path] = {}
+    written: dict[str, Path] = {} if args.mcap is None else {'recording': args.mcap}
     errors: list[str] = []
     for name, path, write in outputs:
         if path is None:
