@@ -39,6 +39,7 @@ format: $(READY)  ## let ruff mend style and layout
 
 # The tests of one file share nodes and a ROS domain; those of two have nothing in common.
 pytest: $(READY)  ## the tests alone
+	scripts/ensure_chromium.sh
 	$(PYTHON_IN_VENV) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 colcon: $(READY)  ## build, install and test as a ROS workspace does

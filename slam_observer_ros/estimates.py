@@ -35,11 +35,26 @@ def point_share(counts: Counter[str], name: str) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class NormalisedInnovation:
+    """Residuals of m landmarks, judged by what the filter expected of them before the correction.
+
+    ``nis`` is the normalised innovation squared of those that were used, together: χ² of so many
+    ``degrees_of_freedom`` where all noise is as stated; None where no joint covariance is known.
+    """
+
+    distances: FloatArray  # (m,) Mahalanobis distance of each; zero if no noise is known
+    weights: FloatArray  # (m,) Huber's, 0 for a rejected one
+    nis: float | None
+    degrees_of_freedom: int
+
+
+@dataclass(frozen=True, slots=True)
 class Update:
     """The state at ``stamp_ns``, right after an observation of m known landmarks was used.
 
     Residuals are those before the correction, along the world's axes; the rejected ones were too
     far off to be used. ``lyapunov`` is L (34) of them all; k_i is ``gain_k`` whatever the gains.
+    ``innovation`` is None unless the estimator was asked for it.
     """
 
     stamp_ns: int
@@ -48,6 +63,7 @@ class Update:
     residuals: FloatArray  # (m, 3) r_i, metres
     rejected: BoolArray  # (m,)
     lyapunov: float
+    innovation: NormalisedInnovation | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 import json
 import logging
 import sys
@@ -26,6 +27,29 @@ class MessageHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Show one record."""
         show_message(record.levelname.lower(), record.getMessage())
+
+
+class _Keeper(logging.Handler):
+    """Keeps the warnings, as text."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.warnings: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one record."""
+        self.warnings.append(' '.join(record.getMessage().split()))
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """Give a list that the package's warnings are added to, beside being shown."""
+    keeper, package_logger = _Keeper(), logging.getLogger('slam_observer_ros')
+    package_logger.addHandler(keeper)
+    try:
+        yield keeper.warnings
+    finally:
+        package_logger.removeHandler(keeper)
 
 
 def show_message(kind: str, text: str) -> None:

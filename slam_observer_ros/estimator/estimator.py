@@ -52,7 +52,8 @@ class Estimator:
     ``on_stamp`` when all events of a stamp have been used: before the first one of a later stamp
     or after a jump of the clock that holds the pose, and by :meth:`flush`; ``on_motion`` with
     velocities and two stamps, nanoseconds, before the state is moved on between these; and
-    ``on_jump`` when the estimate has gone on after a jump of the clock.
+    ``on_jump`` when the estimate has gone on after a jump of the clock. ``judges_innovations``
+    adds :attr:`.Update.innovation`, which takes time.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class Estimator:
         on_stamp: Callable[[], None] | None = None,
         on_motion: OnMotion | None = None,
         on_jump: Callable[[], None] | None = None,
+        judges_innovations: bool = False,
     ) -> None:
         self.settings = settings = checked(settings)  # those in force
         self._live = LiveSettings.of(settings)
@@ -73,6 +75,7 @@ class Estimator:
         self.last_update: Update | None = None  # None before the first observation
         self._on_update, self._on_stamp = on_update, on_stamp
         self._on_motion, self._on_jump = on_motion, on_jump
+        self._judges_innovations = judges_innovations
         self._start_pose: FloatArray | None = None
         self._was_placed = False  # by somebody, so the pose of the settings is not its start
         self._hypotheses = Hypotheses(self._state_at(np.eye(4)))
@@ -456,7 +459,9 @@ class Estimator:
 
     def _state_at(self, pose: FloatArray) -> State:
         """Return a state at its start, with P° = ``pose`` (4, 4)."""
-        return State(make_filter(self._live, pose), self._live)
+        state = State(make_filter(self._live, pose), self._live)
+        state.judges_innovations = self._judges_innovations
+        return state
 
     def _allowed(self, pose: FloatArray) -> FloatArray:
         """Return a pose (4, 4), or with ``two_d_mode`` what of it lies in the plane."""
@@ -494,6 +499,7 @@ class Estimator:
             se3.rotate(observer.reference_pose, outcome.residuals),
             outcome.rejected,
             lyapunov(self.settings.gain_k, outcome.residuals),
+            outcome.innovation,
         )
 
     def _clear_time(self) -> None:

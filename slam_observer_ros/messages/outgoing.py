@@ -52,41 +52,41 @@ class OutgoingMessages:
         self, class_of: Callable[[str], Callable[..., Any]], octets: Callable[[bytes], Any]
     ) -> None:
         self._class_of = class_of
-        self._octets = octets
+        self.octets = octets
 
     def time(self, stamp_ns: int) -> Any:
         """Make a builtin_interfaces/Time."""
         seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS_PER_SECOND)
-        return self._make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
+        return self.make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
 
     def header(self, stamp_ns: int, frame_id: str) -> Any:
         """Make a std_msgs/Header."""
-        return self._make('std_msgs/msg/Header', stamp=self.time(stamp_ns), frame_id=frame_id)
+        return self.make('std_msgs/msg/Header', stamp=self.time(stamp_ns), frame_id=frame_id)
 
     def point(self, position: FloatArray) -> Any:
         """Make a geometry_msgs/Point of a position (3,)."""
         x, y, z = position.tolist()
-        return self._make('geometry_msgs/msg/Point', x=x, y=y, z=z)
+        return self.make('geometry_msgs/msg/Point', x=x, y=y, z=z)
 
     def vector(self, components: FloatArray) -> Any:
         """Make a geometry_msgs/Vector3 of its components (3,)."""
         x, y, z = components.tolist()
-        return self._make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
+        return self.make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
 
     def quaternion(self, rotation: FloatArray) -> Any:
         """Make a geometry_msgs/Quaternion of a rotation matrix (3, 3)."""
         x, y, z, w = so3.to_quaternion(rotation).tolist()
-        return self._make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
+        return self.make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
 
     def pose(self, pose: FloatArray) -> Any:
         """Make a geometry_msgs/Pose."""
         position, orientation = self.point(pose[:3, 3]), self.quaternion(pose[:3, :3])
-        return self._make('geometry_msgs/msg/Pose', position=position, orientation=orientation)
+        return self.make('geometry_msgs/msg/Pose', position=position, orientation=orientation)
 
     def pose_stamped(self, stamp_ns: int, frame_id: str, pose: FloatArray) -> Any:
         """Make a geometry_msgs/PoseStamped."""
         header = self.header(stamp_ns, frame_id)
-        return self._make('geometry_msgs/msg/PoseStamped', header=header, pose=self.pose(pose))
+        return self.make('geometry_msgs/msg/PoseStamped', header=header, pose=self.pose(pose))
 
     def pose_with_covariance(self, pose: FloatArray, covariance: FloatArray | None) -> Any:
         """Make a geometry_msgs/PoseWithCovariance.
@@ -94,7 +94,7 @@ class OutgoingMessages:
         The covariance (6, 6) is of (rotation vector, position) about the fixed axes, rad² and m²;
         None if unknown.
         """
-        return self._make(
+        return self.make(
             'geometry_msgs/msg/PoseWithCovariance',
             pose=self.pose(pose),
             covariance=_covariance_field(covariance),
@@ -102,12 +102,12 @@ class OutgoingMessages:
 
     def transform_stamped(self, stamp_ns: int, parent: str, child: str, pose: FloatArray) -> Any:
         """Make a geometry_msgs/TransformStamped of the pose of ``child`` in ``parent``."""
-        transform = self._make(
+        transform = self.make(
             'geometry_msgs/msg/Transform',
             translation=self.vector(pose[:3, 3]),
             rotation=self.quaternion(pose[:3, :3]),
         )
-        return self._make(
+        return self.make(
             'geometry_msgs/msg/TransformStamped',
             header=self.header(stamp_ns, parent),
             child_frame_id=child,
@@ -117,18 +117,18 @@ class OutgoingMessages:
     def twist(self, body_velocity: FloatArray) -> Any:
         """Make a geometry_msgs/Twist."""
         angular, linear = self.vector(body_velocity[:3]), self.vector(body_velocity[3:])
-        return self._make('geometry_msgs/msg/Twist', linear=linear, angular=angular)
+        return self.make('geometry_msgs/msg/Twist', linear=linear, angular=angular)
 
     def twist_stamped(self, stamp_ns: int, frame_id: str, body_velocity: FloatArray) -> Any:
         """Make a geometry_msgs/TwistStamped."""
         header, twist = self.header(stamp_ns, frame_id), self.twist(body_velocity)
-        return self._make('geometry_msgs/msg/TwistStamped', header=header, twist=twist)
+        return self.make('geometry_msgs/msg/TwistStamped', header=header, twist=twist)
 
     def twist_with_covariance(
         self, body_velocity: FloatArray, covariance: FloatArray | None
     ) -> Any:
         """Make a geometry_msgs/TwistWithCovariance; covariance (6, 6), None if unknown."""
-        return self._make(
+        return self.make(
             'geometry_msgs/msg/TwistWithCovariance',
             twist=self.twist(body_velocity),
             covariance=_covariance_field(covariance),
@@ -151,7 +151,7 @@ class OutgoingMessages:
         """
         records = _cloud_records(ids, points, covariances, velocities)
         fields = [
-            self._make(
+            self.make(
                 'sensor_msgs/msg/PointField',
                 name=name,
                 offset=4 * index,
@@ -160,7 +160,7 @@ class OutgoingMessages:
             )
             for index, name in enumerate(records.dtype.names or ())
         ]
-        return self._make(
+        return self.make(
             'sensor_msgs/msg/PointCloud2',
             header=self.header(stamp_ns, frame_id),
             height=1,
@@ -169,11 +169,12 @@ class OutgoingMessages:
             is_bigendian=False,
             point_step=records.itemsize,
             row_step=records.nbytes,
-            data=self._octets(records.tobytes()),
+            data=self.octets(records.tobytes()),
             is_dense=True,
         )
 
-    def _make(self, type_name: str, **fields: Any) -> Any:
+    def make(self, type_name: str, **fields: Any) -> Any:
+        """Make a message of a type such as ``geometry_msgs/msg/Pose`` from all its fields."""
         return self._class_of(type_name)(**fields)
 
 

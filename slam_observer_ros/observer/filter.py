@@ -151,6 +151,10 @@ class Filter:
         """Return the Mahalanobis distance (m,) of each residual; zero if no noise is known."""
         return np.zeros(len(residuals.r))
 
+    def innovation_covariance(self, residuals: Residuals) -> FloatArray | None:
+        """Return the joint covariance (m k, m k) of residuals, noise included; None if unknown."""
+        return None
+
     def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
         raise NotImplementedError

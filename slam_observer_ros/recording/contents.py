@@ -60,6 +60,17 @@ class Contents:
         """Return the frame that the poses of an odometry are in."""
         return self._frame(odometry, lambda raw: [decode_pose(raw)]).lstrip('/')
 
+    def has_parent_of(self, frame: str, selected: SelectedTopics) -> bool:
+        """Return whether a transform on /tf_static or /tf places a frame in another one."""
+        transforms = selected.transforms
+        return any(
+            transform.child_frame_id.lstrip('/') == frame
+            for message in self._decoded(
+                (*transforms.static, *transforms.moving), decode_transform_message
+            )
+            for transform in message
+        )
+
     def has_transform_of(self, frame: str, selected: SelectedTopics) -> bool:
         """Return whether a transform on /tf_static or /tf is from or to a frame."""
         transforms = selected.transforms

@@ -35,6 +35,7 @@ from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
 from slam_observer_ros.recording.sources import Loss, RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
+from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -161,6 +162,24 @@ class Recording:
             for event in events:
                 yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
         yield from builder.finish()
+
+    def copy_to(self, writer: RecordingWriter, selected: SelectedTopics) -> list[Topic]:
+        """Write what was read, as it was received; return topics left out, of unknown types."""
+        optional = (selected.pose_truth, selected.landmark_truth)
+        topics = [
+            *selected.inputs,
+            *selected.transforms.static,
+            *selected.transforms.moving,
+            *(topic for topic in optional if topic is not None),
+        ]
+        known = [topic for topic in topics if writer.knows(topic.message_type)]
+        latched = (*selected.transforms.static, selected.landmark_truth)
+        for raw in self._source.messages(known):
+            topic = raw.topic
+            writer.write(
+                topic.name, topic.message_type, raw.data, raw.receive_stamp_ns, topic in latched
+            )
+        return [topic for topic in topics if topic not in known]
 
     def truth(self, selected: SelectedTopics, base_frame: str = '') -> Truth:
         """Read the true landmarks, and the true poses of the base frame.

@@ -56,8 +56,9 @@ _LATCHED = Qos(
 class RecordingWriter:
     """Writes messages to a .mcap file that appears, whole, when the ``with`` block ends.
 
-    After an error in the block there is none. Raises a RecordingError if the file exists and may
-    not be replaced, isn't named .mcap, or can't be written, as on a full disk.
+    After an error in the block there is none. ``messages`` makes what it writes. Raises a
+    RecordingError if the file exists and may not be replaced, isn't named .mcap, or can't be
+    written, as on a full disk.
     """
 
     def __init__(self, path: Path | str, overwrite: bool = False) -> None:
@@ -65,7 +66,7 @@ class RecordingWriter:
         self._overwrite = overwrite
         self._connections: dict[tuple[str, str], Connection] = {}
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
-        self._messages = OutgoingMessages(
+        self.messages = OutgoingMessages(
             self._typestore.types.__getitem__, lambda data: np.frombuffer(data, np.uint8)
         )
         if self.path.suffix != '.mcap':
@@ -144,6 +145,10 @@ class RecordingWriter:
         except OSError as error:
             raise RecordingError(f'{self.path}: {error.strerror}') from error
 
+    def knows(self, message_type: str) -> bool:
+        """Return whether messages of a type can be written."""
+        return message_type in self._typestore.types
+
     def write_event(self, event: VelocityEvent | ObservationEvent | PoseTruth) -> None:
         """Write a velocity, an observation or a true pose to its default topic."""
         if isinstance(event, VelocityEvent):
@@ -161,8 +166,8 @@ class RecordingWriter:
         receive_stamp_ns: int | None = None,
     ) -> None:
         """Write a TwistStamped, received at its stamp by default; it can hold no covariance."""
-        message = self._messages.twist_stamped(event.stamp_ns, frame_id, event.body_velocity)
-        self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
+        message = self.messages.twist_stamped(event.stamp_ns, frame_id, event.body_velocity)
+        self.write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
     def write_observation(
         self,
@@ -172,7 +177,7 @@ class RecordingWriter:
         receive_stamp_ns: int | None = None,
     ) -> None:
         """Write a PointCloud2 with ids, and covariances and velocities if the event has them."""
-        message = self._messages.point_cloud2(
+        message = self.messages.point_cloud2(
             event.stamp_ns,
             frame_id,
             event.ids,
@@ -180,19 +185,19 @@ class RecordingWriter:
             event.covariances,
             event.velocities,
         )
-        self._write_message(topic, message, event.stamp_ns, receive_stamp_ns)
+        self.write_message(topic, message, event.stamp_ns, receive_stamp_ns)
 
     def write_pose(self, truth: PoseTruth) -> None:
         """Write a true pose as PoseStamped."""
-        message = self._messages.pose_stamped(truth.stamp_ns, MAP_FRAME, truth.pose)
-        self._write_message(POSE_TRUTH_TOPIC, message, truth.stamp_ns)
+        message = self.messages.pose_stamped(truth.stamp_ns, MAP_FRAME, truth.pose)
+        self.write_message(POSE_TRUTH_TOPIC, message, truth.stamp_ns)
 
     def write_landmarks(self, stamp_ns: int, truth: LandmarkTruth) -> None:
         """Write true landmark positions as a latched PointCloud2 with ids."""
-        message = self._messages.point_cloud2(stamp_ns, MAP_FRAME, truth.ids, truth.world_points)
-        self._write_message(LANDMARK_TRUTH_TOPIC, message, stamp_ns, latched=True)
+        message = self.messages.point_cloud2(stamp_ns, MAP_FRAME, truth.ids, truth.world_points)
+        self.write_message(LANDMARK_TRUTH_TOPIC, message, stamp_ns, latched=True)
 
-    def _write_message(
+    def write_message(
         self,
         topic: str,
         message: object,
@@ -200,6 +205,7 @@ class RecordingWriter:
         receive_stamp_ns: int | None = None,
         latched: bool = False,
     ) -> None:
+        """Write what :attr:`messages` has made, received at its stamp by default, nanoseconds."""
         message_type: str = message.__msgtype__  # type: ignore[attr-defined]
         data = self._typestore.serialize_cdr(message, message_type)
         received = stamp_ns if receive_stamp_ns is None else receive_stamp_ns

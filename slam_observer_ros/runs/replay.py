@@ -7,10 +7,10 @@ observations alike, so that stretches in which nothing is seen count too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 import time
-from typing import ParamSpec
+from typing import ParamSpec, Protocol
 
 import numpy as np
 
@@ -31,6 +31,19 @@ P = ParamSpec('P')
 
 NEES_PERIOD_NS = 5_000_000_000
 """Time between two covariances of the configuration, nanoseconds: they cost O(n³)."""
+
+
+class Recorder(Protocol):
+    """Notes of a run what is shown or written."""
+
+    def note_stamp(self, estimator: Estimator) -> None:
+        """Take in the state when all events of a stamp have been used."""
+
+    def note_update(self, update: Update) -> None:
+        """Take in an observation, with its innovation."""
+
+    def clear(self) -> None:
+        """Forget all: the run has started again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,14 +105,16 @@ def replay(
     truth: Truth | None = None,
     landmark_map: LandmarkMap | None = None,
     keep_all: bool = True,
+    recorders: Sequence[Recorder] = (),
 ) -> Replay:
     """Run events through an estimator, from where the settings say or anywhere in a known map.
 
     The events are in the order in which they were received; the truth is what the configuration
     error is measured against. Where not all is kept, memory does not grow with the recording: of
-    poses there are the first and the last, and residuals there are none.
+    poses there are the first and the last, and residuals there are none. What
+    ``recorders`` note is shown or written.
     """
-    run = _RunningReplay(settings, truth, landmark_map, keep_all)
+    run = _RunningReplay(settings, truth, landmark_map, keep_all, recorders)
     for event in events:
         run.add(event)
     return run.finish()
@@ -114,15 +129,18 @@ class _RunningReplay:
         truth: Truth | None,
         landmark_map: LandmarkMap | None,
         keep_all: bool,
+        recorders: Sequence[Recorder],
     ) -> None:
         self._settings = settings
         self._keep_all = keep_all
+        self._recorders = recorders
         self._estimator = Estimator(
             settings,
             on_update=self._untimed(self._on_update),
             on_stamp=self._untimed(self._on_stamp),
             on_motion=self._untimed(self._on_motion),
             on_jump=self._untimed(self._on_jump),
+            judges_innovations=bool(recorders),
         )
         self._in_known_map = landmark_map is not None
         self._in_fixed_map = self._in_known_map and settings.localization_mode == 'fixed'
@@ -188,6 +206,8 @@ class _RunningReplay:
     def _on_stamp(self) -> None:
         if self._start_ns is None:
             self._start_ns = self._estimator.stamp_ns
+        for recorder in self._recorders:
+            recorder.note_stamp(self._estimator)
         stamp_ns, is_localised = self._estimator.stamp_ns, self._estimator.is_localised
         if stamp_ns is None or not is_localised or not self._sampler.is_due(stamp_ns):
             return
@@ -201,6 +221,8 @@ class _RunningReplay:
     def _on_update(self, update: Update) -> None:
         if self._keep_all:
             self._updates.append(update)
+        for recorder in self._recorders:
+            recorder.note_update(update)
         self._count_observation()
         self._compare_with_truth(update)
 
@@ -208,6 +230,8 @@ class _RunningReplay:
         self._next_nees_ns = 0
         if self._settings.on_time_jump == 'reset':
             self._clear_figures()
+            for recorder in self._recorders:
+                recorder.clear()
 
     def _count_observation(self) -> None:
         used = used_points(self._estimator.counts)

@@ -27,6 +27,7 @@ class State:
 
     def __init__(self, filter_: Filter, settings: Settings) -> None:
         self.settings = settings  # those in force
+        self.judges_innovations = False  # which takes time, and is for those who look at them
         self.is_mapping = True  # landmarks are added, and relocated if rejected too often
         self.filter = filter_  # X̂, and what is known of its errors
         self.observer, self.axes = self.filter.observer, self.filter.axes

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
     is_contradiction,
     keyframe_of,
@@ -28,19 +30,22 @@ class Outcome:
     residuals: FloatArray  # (m, 3) before the correction, metres, reference frame
     rejected: BoolArray  # (m,) which of them were too far off to be used
     moved_ids: IntArray  # ids of landmarks that it showed to have moved
+    innovation: NormalisedInnovation | None = None
 
 
 def step(state: State, matched: MatchedObservation) -> Outcome:
     """One step of the observer (28), from where the velocity has led it (27): the innovation."""
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     _drop_history_if_full(state, matched)
+    expected = Expected.of(state.filter, residuals) if state.judges_innovations else None
     weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
     rejected = weights == 0.0
     _count(state, matched, rejected)
     event, rows = _add_new(state, matched)  # y_i° = Â y_i
     moved_ids = _relinearise(state, event, rows)
     _set_velocities(state, event, rows)  # (19)
-    return Outcome(matched.known.ids, residuals.r, rejected, moved_ids)
+    innovation = None if expected is None else expected.judge(weights)
+    return Outcome(matched.known.ids, residuals.r, rejected, moved_ids, innovation)
 
 
 def _correct(state: State, residuals: Residuals) -> FloatArray:

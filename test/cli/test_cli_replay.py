@@ -24,7 +24,7 @@ from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.simulation import Scenario, Simulation
 
 REPORT_KEYS = {
-    'lost',
+    'lost', 'recording', 'recording_sha256', 'version', 'settings', 'warnings', 'nis',
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
     'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
     'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',

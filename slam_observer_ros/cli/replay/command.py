@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from dataclasses import replace
 import logging
 from pathlib import Path
 
-from slam_observer_ros.cli.console import print_json, show_progress
+from slam_observer_ros.cli.console import kept_warnings, print_json, show_progress
 from slam_observer_ros.cli.options import add_settings_options, read_settings
 from slam_observer_ros.cli.outputs import add_force_option, add_result_options
+from slam_observer_ros.cli.replay.estimate_recording import (
+    add_recording_options,
+    estimate_writer,
+)
 from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
+from slam_observer_ros.cli.replay.identity import identity
 from slam_observer_ros.cli.replay.input_options import (
     add_input_options,
     check_frames,
@@ -27,16 +34,18 @@ from slam_observer_ros.cli.replay.outcome_checks import (
     warn_of_input,
     warn_of_resets,
 )
-from slam_observer_ros.cli.replay.summary import as_json, print_summary
+from slam_observer_ros.cli.replay.summary import as_json, print_summary, summary_rows
 from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
 from slam_observer_ros.common.errors import LossError, OutputError, UsageError
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.parameter_table import Value
 
 logger = logging.getLogger(__name__)
 
@@ -77,6 +86,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help='trajectory, as evo reads it, at most 20 poses a second',
     )
     outputs.add_argument('--map', type=Path, metavar='FILE', help='landmarks, as YAML')
+    outputs.add_argument(
+        '--report',
+        type=Path,
+        metavar='OUT.html',
+        help='one page for any browser, without a network: map, residuals, consistency and '
+        'calibration over time',
+    )
+    add_recording_options(outputs)
     add_result_options(outputs, FIGURES)
     parser.add_argument(
         '--strict',
@@ -92,6 +109,13 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run(args: argparse.Namespace) -> None:
     """Replay a recording, and write what was asked for."""
     defaults = {'smoothing_window': 0} if args.smooth else {}
+    with kept_warnings() as warnings:
+        outcome, map_frame = _outcome(args, defaults)
+    _write_and_print(args, replace(outcome, warnings=warnings), map_frame)
+
+
+def _outcome(args: argparse.Namespace, defaults: Mapping[str, Value]) -> tuple[ReplayOutcome, str]:
+    """Read what is asked for and replay; return what came of it, and the frame of outputs."""
     settings = read_settings(args, INPUT_NAMES, INSTEAD, **defaults)
     inputs = read_inputs(args)
     if args.smooth and not DESIGNS[settings.gains].has_joint_covariance:
@@ -100,7 +124,7 @@ def run(args: argparse.Namespace) -> None:
     warn_of_unused(args, settings)
     landmark_map = None if args.load_map is None else read_map(args.load_map)
     outcome = _replay(args, settings, inputs, landmark_map)
-    _write_and_print(args, outcome, _frame_of_outputs(inputs, landmark_map))
+    return outcome, _frame_of_outputs(inputs, landmark_map)
 
 
 def _replay(
@@ -123,17 +147,31 @@ def _replay(
             'replaying',
             recording.event_count(selected),
         )
-        is_drawn = args.tum is not None or args.plot is not None
+        recorder = _recorder(args)
+        map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
+        is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
         needs_poses = is_drawn or len(truth.stamps_ns) > 0
-        result = replay(events, settings, truth, landmark_map, keep_all=needs_poses)
-        warn_of_resets(result)
-        check_used(args, recording, selected, inputs, result)
-        if landmark_map is not None:
-            check_localised(args, result, landmark_map)
-        outcome = outcome_of(recording, selected, result, truth)
+        with estimate_writer(args, recording, selected, inputs, map_frame) as writer:
+            recorders = [noter for noter in (recorder, writer) if noter is not None]
+            result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
+            warn_of_resets(result)
+            check_used(args, recording, selected, inputs, result)
+            if landmark_map is not None:
+                check_localised(args, result, landmark_map)
+            outcome = outcome_of(recording, selected, result, truth)
+            if writer is not None:
+                writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
         warn_of_input(recording, selected, result)
         warn_of_timing(recording, selected)
+    if recorder is not None:
+        outcome = replace(outcome, recorder=recorder)
     return with_smoothed(outcome) if args.smooth else outcome
+
+
+def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
+    if args.report is not None:
+        return RunRecorder()
+    return NisTally() if args.json else None
 
 
 def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
@@ -151,9 +189,9 @@ def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -
 
 def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
     """Write and print all that can be, and only then say what could not be written."""
-    written, errors = write_files(args, outcome, map_frame)
+    written, errors = write_files(args, outcome, map_frame, summary_rows(outcome))
     if args.json:
-        print_json(as_json(outcome))
+        print_json(identity(args.recording, outcome) | as_json(outcome))
     else:
         print_summary(args.recording, outcome, written)
     if errors:

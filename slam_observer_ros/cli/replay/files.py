@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import dataclasses
 import logging
 from pathlib import Path
@@ -23,6 +23,9 @@ from slam_observer_ros.evaluation.plots.replay_plots import plot_errors, plot_re
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.recording.opening import files_of
+from slam_observer_ros.report.page import write_report
+from slam_observer_ros.report.reported_run import ReportedRun
+from slam_observer_ros.runs.recorder import RunRecorder
 
 logger = logging.getLogger(__name__)
 
@@ -35,22 +38,24 @@ def check_files(args: argparse.Namespace) -> None:
     if args.config is not None:
         read['the file of --config'] = [find_config(args.config)]
     loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
-    check_inputs_are_kept({'--tum': args.tum}, read | loaded)
+    kept = {'--tum': args.tum, '--report': args.report, '--mcap': args.mcap}
+    check_inputs_are_kept(kept, read | loaded)
     check_inputs_are_kept({'--map': args.map}, read)
-    check_outputs([args.tum, args.map], args.force)
+    check_outputs([args.tum, args.map, args.report, args.mcap], args.force)
     check_plots(args.plot, FIGURES, args.force)
 
 
 def write_files(
-    args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str
+    args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str, summary: Mapping[str, str]
 ) -> tuple[dict[str, Path], list[str]]:
     """Write what was asked for; return what was written, and why something was not."""
     outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
         ('trajectory', args.tum, lambda path: write_tum(outcome.trajectory, path)),
         ('map', args.map, lambda path: _write_map(outcome, map_frame, path)),
+        ('report', args.report, lambda path: _write_report(args, outcome, summary, path)),
         ('figures', args.plot, lambda path: _draw_figures(outcome, path)),
     )
-    written: dict[str, Path] = {}
+    written: dict[str, Path] = {} if args.mcap is None else {'recording': args.mcap}
     errors: list[str] = []
     for name, path, write in outputs:
         if path is None:
@@ -73,6 +78,32 @@ def _write_map(outcome: ReplayOutcome, map_frame: str, path: Path) -> None:
         # The covariances stay: what the filter knows of the map in the end is smoothed, too.
         landmark_map = dataclasses.replace(landmark_map, world_points=smoothed.world_points)
     write_map(path, landmark_map, estimator.settings)
+
+
+def _write_report(
+    args: argparse.Namespace, outcome: ReplayOutcome, summary: Mapping[str, str], path: Path
+) -> None:
+    recorder = outcome.recorder
+    if not isinstance(recorder, RunRecorder):
+        return
+    estimator = outcome.result.estimator
+    write_report(
+        path,
+        ReportedRun(
+            title=args.recording.name,
+            figures=summary,
+            warnings=outcome.warnings,
+            settings=estimator.settings,
+            start_ns=outcome.result.start_ns,
+            trajectory=outcome.result.trajectory,
+            in_known_map=outcome.result.in_known_map,
+            truth=outcome.truth,
+            errors=outcome.accuracy.pose_errors,
+            anees=outcome.accuracy.anees,
+            instants=recorder.finish(estimator),
+            innovations=recorder.innovations,
+        ),
+    )
 
 
 def _draw_figures(outcome: ReplayOutcome, directory: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import logging
 
@@ -16,6 +16,7 @@ from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.sources import Loss, NOTHING_LOST
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.accuracy import Accuracy, measure, measure_smoothed, trajectory_of
+from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import Replay
 
 MALFORMED = 'malformed'
@@ -43,6 +44,8 @@ class ReplayOutcome:
     smoothed: Smoothed | None = None
     smoothed_errors: TrajectoryErrors | None = None
     smoothed_landmark_rmse_m: float | None = None
+    recorder: RunRecorder | NisTally | None = None
+    warnings: Sequence[str] = ()
 
     @property
     def events(self) -> int:

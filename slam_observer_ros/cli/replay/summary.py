@@ -62,6 +62,7 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'configuration_rmse_m': accuracy.configuration_rmse_m,
         'anees': accuracy.anees,
         'configuration_anees': accuracy.configuration_anees,
+        'nis': None if outcome.recorder is None else outcome.recorder.mean_nis,
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
         'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
         'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,
@@ -74,6 +75,12 @@ def _ate_rmse_m(errors: TrajectoryErrors | None) -> float | None:
 
 def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str, Path]) -> None:
     """Print the figures as a table, and what was written where."""
+    rows = summary_rows(outcome) | {name: str(path) for name, path in written.items()}
+    print_table(str(recording), rows)
+
+
+def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
+    """Return the figures as text, by their names."""
     selected = outcome.selected
     estimator = outcome.result.estimator
     note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
@@ -97,9 +104,7 @@ def print_summary(recording: Path, outcome: ReplayOutcome, written: Mapping[str,
     if outcome.localised_after_s is not None:
         rows['pose in the map'] = _localisation_text(outcome.result, outcome.localised_after_s)
     rows |= {part.name: str(part) for part in estimator.calibration}
-    rows |= _accuracy_rows(outcome)
-    rows |= {name: str(path) for name, path in written.items()}
-    print_table(str(recording), rows)
+    return rows | _accuracy_rows(outcome)
 
 
 def _loss_text(outcome: ReplayOutcome) -> str:

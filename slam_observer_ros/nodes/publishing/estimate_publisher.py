@@ -16,11 +16,11 @@ from visualization_msgs.msg import MarkerArray
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
+from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.nodes.intake.input_topic import several
 from slam_observer_ros.nodes.intake.transform_listener import LiveTransforms
 from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.publishing.markers import landmark_markers, no_markers
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
@@ -32,9 +32,6 @@ TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', '
 EARLY = 0.5
 """Part of the period by which a state may come early, so that one of an input of the same rate,
 which jitters, is never left for the next."""
-
-PATH_SPACING_NS = 100_000_000
-"""Least time between two poses of the path, nanoseconds."""
 
 
 class EstimatePublisher:
@@ -56,6 +53,7 @@ class EstimatePublisher:
         self._settings = settings
         self._log = ThrottledLog(node)
         self._estimator = estimator
+        self._messages = EstimateMessages(MESSAGES, settings.map_frame, settings.base_frame)
         self._period_s = 1.0 / settings.publish_rate
         self._due_s = 0.0  # when the next state may be published, by a steady clock
         self._fast_stamp_ns: int | None = None
@@ -114,7 +112,7 @@ class EstimatePublisher:
         if self._broadcaster is not None:
             self._broadcaster.add(stamp_ns, pose)
         self._extend_path(stamp_ns, pose)
-        self._lyapunov.publish(Float64(data=float(self._estimator.lyapunov)))
+        self._lyapunov.publish(self._messages.value(self._estimator.lyapunov))
         self._publish_estimates(stamp_ns)
 
     def publish_overview(self) -> None:
@@ -123,8 +121,7 @@ class EstimatePublisher:
         if stamp_ns in (None, self._slow_stamp_ns) or not self._estimator.is_localised:
             return
         self._slow_stamp_ns = stamp_ns
-        header = MESSAGES.header(stamp_ns, self._settings.map_frame)
-        self._path_publisher.publish(Path(header=header, poses=list(self._path)))
+        self._path_publisher.publish(self._messages.path(stamp_ns, self._path))
         self._publish_landmarks(stamp_ns)
 
     def replace_landmarks(self) -> None:
@@ -139,7 +136,7 @@ class EstimatePublisher:
             return
         no_ids = np.empty(0, dtype=np.int64)
         self._map.publish(MESSAGES.point_cloud2(stamp_ns, map_frame, no_ids, np.empty((0, 3))))
-        self._markers.publish(no_markers(MESSAGES.header(stamp_ns, map_frame)))
+        self._markers.publish(self._messages.markers.none(stamp_ns))
 
     def repeat_transform(self) -> None:
         """Publish the odometry's correction as of now, while no new one comes."""
@@ -158,43 +155,24 @@ class EstimatePublisher:
         self.replace_landmarks()
 
     def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
-        header = MESSAGES.header(stamp_ns, self._settings.map_frame)
-        uncertain = MESSAGES.pose_with_covariance(pose, self._estimator.pose_covariance)
         estimator = self._estimator
-        uncertain_twist = MESSAGES.twist_with_covariance(
-            estimator.body_velocity, estimator.body_velocity_covariance
-        )
-        self._pose.publish(PoseWithCovarianceStamped(header=header, pose=uncertain))
-        self._odometry.publish(
-            Odometry(
-                header=header,
-                child_frame_id=self._settings.base_frame,
-                pose=uncertain,
-                twist=uncertain_twist,
-            )
-        )
+        uncertain = self._messages.pose(stamp_ns, pose, estimator.pose_covariance)
+        self._pose.publish(uncertain)
+        velocity, covariance = estimator.body_velocity, estimator.body_velocity_covariance
+        self._odometry.publish(self._messages.odometry(uncertain, velocity, covariance))
 
     def _publish_landmarks(self, stamp_ns: int) -> None:
-        estimator, map_frame = self._estimator, self._settings.map_frame
-        velocities = estimator.landmark_velocities
-        self._map.publish(
-            MESSAGES.point_cloud2(
-                stamp_ns,
-                map_frame,
-                estimator.landmark_ids,
-                estimator.world_points,
-                estimator.landmark_covariances,
-                velocities if velocities.any() else None,
-            )
+        estimator = self._estimator
+        landmarks = (
+            estimator.landmark_ids,
+            estimator.world_points,
+            estimator.landmark_covariances,
         )
+        velocities = estimator.landmark_velocities
+        self._map.publish(self._messages.landmarks(stamp_ns, *landmarks, velocities))
         if self._markers.get_subscription_count() > 0:
-            header = MESSAGES.header(stamp_ns, map_frame)
-            landmarks = (
-                estimator.landmark_ids,
-                estimator.world_points,
-                estimator.landmark_covariances,
-            )
-            self._markers.publish(landmark_markers(header, *landmarks, estimator.last_update))
+            markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
+            self._markers.publish(markers)
 
     def _publish_estimates(self, stamp_ns: int) -> None:
         ids = self._estimator.landmark_ids
@@ -213,4 +191,4 @@ class EstimatePublisher:
         if last_ns is not None and 0 <= stamp_ns - last_ns < PATH_SPACING_NS:
             return
         self._path_stamp_ns = stamp_ns
-        self._path.append(MESSAGES.pose_stamped(stamp_ns, self._settings.map_frame, pose))
+        self._path.append(self._messages.path_pose(stamp_ns, pose))

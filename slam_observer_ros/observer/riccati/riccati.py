@@ -71,6 +71,10 @@ class RiccatiFilter(Filter):
         _, predicted = self.joint.output(C, residuals.rows)
         return mahalanobis(r, predicted + R)
 
+    def innovation_covariance(self, residuals: Residuals) -> FloatArray:
+        """Return the joint covariance (m k, m k) of residuals, noise included."""
+        return with_blocks(self.predicted(residuals)[1], residuals.on(self.axes)[1])
+
     def predicted(self, residuals: Residuals) -> tuple[FloatArray, FloatArray]:
         """Return what P predicts of m residuals: with ε (p, m k), and their own (m k, m k)."""
         C = self.joint.output_matrix(residuals, chord=0.5)

@@ -1,0 +1,296 @@
+// @ts-check
+'use strict';
+/* Draws the numbers of the page with Plotly; the slider moves everything to one instant. */
+
+/** @typedef {(number|null)[]} Curve */
+/** @type {any} */
+const Plotly = /** @type {any} */ (globalThis).Plotly;
+/** @type {any} */
+const run = JSON.parse(/** @type {HTMLElement} */ (document.getElementById('numbers')).textContent || '{}');
+
+/* Okabe and Ito: distinct for all kinds of colour vision. */
+const BLUE = '#0072b2', SKY = '#56b4e9', ORANGE = '#e69f00', RED = '#d55e00', GREEN = '#009e73', PINK = '#cc79a7';
+const HEIGHTS = { large: 200, small: 130 };
+const dark = matchMedia('(prefers-color-scheme: dark)');
+let printing = false;
+
+/** @param {string} id @returns {HTMLElement} */
+const element = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
+const slider = /** @type {HTMLInputElement} */ (element('slider'));
+
+function ink() { return dark.matches && !printing ? '#e6e9ee' : '#1b1f24'; }
+/* From blue to yellow, as Cividis; small values stay visible on paper and in the dark. */
+function scale() { return dark.matches && !printing ? [[0, '#4a74b5'], [0.5, '#9c9a8e'], [1, '#ffe945']] : [[0, '#f0d84a'], [0.5, '#7c7b78'], [1, '#00204d']]; }
+function grid() { return dark.matches && !printing ? '#39404a' : '#d5d9de'; }
+
+/** Points of an ellipse, then a gap. @param {number} x @param {number} y @param {number[]} shape @param {Curve} xs @param {Curve} ys */
+function addEllipse(x, y, [a, b, angle], xs, ys) {
+  for (let i = 0; i <= 24; i += 1) {
+    const u = a * Math.cos(i * Math.PI / 12), v = b * Math.sin(i * Math.PI / 12);
+    xs.push(x + u * Math.cos(angle) - v * Math.sin(angle));
+    ys.push(y + u * Math.sin(angle) + v * Math.cos(angle));
+  }
+  xs.push(null);
+  ys.push(null);
+}
+
+/** What moves with the slider. @param {number} i instant @param {number} plane 0 plan, 1 side @param {number} second which axis is drawn upwards */
+function stateAt(i, plane, second) {
+  const { xyz, ahead, robot, points, ellipses } = run.instants;
+  const [x, y] = [xyz[i][0], xyz[i][second]];
+  /** @type {Curve} */ const ex = [];
+  /** @type {Curve} */ const ey = [];
+  (ellipses[i][plane] || []).forEach((/** @type {number[]} */ e, /** @type {number} */ n) => addEllipse(points[i][0][n], points[i][second][n], e, ex, ey));
+  /** @type {Curve} */ const rx = [];
+  /** @type {Curve} */ const ry = [];
+  if (robot[i][plane]) addEllipse(x, y, robot[i][plane][0], rx, ry);
+  const length = 0.04 * extent;
+  return {
+    x: [points[i][0], ex, rx, [x, x + length * ahead[i][0]], [x]],
+    y: [points[i][second], ey, ry, [y, y + length * ahead[i][second]], [y]],
+    text: [run.instants.ids[i].map((/** @type {number} */ id) => String(id)), null, null, null, null],
+  };
+}
+
+const extent = (() => {
+  const all = [0, 1].map((k) => run.path.xyz[k].filter((/** @type {number|null} */ v) => v !== null));
+  return Math.max(...all.map((v) => (v.length ? v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.max(a, b)) - v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.min(a, b)) : 1)), 0.1);
+})();
+
+/** @param {string} id @param {number} plane @param {number} second */
+function drawMap(id, plane, second) {
+  const path = run.path, first = stateAt(0, plane, second);
+  const traces = [];
+  if (path.true_xyz) {
+    traces.push({ x: path.true_xyz[0], y: path.true_xyz[second], mode: 'lines', name: 'truth, aligned', line: { color: ink(), width: 1, dash: 'dot' }, hoverinfo: 'skip' });
+  }
+  const colours = path.error_m
+    ? { color: path.error_m, colorscale: scale(), size: 4, colorbar: { title: { text: 'error [m]', side: 'right' }, thickness: 12, len: 0.8 } }
+    : { color: path.t, colorscale: scale(), size: 4, colorbar: { title: { text: 'time [s]', side: 'right' }, thickness: 12, len: 0.8 } };
+  traces.push({
+    x: path.xyz[0], y: path.xyz[second], mode: 'markers', name: 'estimate', marker: colours, customdata: path.t,
+    text: path.error_m ? path.error_m.map((/** @type {number|null} */ e) => (e === null ? 'no truth' : `${e.toFixed(2)} m off`)) : path.t,
+    hovertemplate: '%{customdata:.1f} s, %{text}<extra></extra>',
+  });
+  if (run.true_landmarks) {
+    traces.push({ x: run.true_landmarks.xyz[0], y: run.true_landmarks.xyz[second], mode: 'markers', name: 'true landmarks', marker: { symbol: 'x-thin', size: 9, line: { color: ink(), width: 1.5 } }, text: run.true_landmarks.ids, hovertemplate: 'true landmark %{text}<extra></extra>' });
+  }
+  const still = traces.length;
+  traces.push(
+    { x: first.x[0], y: first.y[0], text: first.text[0], mode: 'markers+text', textposition: 'top right', name: 'landmarks', marker: { symbol: 'square', size: 7, color: GREEN }, hovertemplate: 'landmark %{text}<extra></extra>' },
+    { x: first.x[1], y: first.y[1], mode: 'lines', name: '95 %, landmarks', line: { color: GREEN, width: 1.5 }, hoverinfo: 'skip' },
+    { x: first.x[2], y: first.y[2], mode: 'lines', name: '95 %, robot', line: { color: RED, width: 2 }, hoverinfo: 'skip' },
+    { x: first.x[3], y: first.y[3], mode: 'lines', showlegend: false, line: { color: RED, width: 3 }, hoverinfo: 'skip' },
+    { x: first.x[4], y: first.y[4], mode: 'markers', name: 'robot', marker: { size: 10, color: RED, line: { color: '#fff', width: 1 } }, hoverinfo: 'skip' },
+  );
+  const axis = { gridcolor: grid(), zeroline: false, automargin: true };
+  Plotly.newPlot(id, traces, {
+    paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink() },
+    margin: { l: 50, r: 10, t: 10, b: 40 }, legend: { orientation: 'h', y: 1.02, yanchor: 'bottom', x: 0.5, xanchor: 'center' },
+    xaxis: { ...axis, title: { text: 'x [m]' }, constrain: 'domain' },
+    yaxis: { ...axis, title: { text: second === 1 ? 'y [m]' : 'z [m]' }, scaleanchor: 'x', constrain: 'domain' },
+    hovermode: 'closest', uirevision: 'kept', showlegend: plane === 0,
+  }, { responsive: true, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches ? undefined : false });
+  element(id).dataset.still = String(still);
+  /** @type {any} */ (element(id)).on('plotly_click', (/** @type {any} */ event) => {
+    const t = event.points[0].customdata;
+    if (typeof t === 'number') goTo(t);
+  });
+}
+
+/** @typedef {{title: string, traces: any[], axis?: any, small?: boolean}} Row */
+
+/** One legend entry inside the row it belongs to: the name is written at the curve's row title.
+ * @returns {Row[]} */
+function rows() {
+  const { errors, consistency, residuals } = run;
+  /** @param {any} x @param {any} y @param {string} name @param {any} line */
+  const curve = (x, y, name, line) => ({ x, y, name, mode: 'lines', line: { width: 1.6, ...line } });
+  /** @type {Row[]} */
+  const all = [];
+  const position = [];
+  if (run.path.error_m) position.push(curve(run.path.t, run.path.error_m, 'error, aligned as for the ATE', { color: BLUE }));
+  if (errors.drift_m) position.push(curve(errors.t, errors.drift_m, 'error from the first pose on', { color: RED }));
+  position.push(curve(errors.t, errors.bound_m, 'stated 95 %, from the first pose on', { color: ink(), dash: 'dash' }));
+  all.push({ title: 'position [m]', traces: position, axis: { rangemode: 'tozero' } });
+  const ids = residuals.id;
+  /** @param {(w: number) => boolean} test @param {any} y @param {string} name @param {any} marker */
+  const some = (test, y, name, marker) => {
+    const rows = residuals.weight.map((/** @type {number} */ w, /** @type {number} */ i) => i).filter((/** @type {number} */ i) => test(residuals.weight[i]));
+    return { x: rows.map((/** @type {number} */ i) => residuals.t[i]), y: rows.map((/** @type {number} */ i) => y(i)), text: rows.map((/** @type {number} */ i) => `landmark ${ids[i]}: ${residuals.sigma[i]} σ`), name, mode: 'markers', marker, hovertemplate: '%{text}<extra></extra>' };
+  };
+  const known = residuals.sigma.some((/** @type {number} */ s) => s > 0);
+  /** @param {any} y @param {boolean} legend */
+  const kinds = (y, legend) => [
+    some((w) => w === 1, y, 'used', { color: SKY, size: 4 }),
+    some((w) => w > 0 && w < 1, y, 'down-weighted', { color: ORANGE, size: 6, symbol: 'triangle-up' }),
+    some((w) => w === 0, y, 'rejected', { color: RED, size: 8, symbol: 'x' }),
+  ].map((trace, n) => ({ ...trace, showlegend: legend, legendgroup: `kind${n}` }));
+  if (known) {
+    all.push({ title: 'residual [σ]', traces: kinds((/** @type {number} */ i) => Math.max(residuals.sigma[i], 0.1), true), axis: { type: 'log', range: [-1, Math.max(1, Math.log10(1.2 * Math.max(...residuals.sigma, 1)))], dtick: 1 } });
+  }
+  const names = [...new Set(ids)].sort((a, b) => Number(a) - Number(b));
+  all.push({ title: 'landmark seen', traces: kinds((/** @type {number} */ i) => names.indexOf(ids[i]), !known), axis: { tickvals: names.map((_, i) => i), ticktext: names.map(String), showgrid: names.length <= 40, range: [-0.7, names.length - 0.3], nticks: 20, tickfont: { size: names.length > 12 ? 9 : 11 } } });
+  const fit = [];
+  if (consistency.nis) {
+    fit.push(
+      { ...curve(consistency.nis_t, consistency.nis_low, 'low', { width: 0 }), showlegend: false, hoverinfo: 'skip' },
+      { ...curve(consistency.nis_t, consistency.nis_high, `95 % of NIS if all noise is as stated`, { width: 0 }), fill: 'tonexty', fillcolor: 'rgba(0,158,115,0.25)', hoverinfo: 'skip' },
+      curve(consistency.nis_t, consistency.nis, `NIS per degree of freedom, ${consistency.nis_group} observations each`, { color: GREEN, width: 0.8 }),
+    );
+    fit[2].mode = 'lines+markers';
+    fit[2].marker = { size: 4, color: GREEN };
+  }
+  if (consistency.nees) {
+    fit.push(curve(consistency.nees_t, consistency.nees, 'NEES of the pose per degree of freedom', { color: PINK }));
+    for (const limit of consistency.nees_band) {
+      fit.push({ ...curve([run.errors.t[0], run.errors.t[run.errors.t.length - 1]], [limit, limit], '95 % of NEES', { color: PINK, dash: 'dot', width: 1 }), showlegend: limit === consistency.nees_band[1], hoverinfo: 'skip' });
+    }
+  }
+  if (fit.length) all.push({ title: 'NIS, NEES', traces: fit, axis: { type: 'log', dtick: 1 } });
+  for (const part of run.calibration) {
+    const x = run.errors.t, up = part.value.map((/** @type {number} */ v, /** @type {number} */ i) => v + part.deviation[i]);
+    const down = part.value.map((/** @type {number} */ v, /** @type {number} */ i) => v - part.deviation[i]);
+    all.push({
+      title: `${part.name.replaceAll('_', ' ')}${part.unit ? `<br>[${part.unit}]` : ''}`, small: true,
+      traces: [
+        { ...curve(x, down, 'down', { width: 0 }), showlegend: false, hoverinfo: 'skip' },
+        { ...curve(x, up, '± σ', { width: 0 }), fill: 'tonexty', fillcolor: 'rgba(86,180,233,0.35)', showlegend: false, hoverinfo: 'skip' },
+        { ...curve(x, part.value, part.name, { color: BLUE }), showlegend: false },
+        { ...curve([x[0], x[x.length - 1]], [part.nominal, part.nominal], 'nominal', { color: ink(), dash: 'dot', width: 1 }), showlegend: false },
+      ],
+    });
+  }
+  all.push({ title: 'log10 L', small: true, traces: [{ ...curve(errors.lyapunov_t, errors.lyapunov, 'log10 L', {}), mode: 'markers', marker: { color: BLUE, size: 3 }, showlegend: false }] });
+  if (run.drops.length) {
+    all.push({ title: 'dropped', small: true, traces: run.drops.map((/** @type {any} */ drop, /** @type {number} */ n) => ({ ...curve(errors.t, drop.count, `dropped: ${drop.reason}`, { color: [RED, BLUE, ORANGE, GREEN, PINK, SKY][n % 6], shape: 'hv' }) })), axis: { rangemode: 'tozero' } });
+  }
+  return all;
+}
+
+function drawCurves() {
+  const all = rows(), narrow = element('curves').clientWidth < 700;
+  /* Above each row there is room for its legend, a line for each name where they don't fit into one. */
+  const spaces = all.map((row) => 28 + 18 * (narrow ? row.traces.filter((trace) => trace.showlegend !== false).length : 1));
+  const heights = all.map((row) => (row.small ? HEIGHTS.small : HEIGHTS.large));
+  const total = heights.reduce((a, b, n) => a + b + spaces[n], 0);
+  const end = run.errors.t[run.errors.t.length - 1] || 1;
+  /** @type {any} */
+  const layout = {
+    height: total + 44, paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink(), size: 12 },
+    margin: { l: 62, r: 12, t: 4, b: 40 }, hovermode: 'closest', uirevision: 'kept',
+    xaxis: { gridcolor: grid(), zeroline: false, title: { text: 'time [s]' }, anchor: `y${all.length}`, range: [0, end] },
+    shapes: [{ type: 'line', xref: 'x', yref: 'paper', x0: 0, x1: 0, y0: 0, y1: 1, line: { color: RED, width: 1.5 } }].concat(run.gaps.map((/** @type {number[]} */ gap) => ({ type: 'rect', xref: 'x', yref: 'paper', x0: gap[0], x1: gap[1], y0: 0, y1: 1, line: { width: 0 }, fillcolor: 'rgba(128,128,128,0.18)', layer: 'below' }))),
+  };
+  /** @type {any[]} */
+  const traces = [];
+  let top = 0;
+  all.forEach((row, n) => {
+    const name = n ? String(n + 1) : '';
+    top += spaces[n];
+    const y1 = 1 - top / total, y0 = 1 - (top + heights[n]) / total;
+    layout[`yaxis${name}`] = { domain: [Math.max(y0, 0), y1], gridcolor: grid(), zeroline: false, title: { text: row.title, font: { size: 11 } }, ...row.axis };
+    layout[`legend${name}`] = { orientation: 'h', x: 0, y: y1, yanchor: 'bottom', bgcolor: 'rgba(0,0,0,0)', font: { size: 11 } };
+    row.traces.forEach((trace) => traces.push({ ...trace, xaxis: 'x', yaxis: `y${name}`, legend: `legend${name}` }));
+    top += heights[n];
+  });
+  Plotly.newPlot('curves', traces, layout, { responsive: true, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches ? undefined : false });
+  /** @type {any} */ (element('curves')).on('plotly_click', (/** @type {any} */ event) => goTo(event.points[0].x));
+}
+
+/** @param {number} t seconds */
+function goTo(t) {
+  const times = run.instants.t;
+  let best = 0;
+  times.forEach((/** @type {number} */ time, /** @type {number} */ i) => { if (Math.abs(time - t) < Math.abs(times[best] - t)) best = i; });
+  slider.value = String(best);
+  show();
+}
+
+let due = false;
+function show() {
+  if (due) return;
+  due = true;
+  setTimeout(() => { due = false; update(); }, 16);
+}
+
+function update() {
+  const i = Number(slider.value), t = run.instants.t[i];
+  if (t === undefined) return;
+  [['map', 0, 1], ['side', 1, 2]].forEach(([id, plane, second]) => {
+    const still = Number(element(String(id)).dataset.still);
+    if (!element(String(id)).dataset.still) return;
+    const state = stateAt(i, Number(plane), Number(second));
+    Plotly.restyle(id, { x: state.x, y: state.y, text: state.text.map((text) => text || '') }, [0, 1, 2, 3, 4].map((n) => still + n));
+  });
+  Plotly.relayout('curves', { 'shapes[0].x0': t, 'shapes[0].x1': t });
+  const near = run.path.t.reduce((/** @type {number} */ a, /** @type {number} */ time, /** @type {number} */ k) => (Math.abs(time - t) < Math.abs(run.path.t[a] - t) ? k : a), 0);
+  const error = run.path.error_m ? run.path.error_m[near] : null;
+  const bound = run.errors.bound_m[run.errors.t.indexOf(t)];
+  const parts = [`${t.toFixed(1)} s`, `${run.instants.ids[i].length} landmarks`];
+  if (error !== null && error !== undefined) parts.push(`position ${error.toPrecision(2)} m off (aligned)`);
+  if (bound !== null && bound !== undefined) parts.push(`stated 95 %: ${bound.toFixed(2)} m`);
+  if (run.gaps.some((/** @type {number[]} */ gap) => gap[0] <= t && t <= gap[1])) parts.push('sees no landmark it can use');
+  element('readout').textContent = parts.join(' · ');
+  slider.setAttribute('aria-valuetext', parts.join(', '));
+}
+
+/** @param {string} id @param {string[]} head @param {any[][]} body */
+function fillTable(id, head, body) {
+  const table = /** @type {HTMLTableElement} */ (element(id));
+  if (head.length) {
+    const row = table.createTHead().insertRow();
+    head.forEach((text, n) => { const cell = document.createElement('th'); cell.textContent = text; if (body[0] && typeof body[0][n] === 'number') cell.className = 'number'; row.append(cell); });
+  }
+  const rows = table.createTBody();
+  body.forEach((values) => {
+    const row = rows.insertRow();
+    values.forEach((value) => { const cell = row.insertCell(); cell.textContent = value === null ? '–' : String(value); if (typeof value === 'number') cell.className = 'number'; });
+  });
+}
+
+function write() {
+  document.title = run.title;
+  element('title').textContent = run.title;
+  const list = /** @type {HTMLElement} */ (element('findings').querySelector('ol'));
+  run.findings.forEach((/** @type {any} */ finding) => {
+    const item = document.createElement('li');
+    if (finding.end_s === null) {
+      item.textContent = finding.text;
+    } else {
+      const button = document.createElement('button');
+      button.textContent = finding.text;
+      button.addEventListener('click', () => goTo(finding.end_s));
+      item.append(button);
+    }
+    list.append(item);
+  });
+  if (!run.findings.length) element('findings').hidden = true;
+  element('map-note').textContent = run.path.true_xyz ? 'The estimate as it was at each moment; its colour is the distance from the truth, aligned with the whole run.' : 'The estimate as it was at each moment. The recording holds no truth to compare it with.';
+  if (run.errors.bound_m.some((/** @type {number|null} */ b) => b !== null)) element('map-note').textContent += ' Ellipses hold 95 %; they count from the first pose, from where everything is mapped.';
+  fillTable('landmarks', ['id', 'observed', 'rejected', 'down-weighted', 'residual RMS [m]', 'residual RMS [σ]', 'stated σ [m]', 'error [m]'], run.landmarks);
+  fillTable('figures', [], run.figures);
+  fillTable('settings', ['name', 'value', 'default'], run.settings);
+  fillTable('versions', [], run.versions);
+  const warnings = run.warnings.length ? run.warnings : ['none'];
+  warnings.forEach((/** @type {string} */ text) => { const item = document.createElement('li'); item.textContent = text; element('warnings').append(item); });
+}
+
+function draw() {
+  if (!run.instants.t.length) { element('time-bar').hidden = true; return; }
+  drawMap('map', 0, 1);
+  if (!run.is_flat) drawMap('side', 1, 2);
+  drawCurves();
+  update();
+}
+
+write();
+slider.max = String(Math.max(run.instants.t.length - 1, 0));
+slider.value = slider.max;
+draw();
+const wanted = /^#t=([0-9.]+)$/.exec(location.hash);
+if (wanted) goTo(Number(wanted[1]));
+slider.addEventListener('input', show);
+dark.addEventListener('change', draw);
+addEventListener('beforeprint', () => { printing = true; draw(); });
+addEventListener('afterprint', () => { printing = false; draw(); });

@@ -1,0 +1,124 @@
+"""What the page draws over time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.consistency import average_nees_band, normalised_squared_errors
+from slam_observer_ros.report.ellipses import CHI_SQUARE_95
+from slam_observer_ros.report.lists import Json, rounded
+from slam_observer_ros.report.reported_run import ReportedRun
+
+MAX_GROUPS = 150
+"""Points of the curve of NIS, each the mean of as many observations as that takes."""
+
+MIN_GROUP = 10
+
+
+def errors(run: ReportedRun) -> dict[str, Json]:
+    """Return position errors and the half-axis of the stated 95 % ellipse, metres."""
+    seconds = run.instants_s
+    curves: dict[str, Json] = {
+        't': rounded(seconds, 2),
+        'bound_m': rounded(_bounds_m(run), 3),
+        'lyapunov_t': rounded(run.seconds(run.innovations.update_stamps_ns), 2),
+        'lyapunov': _log10(run.innovations.lyapunov),
+    }
+    anchored = run.anchored_errors()
+    if anchored is not None:
+        of_poses, rows = anchored
+        error_m = np.full(len(seconds), np.nan)
+        error_m[rows] = np.linalg.norm(of_poses[:, 3:], axis=1)
+        curves['drift_m'] = rounded(error_m, 3)
+    return curves
+
+
+def _log10(values: FloatArray) -> Json:
+    return rounded(np.log10(np.where(values > 0.0, values, np.nan)), 2)
+
+
+def _bounds_m(run: ReportedRun) -> FloatArray:
+    covariances = [instant.pose_covariance for instant in run.instants]
+    return np.array(
+        [
+            np.nan
+            if covariance is None
+            else np.sqrt(CHI_SQUARE_95 * max(np.linalg.eigvalsh(covariance[3:, 3:])[-1], 0.0))
+            for covariance in covariances
+        ]
+    )
+
+
+def consistency(run: ReportedRun) -> dict[str, Json]:
+    """Return NEES of the pose and NIS, each per degree of freedom, with their 95 % bands."""
+    curves = _nis(run)
+    anchored = run.anchored_errors()
+    if anchored is None:
+        return curves
+    of_poses, rows = anchored
+    known = [index for index, row in enumerate(rows) if _has_covariance(run, int(row))]
+    if not known:
+        return curves
+    covariances = np.array([run.instants[rows[index]].pose_covariance for index in known])
+    nees, degrees = normalised_squared_errors(of_poses[known], covariances)
+    usable = degrees > 0  # the first pose is exact
+    if not usable.any():
+        return curves
+    return curves | {
+        'nees_t': rounded(run.instants_s[rows[known]][usable], 2),
+        'nees': rounded(nees[usable] / degrees[usable], 3),
+        'nees_band': rounded(np.array(average_nees_band(int(degrees[usable].max()), 1)), 3),
+    }
+
+
+def _has_covariance(run: ReportedRun, row: int) -> bool:
+    return run.instants[row].pose_covariance is not None
+
+
+def _nis(run: ReportedRun) -> dict[str, Json]:
+    innovations = run.innovations
+    known = np.flatnonzero(innovations.degrees_of_freedom > 0)
+    if not len(known):
+        return {}
+    group = max(MIN_GROUP, -(-len(known) // MAX_GROUPS))
+    starts = np.arange(0, len(known), group)
+    degrees = np.add.reduceat(innovations.degrees_of_freedom[known], starts)
+    nis = np.add.reduceat(innovations.nis[known], starts) / degrees
+    middles = np.minimum(starts + group // 2, len(known) - 1)
+    bands = np.array([average_nees_band(int(count), 1) for count in degrees])
+    return {
+        'nis_t': rounded(run.seconds(innovations.update_stamps_ns[known[middles]]), 2),
+        'nis': rounded(nis, 3),
+        'nis_low': rounded(bands[:, 0], 3),
+        'nis_high': rounded(bands[:, 1], 3),
+        'nis_group': group,
+    }
+
+
+def calibration(run: ReportedRun) -> list[Json]:
+    """Return what was estimated of the velocity's calibration, and its standard deviation."""
+    parts = run.instants[-1].calibration if run.instants else ()
+    return [
+        {
+            'name': part.name,
+            'unit': part.unit,
+            'nominal': part.nominal,
+            'value': rounded(
+                np.array([instant.calibration[index].value for instant in run.instants]), 5
+            ),
+            'deviation': rounded(
+                np.array([instant.calibration[index].deviation for instant in run.instants]), 5
+            ),
+        }
+        for index, part in enumerate(parts)
+    ]
+
+
+def drops(run: ReportedRun) -> list[Json]:
+    """Return the messages dropped until each instant, by reason."""
+    reasons = sorted({reason for instant in run.instants for reason in instant.dropped})
+    return [
+        {'reason': reason, 'count': [instant.dropped[reason] for instant in run.instants]}
+        for reason in reasons
+    ]

@@ -1,0 +1,210 @@
+"""The numbers that the page draws, as JSON has them: lists, null for what is not known."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+import math
+import sys
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.evaluation.metrics import TrajectoryErrors
+from slam_observer_ros.evaluation.trajectory import interpolate
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.report.curves import calibration, consistency, drops, errors
+from slam_observer_ros.report.ellipses import ellipses
+from slam_observer_ros.report.findings import findings
+from slam_observer_ros.report.lists import Json, rounded
+from slam_observer_ros.report.reported_run import ReportedRun
+from slam_observer_ros.settings.parameter_table import changed_names, table
+
+MAX_PATH = 4000
+MAX_RESIDUALS = 6000
+MAX_ELLIPSES = 40_000
+"""Landmarks of all instants together that are drawn."""
+
+FLAT = 0.05
+"""Height of a map over its width, below which only its plan is drawn."""
+
+TOP, SIDE = (0, 1), (0, 2)
+
+
+def report_data(run: ReportedRun) -> dict[str, Json]:
+    """Return all that the page shows of a run."""
+    return {
+        'title': run.title,
+        'figures': [[name, value] for name, value in run.figures.items()],
+        'findings': [asdict(finding) for finding in findings(run)],
+        'warnings': list(run.warnings),
+        'settings': _settings(run),
+        'versions': [
+            ['slam_observer_ros', VERSION],
+            ['Python', sys.version.split()[0]],
+            ['numpy', np.__version__],
+        ],
+        'is_flat': _is_flat(run),
+        'gaps': rounded(run.gaps_s, 2),
+        'path': _path(run),
+        'instants': _instants(run),
+        'landmarks': _landmarks(run),
+        'true_landmarks': _true_landmarks(run),
+        'errors': errors(run),
+        'consistency': consistency(run),
+        'residuals': _residuals(run),
+        'gate': run.settings.rejection_threshold,
+        'calibration': calibration(run),
+        'drops': drops(run),
+    }
+
+
+def _settings(run: ReportedRun) -> list[Json]:
+    settings = run.settings
+    defaults = {row.name: row.default for row in table(type(settings))}
+    return [
+        [name, str(getattr(settings, name)), str(defaults[name])]
+        for name in changed_names(settings)
+    ]
+
+
+def _is_flat(run: ReportedRun) -> bool:
+    points = [run.trajectory.positions]
+    if run.instants:
+        points.append(run.instants[-1].world_points)
+    extent = np.ptp(np.concatenate(points), axis=0) if len(points[0]) else np.zeros(3)
+    return bool(extent[2] <= FLAT * max(extent[0], extent[1]))
+
+
+def _thinned(count: int, most: int) -> slice:
+    return slice(None, None, max(1, -(-count // most)))
+
+
+def _path(run: ReportedRun) -> dict[str, Json]:
+    trajectory = run.trajectory
+    some = _thinned(len(trajectory), MAX_PATH)
+    stamps_ns, positions = trajectory.stamps_ns[some], trajectory.positions[some]
+    path: dict[str, Json] = {
+        't': rounded(run.seconds(stamps_ns), 2),
+        'xyz': rounded(positions.T, 3),
+    }
+    truth = run.truth_in_map
+    if truth is not None:
+        true_poses, _ = interpolate(truth, stamps_ns)
+        path['true_xyz'] = rounded(true_poses[:, :3, 3].T, 3)
+        path['error_m'] = rounded(np.linalg.norm(positions - true_poses[:, :3, 3], axis=1), 3)
+    return path
+
+
+def _instants(run: ReportedRun) -> dict[str, Json]:
+    """Return robot and map at instants, with ellipses on the plan and, in space, on the side."""
+    total = sum(len(instant.ids) for instant in run.instants)
+    some = run.instants[_thinned(total, MAX_ELLIPSES)]
+    seconds = run.seconds(np.array([instant.stamp_ns for instant in some], dtype=np.int64))
+    planes = [TOP] if _is_flat(run) else [TOP, SIDE]
+    poses = np.array([instant.pose for instant in some]).reshape(-1, 4, 4)
+    return {
+        't': rounded(seconds, 2),
+        'xyz': rounded(poses[:, :3, 3], 3),
+        'ahead': rounded(poses[:, :3, 0], 3),
+        'robot': [
+            [_ellipses(_position_covariance(instant.pose_covariance), plane) for plane in planes]
+            for instant in some
+        ],
+        'ids': [instant.ids.tolist() for instant in some],
+        'points': [rounded(instant.world_points.T, 3) for instant in some],
+        'ellipses': [
+            [_ellipses(instant.landmark_covariances, plane) for plane in planes]
+            for instant in some
+        ],
+    }
+
+
+def _position_covariance(pose_covariance: FloatArray | None) -> FloatArray | None:
+    return None if pose_covariance is None else pose_covariance[None, 3:, 3:]
+
+
+def _ellipses(covariances: FloatArray | None, plane: tuple[int, int]) -> Json:
+    return None if covariances is None else rounded(ellipses(covariances, plane), 3)
+
+
+def _true_landmarks(run: ReportedRun) -> Json:
+    truth = run.truth.landmarks
+    if truth is None or run.errors is None:
+        return None
+    points = _in_map(run.errors, truth.world_points)
+    return {'ids': truth.ids.tolist(), 'xyz': rounded(points.T, 3)}
+
+
+def _in_map(errors: TrajectoryErrors, true_points: FloatArray) -> FloatArray:
+    return se3.transform(se3.inverse(errors.alignment), true_points)
+
+
+def _landmarks(run: ReportedRun) -> list[Json]:
+    """Return a row for each landmark of the map: what was seen of it, and how well it fits."""
+    if not run.instants:
+        return []
+    innovations, last = run.innovations, run.instants[-1]
+    true_points = {}
+    if run.errors is not None and (truth := run.truth.landmarks) is not None:
+        moved = _in_map(run.errors, truth.world_points)
+        true_points = dict(zip(truth.ids.tolist(), moved, strict=True))
+    rows: list[Json] = []
+    for row, landmark_id in enumerate(last.ids.tolist()):
+        of_it = innovations.ids == landmark_id
+        used = of_it & (innovations.weights > 0.0)
+        true_point = true_points.get(landmark_id)
+        error_m = math.nan
+        if true_point is not None:
+            error_m = float(np.linalg.norm(last.world_points[row] - true_point))
+        deviation_m = math.nan
+        if last.landmark_covariances is not None:
+            deviation_m = math.sqrt(max(np.trace(last.landmark_covariances[row]), 0.0))
+        rows.append(
+            [
+                landmark_id,
+                int(np.count_nonzero(of_it)),
+                int(np.count_nonzero(of_it & (innovations.weights == 0.0))),
+                int(np.count_nonzero(used & (innovations.weights < 1.0))),
+                *rounded(
+                    np.array(
+                        [
+                            _rms(innovations.residuals_m[used]),
+                            _rms(innovations.distances[used]),
+                            deviation_m,
+                            error_m,
+                        ]
+                    ),
+                    3,
+                ),
+            ]
+        )
+    return rows
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def _residuals(run: ReportedRun) -> dict[str, Json]:
+    """Return residuals in σ: of a great many the suspicious ones, and some of the others."""
+    innovations = run.innovations
+    shown = _shown(innovations.weights, innovations.distances)
+    return {
+        't': rounded(run.seconds(innovations.stamps_ns[shown]), 2),
+        'id': innovations.ids[shown].tolist(),
+        'sigma': rounded(innovations.distances[shown], 2),
+        'weight': rounded(innovations.weights[shown], 2),
+        'left_out': int(np.count_nonzero(~shown)),
+    }
+
+
+def _shown(weights: FloatArray, distances: FloatArray) -> BoolArray:
+    if len(weights) <= MAX_RESIDUALS:
+        return np.ones(len(weights), dtype=np.bool_)
+    suspicious = np.flatnonzero((weights < 1.0) | (distances > 3.0))
+    suspicious = suspicious[_thinned(len(suspicious), MAX_RESIDUALS // 2)]
+    shown = np.zeros(len(weights), dtype=np.bool_)
+    shown[_thinned(len(weights), MAX_RESIDUALS // 2)] = True
+    shown[suspicious] = True
+    return shown

@@ -1,0 +1,37 @@
+"""One HTML file with style, script, plotting library and numbers inside."""
+
+from __future__ import annotations
+
+from importlib import resources
+import json
+from pathlib import Path
+
+from slam_observer_ros.common.errors import OutputError
+from slam_observer_ros.common.output_files import unfinished_file
+from slam_observer_ros.report.data import report_data
+from slam_observer_ros.report.reported_run import ReportedRun
+
+_PARTS = {
+    'STYLE': 'report.css',
+    'PLOTTING_LIBRARY': 'plotly-basic.min.js',
+    'SCRIPT': 'report.js',
+}
+
+
+def write_report(path: Path, run: ReportedRun) -> None:
+    """Write the report of a run; it is whole or not there. Raises an OutputError if it can't."""
+    page = _asset('page.html')
+    for mark, name in _PARTS.items():
+        page = page.replace(f'@{mark}@', _asset(name), 1)
+    # In a script element only `<` could end it.
+    numbers = json.dumps(report_data(run), allow_nan=False, separators=(',', ':'))
+    page = page.replace('@NUMBERS@', numbers.replace('<', '\\u003c'), 1)
+    try:
+        with unfinished_file(path) as file:
+            file.write(page)
+    except OSError as error:
+        raise OutputError(f"can't write {path}: {error.strerror}") from error
+
+
+def _asset(name: str) -> str:
+    return (resources.files(__package__) / 'assets' / name).read_text(encoding='utf-8')

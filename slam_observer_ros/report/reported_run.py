@@ -1,0 +1,90 @@
+"""What a report is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
+from slam_observer_ros.evaluation.run_record import Innovations, Instant
+from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.settings.estimator_settings import Settings
+
+MIN_GAP_S = 3.0
+"""Shortest stretch without a used landmark that is marked."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReportedRun:
+    """A replay with what was recorded of it, from ``start_ns`` on.
+
+    ``trajectory`` is the online one and ``errors`` its errors; ``anees`` is that of the pose. Both
+    are None where there is no truth.
+    """
+
+    title: str
+    figures: Mapping[str, str]
+    warnings: Sequence[str]
+    settings: Settings
+    start_ns: int
+    trajectory: Trajectory
+    in_known_map: bool
+    truth: Truth
+    errors: TrajectoryErrors | None
+    anees: float | None
+    instants: Sequence[Instant]
+    innovations: Innovations
+
+    def seconds(self, stamps_ns: IntArray) -> FloatArray:
+        """Return times since the first event of the run, seconds."""
+        seconds: FloatArray = (stamps_ns - self.start_ns) / 1e9
+        return seconds
+
+    @property
+    def instants_s(self) -> FloatArray:
+        """(i,) times of the instants, seconds."""
+        return self.seconds(np.array([instant.stamp_ns for instant in self.instants], np.int64))
+
+    @property
+    def used_s(self) -> FloatArray:
+        """(u,) times at which landmarks were used, seconds."""
+        innovations = self.innovations
+        return np.unique(self.seconds(innovations.stamps_ns[innovations.weights > 0.0]))
+
+    @property
+    def gaps_s(self) -> FloatArray:
+        """(g, 2) beginnings and ends of the stretches in which no landmark was used, seconds."""
+        edges_s = np.concatenate([[0.0], self.used_s, self.instants_s[-1:]])
+        is_gap = np.diff(edges_s) >= MIN_GAP_S
+        return np.column_stack([edges_s[:-1][is_gap], edges_s[1:][is_gap]])
+
+    @property
+    def truth_in_map(self) -> Trajectory | None:
+        """The true poses that the estimate has, aligned with it; None without truth."""
+        if self.errors is None:
+            return None
+        return self.errors.truth.moved(se3.inverse(self.errors.alignment))
+
+    def anchored_errors(self) -> tuple[FloatArray, IntArray] | None:
+        """Return pose errors (a, 6) from the first pose on, and the rows (a,) of their instants.
+
+        The covariance is of these: it counts from the first pose. None where there is no truth, or
+        the pose is that in a loaded map.
+        """
+        if self.errors is None or self.in_known_map:
+            return None
+        stamps_ns = np.array([instant.stamp_ns for instant in self.instants], dtype=np.int64)
+        true_poses, covered = interpolate(
+            Trajectory(self.truth.stamps_ns, self.truth.poses), stamps_ns
+        )
+        rows = np.flatnonzero(covered).astype(np.int64)
+        if not len(rows):
+            return None
+        poses = np.array([self.instants[row].pose for row in rows.tolist()])
+        anchored = poses[0] @ se3.inverse(true_poses[rows[0]]) @ true_poses[rows]
+        return pose_errors(poses, anchored), rows

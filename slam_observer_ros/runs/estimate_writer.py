@@ -1,0 +1,142 @@
+"""The estimate of a replay as a recording, as the node would have published it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.evaluation.metrics import TrajectoryErrors
+from slam_observer_ros.evaluation.truth import LandmarkTruth
+from slam_observer_ros.events import FIRST_AUTOMATIC_ID
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
+from slam_observer_ros.recording.writer import RecordingWriter
+
+OVERVIEW_PERIOD_NS = 1_000_000_000
+"""Time between two maps, nanoseconds."""
+
+TOPICS = ('/odometry', '/pose', '/lyapunov', '/path', '/map', '/markers')
+"""Topics of the estimate, named as the node's."""
+
+ALIGNED_POSE_TOPIC = '/aligned_truth/pose'
+ALIGNED_LANDMARKS_TOPIC = '/aligned_truth/map'
+
+
+class EstimateWriter:
+    """Writes the estimate to a recording while a replay goes on.
+
+    Messages are received at their stamps. ``publishes_tf`` says whether the pose goes out on /tf,
+    where each frame has one parent.
+    """
+
+    def __init__(
+        self,
+        writer: RecordingWriter,
+        map_frame: str,
+        base_frame: str,
+        rate_hz: float,
+        publishes_tf: bool,
+    ) -> None:
+        self._writer = writer
+        self._messages = EstimateMessages(writer.messages, map_frame, base_frame)
+        self._map_frame = map_frame
+        self._period_ns = round(NANOSECONDS_PER_SECOND / rate_hz)
+        self._publishes_tf = publishes_tf
+        self._path: list[Any] = []
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the path and when something was written: the run has started again."""
+        self._path.clear()
+        self._state_ns: int | None = None
+        self._path_ns: int | None = None
+        self._overview_ns: int | None = None
+
+    def note_stamp(self, estimator: Estimator) -> None:
+        """Write the state when all events of a stamp have been used, if it is due."""
+        stamp_ns = estimator.stamp_ns
+        if stamp_ns is None or not estimator.is_localised:
+            return
+        if _is_due(stamp_ns, self._state_ns, self._period_ns):
+            self._state_ns = stamp_ns
+            self._write_state(estimator, stamp_ns)
+        if _is_due(stamp_ns, self._overview_ns, OVERVIEW_PERIOD_NS):
+            self._overview_ns = stamp_ns
+            self._write_landmarks(estimator, stamp_ns)
+
+    def note_update(self, update: Update) -> None:
+        """Write how far off an observation was, in standard deviations."""
+        self._write('/lyapunov', self._messages.value(update.lyapunov), update.stamp_ns)
+        innovation = update.innovation
+        if innovation is None or not len(update.ids):
+            return
+        ids = update.ids.tolist()
+        for landmark_id, distance in zip(ids, innovation.distances.tolist(), strict=True):
+            if landmark_id < FIRST_AUTOMATIC_ID:
+                topic = f'/residual_sigma/landmark_{landmark_id}'
+                self._write(topic, self._messages.value(distance), update.stamp_ns)
+        if innovation.nis is not None:
+            per_degree = innovation.nis / innovation.degrees_of_freedom
+            self._write('/nis', self._messages.value(per_degree), update.stamp_ns)
+
+    def finish(
+        self,
+        estimator: Estimator,
+        errors: TrajectoryErrors | None,
+        landmarks: LandmarkTruth | None,
+    ) -> None:
+        """Write the path, the map at the end, and the truth moved to where the estimate has it."""
+        stamp_ns = estimator.stamp_ns
+        if stamp_ns is not None and estimator.is_localised:
+            self._write('/path', self._messages.path(stamp_ns, self._path), stamp_ns)
+            self._write_landmarks(estimator, stamp_ns)
+        if errors is None:
+            return
+        to_map = se3.inverse(errors.alignment)
+        truth = errors.truth.moved(to_map)
+        for true_ns, pose in zip(truth.stamps_ns.tolist(), truth.poses, strict=True):
+            self._write(ALIGNED_POSE_TOPIC, self._messages.path_pose(true_ns, pose), true_ns)
+        if landmarks is not None:
+            first_ns = int(truth.stamps_ns[0])
+            points = se3.transform(to_map, landmarks.world_points)
+            cloud = self._writer.messages.point_cloud2(
+                first_ns, self._map_frame, landmarks.ids, points
+            )
+            self._write(ALIGNED_LANDMARKS_TOPIC, cloud, first_ns, latched=True)
+
+    def _write_state(self, estimator: Estimator, stamp_ns: int) -> None:
+        messages, pose = self._messages, estimator.pose
+        uncertain = messages.pose(stamp_ns, pose, estimator.pose_covariance)
+        velocity, covariance = estimator.body_velocity, estimator.body_velocity_covariance
+        self._write('/pose', uncertain, stamp_ns, latched=True)
+        self._write('/odometry', messages.odometry(uncertain, velocity, covariance), stamp_ns)
+        if self._publishes_tf:
+            self._write('/tf', messages.transform(stamp_ns, pose), stamp_ns)
+        if _is_due(stamp_ns, self._path_ns, PATH_SPACING_NS):
+            self._path_ns = stamp_ns
+            self._path.append(messages.path_pose(stamp_ns, pose))
+
+    def _write_landmarks(self, estimator: Estimator, stamp_ns: int) -> None:
+        landmarks = (
+            estimator.landmark_ids,
+            estimator.world_points,
+            estimator.landmark_covariances,
+        )
+        velocities = estimator.landmark_velocities
+        cloud = self._messages.landmarks(stamp_ns, *landmarks, velocities)
+        self._write('/map', cloud, stamp_ns, latched=True)
+        markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
+        self._write('/markers', markers, stamp_ns)
+        for part in estimator.calibration:
+            topic = f'/calibration/{part.name}'
+            self._write(topic, self._messages.value(part.value), stamp_ns)
+            self._write(f'{topic}_stddev', self._messages.value(part.deviation), stamp_ns)
+
+    def _write(self, topic: str, message: Any, stamp_ns: int, latched: bool = False) -> None:
+        self._writer.write_message(topic, message, stamp_ns, latched=latched)
+
+
+def _is_due(stamp_ns: int, last_ns: int | None, period_ns: int) -> bool:
+    return last_ns is None or not 0 <= stamp_ns - last_ns < period_ns

@@ -1,0 +1,150 @@
+"""The report of a replay: one file, whole, small, with what happened in it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+import re
+
+from browser import open_page
+from command_line import CommandLine
+import numpy as np
+import pytest
+from recordings import write_mcap
+
+from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.report.ellipses import ellipses
+from slam_observer_ros.report.findings import growth_windows
+
+SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
+MEGABYTE = 1_000_000
+
+
+@pytest.fixture(name='slam_observer')
+def fixture_slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+@pytest.fixture(name='report')
+def fixture_report(slam_observer, tmp_path):
+    recording, report = write_mcap(tmp_path / 'run.mcap'), tmp_path / 'run.html'
+    slam_observer.succeed('replay', recording, '--report', report)
+    return report
+
+
+def numbers_of(report: Path):
+    found = re.search(
+        r'<script type="application/json" id="numbers">(.*?)</script>', report.read_text(), re.S
+    )
+    return json.loads(found.group(1), parse_constant=lambda name: pytest.fail(name))
+
+
+def test_a_report_has_path_truth_map_and_residuals_in_one_file(report):
+    numbers = numbers_of(report)
+    assert numbers['title'] == 'run.mcap'
+    assert len(numbers['path']['t']) == len(numbers['path']['error_m'])
+    assert max(numbers['path']['error_m']) < 0.01
+    assert [row[0] for row in numbers['landmarks']] == [3, 5, 9]
+    # 50 observations of three landmarks; of the first there is nothing to compare with.
+    assert len(numbers['residuals']['sigma']) == 3 * 49
+    assert numbers['instants']['ids'][-1] == [3, 5, 9]
+    assert report.stat().st_size < 2 * MEGABYTE
+
+
+@pytest.mark.parametrize('gains', ['constant', 'scheduled'])
+def test_what_gains_do_not_know_is_left_out(slam_observer, tmp_path, gains):
+    recording, report = write_mcap(tmp_path / 'run.mcap'), tmp_path / 'run.html'
+    slam_observer.succeed('replay', recording, '--gains', gains, '--report', report)
+    assert 'nis' not in numbers_of(report)['consistency']
+
+
+def test_settings_that_differ_are_listed(slam_observer, tmp_path):
+    recording, report = write_mcap(tmp_path / 'run.mcap'), tmp_path / 'run.html'
+    slam_observer.succeed('replay', recording, '--set', 'point_noise=0.03', '--report', report)
+    assert ['point_noise', '0.03'] in [row[:2] for row in numbers_of(report)['settings']]
+
+
+def test_json_says_what_was_replayed_and_how(slam_observer, tmp_path):
+    recording = write_mcap(tmp_path / 'run.mcap')
+    ended = slam_observer.succeed('replay', recording, '--set', 'range_noise=0.2', '--json')
+    figures = ended.json
+    assert figures['recording'] == str(recording)
+    assert figures['recording_sha256'] == hashlib.sha256(recording.read_bytes()).hexdigest()
+    assert figures['settings'] == {'range_noise': 0.2}
+    assert (figures['version'], figures['warnings']) == (VERSION, [])
+    assert figures['nis'] >= 0.0
+
+
+def test_nis_is_the_same_with_a_report(slam_observer, tmp_path):
+    recording = write_mcap(tmp_path / 'run.mcap')
+    plain = slam_observer.succeed('replay', recording, '--json').json
+    report = ('--report', tmp_path / 'run.html')
+    assert slam_observer.succeed('replay', recording, '--json', *report).json[
+        'nis'
+    ] == pytest.approx(plain['nis'])
+
+
+def test_the_sample_is_small_and_replays_with_default_settings(slam_observer):
+    assert SAMPLE.stat().st_size < 2 * MEGABYTE
+    figures = slam_observer.succeed('replay', SAMPLE, '--json').json
+    assert figures['landmarks'] > 5
+    assert 0.5 < figures['nis'] < 1.5
+
+
+def test_no_report_is_replaced_unless_forced(slam_observer, report):
+    recording = report.with_suffix('.mcap')
+    assert 'exists already' in slam_observer.fail('replay', recording, '--report', report)
+    slam_observer.succeed('replay', recording, '--report', report, '--force')
+
+
+def test_growth_is_found_where_the_error_rises():
+    seconds = np.arange(0.0, 200.0)
+    errors_m = np.where(seconds < 120.0, 0.1, 1.0)
+    (window,) = growth_windows(seconds, errors_m)
+    assert window == (window[0], 120)
+    assert 110 <= window[0] < 120
+
+
+def test_an_ellipse_has_its_axes_along_those_of_the_covariance():
+    covariance = np.diag([4.0, 1.0, 9.0])
+    plan, side = (ellipses(covariance[None], plane)[0] for plane in ((0, 1), (0, 2)))
+    assert plan[:2] == pytest.approx(np.sqrt(5.991464547) * np.array([2.0, 1.0]))
+    assert side[:2] == pytest.approx(np.sqrt(5.991464547) * np.array([3.0, 2.0]))
+    assert abs(np.sin(plan[2])) == pytest.approx(0.0, abs=1e-9)
+    assert abs(np.cos(side[2])) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_browser_draws_it_without_an_error_and_asks_no_network(report):
+    opened = open_page(report)
+    assert opened.console == []
+    assert opened.requested == []
+    assert opened.html.count('class="main-svg"') >= 2
+    assert 'stated 95 %' in opened.html
+
+
+def test_a_request_to_the_network_would_be_noticed(tmp_path):
+    page = tmp_path / 'page.html'
+    page.write_text('<html><body><img src="http://127.0.0.1:9/x.png"></body></html>')
+    assert open_page(page).requested
+
+
+def test_the_slider_moves_to_the_time_in_the_address(report):
+    times = numbers_of(report)['instants']['t']
+    for t in (times[1], times[-2]):
+        opened = open_page(report, f'#t={t}')
+        readout = re.search(r'<output id="readout"[^>]*>([^<]*)', opened.html).group(1)
+        assert readout.startswith(f'{t:.1f} s')
+
+
+def test_moving_the_slider_moves_the_robot(report):
+    moved = report.with_name('moved.html')
+    script = (
+        "<script>const s = document.getElementById('slider'); s.value = '1';"
+        "s.dispatchEvent(new Event('input')); setTimeout(() => {"
+        "const d = document.getElementById('map').data; const n = d[d.length - 1];"
+        'document.title = `robot at ${n.x[0]}`; }, 2000);</script></body>'
+    )
+    moved.write_text(script.join(report.read_text().rsplit('</body>', 1)))
+    x = numbers_of(report)['instants']['xyz'][1][0]
+    assert re.search('<title>([^<]*)', open_page(moved).html).group(1) == f'robot at {x}'
