@@ -57,8 +57,11 @@ def files_of(path: Path) -> list[Path]:
 
 
 def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
-    if not (path / 'metadata.yaml').exists():
+    metadata = path / 'metadata.yaml'
+    if not metadata.exists():
         return open_source(_only_file(path))
+    if not metadata.is_file():
+        raise RecordingError(f'{metadata} is no file')
     listed, files = _listed_files(path), _storage_files(path)
     missing = [file.name for file in listed if not file.exists()]
     if missing and len(listed) > 1:

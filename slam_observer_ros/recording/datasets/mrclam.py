@@ -29,6 +29,9 @@ MISREAD = 'misread'
 _UNKNOWN_SUBJECT = 0
 _MILLISECOND_NS = 1_000_000
 
+_MAX_NUMBER = 4e9
+"""More than any time, barcode or distance of the files; as nanoseconds it is still an int64."""
+
 
 def load_mrclam(folder: Path | str, robot: int) -> DataSet:
     """Read one robot's run.
@@ -88,6 +91,10 @@ def _table(path: Path, columns: int) -> FloatArray:
         raise DataSetError(f'{path}: {reason}') from error
     if len(table) == 0 or table.shape[1] != columns:
         raise DataSetError(f'{path}: {columns} columns of numbers are expected')
+    # Written so that NaN is refused too.
+    if not (np.abs(table).max() <= _MAX_NUMBER and table[:, 0].min() >= 0.0):
+        reason = f'a number beyond {_MAX_NUMBER:g}, or a negative time or subject'
+        raise DataSetError(f'{path}: damaged: it has {reason}')
     return table
 
 

@@ -1,0 +1,45 @@
+"""The sample policy for secured graphs names what the node uses, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from node_processes import running
+import pytest
+from robots import Robot
+
+pytestmark = pytest.mark.ros
+
+POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
+NODE = 'observer_node'
+
+NOT_ALWAYS_USED = {('subscribe', f'/{name}') for name in ('imu', 'clock', 'parameter_events')}
+"""Those of ``use_imu`` and ``use_sim_time``, and one that rclpy has only in some releases."""
+
+
+def allowed():
+    """What the policy allows, as pairs of how and a full name."""
+    profile = ElementTree.parse(POLICY).find('enclaves/enclave/profiles/profile')
+    assert profile.attrib == {'ns': '/', 'node': NODE}
+    return {
+        (how, '/' + entry.text.replace('~', NODE))
+        for entries in profile
+        for how, word in entries.attrib.items()
+        if word == 'ALLOW'
+        for entry in entries
+    }
+
+
+def test_the_policy_allows_what_the_node_uses(ros, tmp_path):
+    with running(NODE, tmp_path / 'log'), Robot(ros):
+        used = {
+            (how, name)
+            for how, names_and_types in (
+                ('subscribe', ros.node.get_subscriber_names_and_types_by_node),
+                ('publish', ros.node.get_publisher_names_and_types_by_node),
+                ('reply', ros.node.get_service_names_and_types_by_node),
+            )
+            for name, _ in names_and_types(NODE, '/')
+        }
+    assert allowed() - NOT_ALWAYS_USED == used - NOT_ALWAYS_USED
