@@ -71,9 +71,12 @@ def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
         )
     try:
         whole = BagSource(path)
-        if len(files) != 1:
-            return whole, None
-        return MendedSource(whole, lambda: _salvaged(files[0])), None
+        if not files:
+            return whole, None  # each file is compressed as a whole
+        for file in files:
+            if file.suffix == '.mcap':
+                _check_sums(file, whole)
+        return MendedSource(whole, lambda: _open_parts(files)[0]), None
     except RecordingError:
         # A recorder that was killed leaves a truncated file, which its metadata calls whole.
         parts = files if len(files) == 1 else [file for file in listed if file in files]

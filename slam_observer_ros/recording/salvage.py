@@ -138,11 +138,11 @@ class SalvagedSource:
 
 
 class MendedSource:
-    """A file that rosbags opens; should it turn out to be damaged, what is whole of the rest."""
+    """What rosbags opens; should it turn out to be damaged, what is whole of the rest."""
 
-    def __init__(self, whole: MessageSource, salvage: Callable[[], SalvagedSource]) -> None:
+    def __init__(self, whole: MessageSource, salvage: Callable[[], MessageSource]) -> None:
         self._whole, self._salvage = whole, salvage
-        self._salvaged: SalvagedSource | None = None
+        self._salvaged: MessageSource | None = None
         self.topics = whole.topics
         self.start_ns, self.end_ns = whole.start_ns, whole.end_ns
 
@@ -166,11 +166,13 @@ class MendedSource:
             yield from self._rest(self._salvaged, topics, last_ns)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the files."""
         self._whole.close()
+        if self._salvaged is not None:
+            self._salvaged.close()
 
     def _rest(
-        self, salvaged: SalvagedSource, topics: Collection[Topic], last_ns: int | None
+        self, salvaged: MessageSource, topics: Collection[Topic], last_ns: int | None
     ) -> Iterator[RawMessage]:
         known = {(topic.name, topic.message_type): topic for topic in topics}
         wanted = [topic for topic in salvaged.topics if (topic.name, topic.message_type) in known]

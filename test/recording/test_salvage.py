@@ -23,15 +23,34 @@ from slam_observer_ros.recording.writer import RecordingWriter
 
 COUNT = 30_000
 STEP_NS = 1_000_000
+METADATA = """\
+rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: mcap
+  relative_file_paths: [run_0.mcap, run_1.mcap]
+  duration: {nanoseconds: 1}
+  starting_time: {nanoseconds_since_epoch: 0}
+  message_count: 1
+  compression_format: ''
+  compression_mode: ''
+  topics_with_message_count:
+"""
+
+TOPIC = """\
+  - message_count: 1
+    topic_metadata:
+      {{name: {}, type: {}, serialization_format: cdr, offered_qos_profiles: ''}}
+"""
+
 FORMATS = ['mcap', 'db3', 'bag']
 
 
-def write_mcap(path):
+def write_mcap(path, start_ns=ros.STAMP_NS):
     random = np.random.default_rng(0)  # which does not compress
     with RecordingWriter(path) as writer:
-        writer.write_observation(ObservationEvent(ros.STAMP_NS, np.array([1]), np.zeros((1, 3))))
+        writer.write_observation(ObservationEvent(start_ns, np.array([1]), np.zeros((1, 3))))
         for index in range(COUNT):
-            event = VelocityEvent(ros.STAMP_NS + index * STEP_NS, random.normal(size=6))
+            event = VelocityEvent(start_ns + index * STEP_NS, random.normal(size=6))
             writer.write_velocity(event)
     return path
 
@@ -112,6 +131,24 @@ def test_of_a_whole_recording_nothing_is_lost_and_a_scan_finds_the_same(whole, n
         )
         assert messages == found
     assert not scanned.loss
+
+
+def test_of_a_split_recording_what_is_whole_before_and_behind_a_damaged_chunk_is_read(
+    whole, tmp_path
+):
+    (tmp_path / 'run_0.mcap').write_bytes(whole['mcap'].read_bytes())
+    second = write_mcap(tmp_path / 'run_1.mcap', ros.STAMP_NS + COUNT * STEP_NS)
+    data = bytearray(second.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 20_000] = bytes(20_000)
+    second.write_bytes(data)
+    with Recording(whole['mcap']) as recording:
+        topics = [(topic.name, topic.message_type) for topic in recording.topics]
+    (tmp_path / 'metadata.yaml').write_text(METADATA + ''.join(TOPIC.format(*t) for t in topics))
+    velocities, loss, _ = read(tmp_path)
+    assert velocities == sorted(set(velocities))
+    assert 1.5 * COUNT < len(velocities) < 2 * COUNT
+    assert velocities[-1] == (2 * COUNT - 1) * STEP_NS
+    assert loss.byte_count > 0
 
 
 @pytest.mark.parametrize('name', FORMATS)
