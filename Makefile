@@ -17,7 +17,8 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy benchmark-speed venv clean
+.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy benchmark-speed venv lock \
+	clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
@@ -59,7 +60,13 @@ benchmark-speed: $(READY)  ## cost of an observation against landmarks seen and 
 
 venv: $(READY)  ## only set up .venv
 
-$(READY): setup.py constraints.txt $(wildcard scripts/setup_venv.sh scripts/build_tf2_msgs.py)
+lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt names
+	$(PYTHON_IN_VENV) -m pip install --quiet uv
+	$(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
+		--extra test --extra dev --extra ros --constraint constraints.txt \
+		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
+
+$(READY): setup.py constraints.txt requirements.lock $(wildcard scripts/setup_venv.sh scripts/build_tf2_msgs.py)
 	scripts/setup_venv.sh $(VENV)
 	touch $@
 

@@ -25,7 +25,9 @@ if [ "${ROS_DISTRO:-}" = jazzy ]; then
     "$venv/bin/python" -m pip install --quiet --editable '.[test,dev]' 'numpy<2'
 elif [ -z "${ROS_DISTRO:-}" ]; then
     "$python" -m venv --clear "$venv"
-    "$venv/bin/python" -m pip install --quiet --constraint constraints.txt --editable '.[test,dev,ros]'
+    # All that is needed, and nothing that is not what it was when `make lock` was run.
+    "$venv/bin/python" -m pip install --quiet --no-deps --require-hashes --requirement requirements.lock
+    "$venv/bin/python" -m pip install --quiet --no-deps --no-build-isolation --editable .
     "$venv/bin/python" scripts/build_tf2_msgs.py
 else
     echo "ROS 2 $ROS_DISTRO is sourced, Jazzy is needed: source that, or use a shell without ROS" >&2

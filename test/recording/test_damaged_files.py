@@ -92,7 +92,7 @@ def test_a_damaged_run_of_mrclam(tmp_path_factory, data, damage):
 
 @given(st.floats(0.0, 1.0, exclude_max=True))
 def test_a_file_of_starry_night_that_is_cut_off(tmp_path_factory, share):
-    """SciPy's reader of MATLAB files crashes on some that are damaged otherwise."""
+    """No other damage: the reader of MATLAB files, which is SciPy's, crashes on some."""
     file = write_starry_night(tmp_path_factory.mktemp('starry') / 'dataset3.mat')
     os.truncate(file, int(share * file.stat().st_size))
     is_read_or_refused(lambda: load_starry_night(file))

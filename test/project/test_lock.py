@@ -1,0 +1,28 @@
+"""What is installed beside the package is what it was when it was tried, to the byte."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+
+CHECKOUT = Path(__file__).parents[2]
+
+
+def pins(text: str) -> dict[str, set[str]]:
+    """Return the versions by name of what is pinned, but on Windows alone."""
+    found: dict[str, set[str]] = {}
+    for name, version, marker in re.findall(r'^([a-z0-9-]+)==([^\s;]+)(.*)$', text, re.MULTILINE):
+        if 'win32' not in marker:
+            found.setdefault(name, set()).add(version)
+    return found
+
+
+def test_the_locked_versions_are_those_of_the_constraints():
+    locked = pins((CHECKOUT / 'requirements.lock').read_text())
+    constraints = pins((CHECKOUT / 'constraints.txt').read_text())
+    assert locked == {name: constraints.get(name) for name in locked}
+
+
+def test_each_has_a_hash():
+    for entry in re.split(r'\n(?=[a-z])', (CHECKOUT / 'requirements.lock').read_text())[1:]:
+        assert '--hash=sha256:' in entry, entry
