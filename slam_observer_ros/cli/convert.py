@@ -13,13 +13,11 @@ from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import load_starry_night
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the command line."""
-    parser = commands.add_parser(
-        'convert',
-        help='make a recording of a public data set',
-        description='Make an MCAP recording, with TwistStamped, PointCloud2 and the truth, '
-        'of a public data set.',
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        'Make an MCAP recording, with TwistStamped, PointCloud2 and the truth, '
+        'of a public data set.'
     )
     data_sets = parser.add_subparsers(dest='data_set', required=True, metavar='DATA-SET')
     starry_night = data_sets.add_parser(

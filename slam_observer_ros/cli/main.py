@@ -7,6 +7,7 @@ from slam_observer_ros.cli.interrupts import leaving_at_once
 with leaving_at_once():
     import argparse
     from collections.abc import Sequence
+    from importlib import import_module
     import io
     import logging
     import os
@@ -25,6 +26,13 @@ EXIT_ERROR = 2
 EXIT_LOSS = 3
 EXIT_SIGNAL = 128
 """To which the number of the signal that ended the program is added, as shells do."""
+
+COMMANDS = {
+    'simulate': ('simulate', "run the paper's simulation"),
+    'convert': ('convert', 'make a recording of a public data set'),
+    'replay': ('replay.command', 'run a recording through the observer'),
+}
+"""The module of each command, and what it does; only the one that is given is imported."""
 
 EXAMPLES = """\
 examples:
@@ -59,12 +67,8 @@ class Parser(argparse.ArgumentParser):
         sys.exit(EXIT_ERROR)
 
 
-def make_parser() -> Parser:
-    """Return the parser of the whole command line."""
-    with leaving_at_once():
-        from slam_observer_ros.cli import convert, simulate
-        from slam_observer_ros.cli.replay import command as replay
-
+def make_parser(arguments: Sequence[str]) -> Parser:
+    """Return the parser of the command line, with the options of the command that is given."""
     parser = Parser(
         prog=PROGRAM,
         description='The SLAM observer of Mahony and Hamel on simulations and recordings.',
@@ -73,8 +77,12 @@ def make_parser() -> Parser:
     )
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {VERSION}')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
-    for command in (simulate, convert, replay):
-        command.add_parser(commands)
+    given = next((word for word in arguments if not word.startswith('-')), None)
+    for name, (module, help_text) in COMMANDS.items():
+        command = commands.add_parser(name, help=help_text)
+        if name == given:
+            with leaving_at_once():
+                import_module(f'slam_observer_ros.cli.{module}').add_options(command)
     return parser
 
 
@@ -86,7 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors='replace')  # a terminal without ± is no reason to end
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
-        args = make_parser().parse_args(arguments)
+        words = sys.argv[1:] if arguments is None else arguments
+        args = make_parser(words).parse_args(words)
         use_one_thread()
         # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
         signal.signal(signal.SIGTERM, lambda number, _stack: sys.exit(EXIT_SIGNAL + number))

@@ -20,7 +20,6 @@ from slam_observer_ros.cli.outputs import (
     recording_path,
 )
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.evaluation.plots.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.simulated_run import run_simulation, SimulatedRun
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -45,14 +44,12 @@ _SCENARIO_OPTIONS = {
 }
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the command line."""
-    parser = commands.add_parser(
-        'simulate',
-        help="run the paper's simulation",
-        description="Run the paper's simulation (section VI): a robot drives a circle of 5 m "
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        "Run the paper's simulation (section VI): a robot drives a circle of 5 m "
         'radius and sees landmarks whose first sighting is biased; the observer makes up for it, '
-        "with the paper's constant gains if --gains names no others.",
+        "with the paper's constant gains if --gains names no others."
     )
     parser.add_argument(
         '--duration', type=float, default=80.0, metavar='S', help='simulated seconds (default 80)'
@@ -150,6 +147,12 @@ def _record(simulation: Simulation, path: Path, force: bool) -> None:
 
 
 def _draw(simulation: Simulation, result: SimulatedRun, directory: Path) -> None:
+    # matplotlib takes longer to import than the simulation
+    from slam_observer_ros.evaluation.plots.simulation_plots import (
+        plot_configuration,
+        plot_lyapunov,
+    )
+
     # Where L is zero nothing is drawn, rather than the floor.
     log10_lyapunov = np.where(result.lyapunov > 0.0, result.log10_lyapunov, -np.inf)
     plot_lyapunov(directory / 'lyapunov.png', result.times_s, log10_lyapunov, result.slope_per_s)

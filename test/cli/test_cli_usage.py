@@ -173,7 +173,7 @@ def test_stopped_in_the_middle(tmp_path, stop):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize('module', ['rich', 'numpy', 'matplotlib'])
+@pytest.mark.parametrize('module', ['rich', 'numpy', 'scipy'])
 def test_interrupted_while_modules_load(tmp_path, module):
     # Python itself makes such errors of an interrupt, in __set_name__.
     (tmp_path / f'{module}.py').write_text(
@@ -191,6 +191,34 @@ def test_interrupted_while_modules_load(tmp_path, module):
         check=False,
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, '', '')
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'unneeded'),
+    [
+        (['--help'], {'numpy', 'scipy', 'matplotlib', 'rosbags', 'mcap'}),
+        (['--version'], {'numpy', 'scipy', 'matplotlib', 'rosbags', 'mcap'}),
+        (['convert', '--help'], {'matplotlib'}),
+        (['replay', '--help'], {'matplotlib'}),
+        (['simulate', '--duration', '1', '--json'], {'matplotlib'}),
+    ],
+)
+def test_what_is_not_needed_is_not_imported(arguments, unneeded):
+    program = (
+        'import sys\nfrom slam_observer_ros.cli.main import main\n'
+        f'try:\n    main({arguments})\nexcept SystemExit:\n    pass\n'
+        'print(*sys.modules, file=sys.stderr)'
+    )
+    ended = subprocess.run(
+        [sys.executable, '-c', program],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert ended.stdout
+    assert not unneeded & set(ended.stderr.split())
 
 
 def test_reader_that_leaves_early():

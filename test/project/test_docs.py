@@ -82,9 +82,8 @@ def test_tables_are_current():
 
 @pages
 def test_slam_observer_understands_every_command(page):
-    parser = make_parser()
     for arguments in commands(page, ['slam-observer']):
-        parser.parse_args(arguments)
+        make_parser(arguments).parse_args(arguments)
 
 
 @pages

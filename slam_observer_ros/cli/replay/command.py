@@ -50,13 +50,11 @@ from slam_observer_ros.settings.parameter_table import Value
 logger = logging.getLogger(__name__)
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the command line."""
-    parser = commands.add_parser(
-        'replay',
-        help='run a recording through the observer',
-        description='Run a recording through the observer, as the node would have, and compare '
-        'the outcome with the truth if the recording holds it.',
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        'Run a recording through the observer, as the node would have, and compare '
+        'the outcome with the truth if the recording holds it.'
     )
     parser.add_argument(
         'recording',
