@@ -66,7 +66,8 @@ lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt n
 		--extra test --extra dev --extra ros --constraint constraints.txt \
 		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
 
-$(READY): setup.py constraints.txt requirements.lock $(wildcard scripts/setup_venv.sh scripts/build_tf2_msgs.py)
+$(READY): setup.py constraints.txt requirements.lock \
+		$(wildcard scripts/setup_venv.sh scripts/build_tf2_msgs.py)
 	scripts/setup_venv.sh $(VENV)
 	touch $@
 

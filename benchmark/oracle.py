@@ -37,7 +37,9 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     recorded = starry_night()
     fitted = fitted_poses(recorded)
-    oracle = Run([snapshot(recorded, *sample) for sample in samples(fitted)], 0.0)
+    known = recorded.landmarks.ids, recorded.landmarks.world_points
+    poses = zip(fitted.stamps_ns.tolist(), fitted.poses, strict=True)
+    oracle = Run([Snapshot(stamp_ns, pose, *known) for stamp_ns, pose in poses], cpu_s=0.0)
     fitted_world = replace(recorded, truth=fitted)
     lines = ['| configuration error, m | recorded poses | fitted poses |', '|---|---|---|']
     lines += [f'| oracle | {score(oracle, recorded).configuration_rmse_m:.3f} | |']
@@ -83,16 +85,6 @@ def fitted_pose(points: FloatArray, targets: FloatArray, covariances: FloatArray
         gradient = (JW @ (targets - world)[:, :, None]).sum(axis=0)[:, 0]
         pose = se3.exp(np.linalg.solve((JW @ J).sum(axis=0), gradient)) @ pose
     return pose
-
-
-def samples(trajectory: Trajectory) -> list[tuple[int, FloatArray]]:
-    """Return stamps and poses one by one."""
-    return list(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True))
-
-
-def snapshot(world: World, stamp_ns: int, pose: FloatArray) -> Snapshot:
-    """Return what the oracle knows at a stamp."""
-    return Snapshot(stamp_ns, pose, world.landmarks.ids, world.landmarks.world_points)
 
 
 if __name__ == '__main__':

@@ -1,4 +1,4 @@
-"""Stray stamps: one is an error, several that agree are a pause or a jump of the clock."""
+"""Stamps that jump: a stray one is an error, several that agree are a pause or a jump."""
 
 from __future__ import annotations
 
@@ -7,6 +7,14 @@ AGREEING_STAMPS = 5
 
 NEAR_NS = 1_000_000_000
 """Stamps nearer than this to the newest one are of no pause or jump, nanoseconds."""
+
+
+def is_due(stamp_ns: int, last_ns: int | None, period_ns: int) -> bool:
+    """Return whether what was done at a stamp is to be done again, a period later.
+
+    It is, too, if it has not been done so far, or stamps have gone back.
+    """
+    return last_ns is None or not 0 <= stamp_ns - last_ns < period_ns
 
 
 class StrayStamps:

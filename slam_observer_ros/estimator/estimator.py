@@ -106,10 +106,10 @@ class Estimator:
         ``reset`` starts again where the run began; in a loaded map where the settings say, or
         at an unknown pose. ``hold`` keeps pose and map, and goes on from there.
         """
-        # Events of before the jump that are held back are used first.
         way = ''
         if by_ns is not None:
             way = f' {"back" if by_ns < 0 else "ahead"} by {to_s(abs(by_ns)):.3f} s'
+        # Events of before the jump that are held back are used first.
         self.release()
         if self.settings.on_time_jump == 'reset':
             logger.warning(

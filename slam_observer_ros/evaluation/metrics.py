@@ -47,8 +47,16 @@ class TrajectoryErrors:
     @property
     def unaligned_rmse_m(self) -> float:
         """The same without the alignment, for an estimate in the truth's frame, metres."""
-        positions = se3.transform(se3.inverse(self.alignment), self.estimate.positions)
-        return root_mean_square(positions - self.truth.positions)
+        return root_mean_square(self.in_estimate(self.estimate.positions) - self.truth.positions)
+
+    @property
+    def aligned_truth(self) -> Trajectory:
+        """The true poses in the world of the estimate before the alignment."""
+        return self.truth.moved(se3.inverse(self.alignment))
+
+    def in_estimate(self, points: FloatArray) -> FloatArray:
+        """Return points (n, 3) of the truth's world in that of the estimate, metres."""
+        return se3.transform(se3.inverse(self.alignment), points)
 
     @property
     def rotation_rmse_rad(self) -> float:

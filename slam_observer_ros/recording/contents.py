@@ -62,25 +62,18 @@ class Contents:
 
     def has_parent_of(self, frame: str, selected: SelectedTopics) -> bool:
         """Return whether a transform on /tf_static or /tf places a frame in another one."""
-        transforms = selected.transforms
-        return any(
-            transform.child_frame_id.lstrip('/') == frame
-            for message in self._decoded(
-                (*transforms.static, *transforms.moving), decode_transform_message
-            )
-            for transform in message
-        )
+        return any(child == frame for _, child in self._transforms(selected))
 
     def has_transform_of(self, frame: str, selected: SelectedTopics) -> bool:
         """Return whether a transform on /tf_static or /tf is from or to a frame."""
-        transforms = selected.transforms
-        return any(
-            frame in (name.lstrip('/') for name in (transform.frame_id, transform.child_frame_id))
-            for message in self._decoded(
-                (*transforms.static, *transforms.moving), decode_transform_message
-            )
-            for transform in message
-        )
+        return any(frame in ends for ends in self._transforms(selected))
+
+    def _transforms(self, selected: SelectedTopics) -> Iterator[tuple[str, str]]:
+        """Yield parent and child of each transform."""
+        topics = (*selected.transforms.static, *selected.transforms.moving)
+        for message in self._decoded(topics, decode_transform_message):
+            for transform in message:
+                yield transform.frame_id.lstrip('/'), transform.child_frame_id.lstrip('/')
 
     def has_ids(self, cloud: Topic) -> bool:
         """Return whether the points of a PointCloud or PointCloud2 have ids."""

@@ -10,9 +10,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.common.version import VERSION
-from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import interpolate
-from slam_observer_ros.geometry import se3
 from slam_observer_ros.report.curves import calibration, consistency, drops, errors
 from slam_observer_ros.report.ellipses import ellipses
 from slam_observer_ros.report.findings import findings
@@ -88,9 +86,8 @@ def _path(run: ReportedRun) -> dict[str, Json]:
         't': rounded(run.seconds(stamps_ns), 2),
         'xyz': rounded(positions.T, 3),
     }
-    truth = run.truth_in_map
-    if truth is not None:
-        true_poses, _ = interpolate(truth, stamps_ns)
+    if run.errors is not None:
+        true_poses, _ = interpolate(run.errors.aligned_truth, stamps_ns)
         path['true_xyz'] = rounded(true_poses[:, :3, 3].T, 3)
         path['error_m'] = rounded(np.linalg.norm(positions - true_poses[:, :3, 3], axis=1), 3)
     return path
@@ -129,15 +126,10 @@ def _ellipses(covariances: FloatArray | None, plane: tuple[int, int]) -> Json:
 
 
 def _true_landmarks(run: ReportedRun) -> Json:
-    truth = run.truth.landmarks
-    if truth is None or run.errors is None:
+    truth = run.aligned_landmarks
+    if truth is None:
         return None
-    points = _in_map(run.errors, truth.world_points)
-    return {'ids': truth.ids.tolist(), 'xyz': rounded(points.T, 3)}
-
-
-def _in_map(errors: TrajectoryErrors, true_points: FloatArray) -> FloatArray:
-    return se3.transform(se3.inverse(errors.alignment), true_points)
+    return {'ids': truth.ids.tolist(), 'xyz': rounded(truth.world_points.T, 3)}
 
 
 def _landmarks(run: ReportedRun) -> list[Json]:
@@ -146,9 +138,8 @@ def _landmarks(run: ReportedRun) -> list[Json]:
         return []
     innovations, last = run.innovations, run.instants[-1]
     true_points = {}
-    if run.errors is not None and (truth := run.truth.landmarks) is not None:
-        moved = _in_map(run.errors, truth.world_points)
-        true_points = dict(zip(truth.ids.tolist(), moved, strict=True))
+    if (truth := run.aligned_landmarks) is not None:
+        true_points = dict(zip(truth.ids.tolist(), truth.world_points, strict=True))
     rows: list[Json] = []
     for row, landmark_id in enumerate(last.ids.tolist()):
         of_it = innovations.ids == landmark_id

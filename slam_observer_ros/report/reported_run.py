@@ -11,6 +11,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
 from slam_observer_ros.evaluation.run_record import Innovations, Instant
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
+from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -48,7 +49,11 @@ class ReportedRun:
     @property
     def instants_s(self) -> FloatArray:
         """(i,) times of the instants, seconds."""
-        return self.seconds(np.array([instant.stamp_ns for instant in self.instants], np.int64))
+        return self.seconds(self._instants_ns)
+
+    @property
+    def _instants_ns(self) -> IntArray:
+        return np.array([instant.stamp_ns for instant in self.instants], dtype=np.int64)
 
     @property
     def used_s(self) -> FloatArray:
@@ -64,11 +69,12 @@ class ReportedRun:
         return np.column_stack([edges_s[:-1][is_gap], edges_s[1:][is_gap]])
 
     @property
-    def truth_in_map(self) -> Trajectory | None:
-        """The true poses that the estimate has, aligned with it; None without truth."""
-        if self.errors is None:
+    def aligned_landmarks(self) -> LandmarkTruth | None:
+        """The true landmarks where the estimate should have them; None without truth."""
+        truth = self.truth.landmarks
+        if truth is None or self.errors is None:
             return None
-        return self.errors.truth.moved(se3.inverse(self.errors.alignment))
+        return LandmarkTruth(truth.ids, self.errors.in_estimate(truth.world_points))
 
     def anchored_errors(self) -> tuple[FloatArray, IntArray] | None:
         """Return pose errors (a, 6) from the first pose on, and the rows (a,) of their instants.
@@ -78,9 +84,8 @@ class ReportedRun:
         """
         if self.errors is None or self.in_known_map:
             return None
-        stamps_ns = np.array([instant.stamp_ns for instant in self.instants], dtype=np.int64)
         true_poses, covered = interpolate(
-            Trajectory(self.truth.stamps_ns, self.truth.poses), stamps_ns
+            Trajectory(self.truth.stamps_ns, self.truth.poses), self._instants_ns
         )
         rows = np.flatnonzero(covered).astype(np.int64)
         if not len(rows):

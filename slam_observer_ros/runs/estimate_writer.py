@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
-from slam_observer_ros.geometry import se3
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
 from slam_observer_ros.recording.writer import RecordingWriter
 
@@ -59,10 +59,10 @@ class EstimateWriter:
         stamp_ns = estimator.stamp_ns
         if stamp_ns is None or not estimator.is_localised:
             return
-        if _is_due(stamp_ns, self._state_ns, self._period_ns):
+        if is_due(stamp_ns, self._state_ns, self._period_ns):
             self._state_ns = stamp_ns
             self._write_state(estimator, stamp_ns)
-        if _is_due(stamp_ns, self._overview_ns, OVERVIEW_PERIOD_NS):
+        if is_due(stamp_ns, self._overview_ns, OVERVIEW_PERIOD_NS):
             self._overview_ns = stamp_ns
             self._write_landmarks(estimator, stamp_ns)
 
@@ -94,13 +94,12 @@ class EstimateWriter:
             self._write_landmarks(estimator, stamp_ns)
         if errors is None:
             return
-        to_map = se3.inverse(errors.alignment)
-        truth = errors.truth.moved(to_map)
+        truth = errors.aligned_truth
         for true_ns, pose in zip(truth.stamps_ns.tolist(), truth.poses, strict=True):
             self._write(ALIGNED_POSE_TOPIC, self._messages.path_pose(true_ns, pose), true_ns)
         if landmarks is not None:
             first_ns = int(truth.stamps_ns[0])
-            points = se3.transform(to_map, landmarks.world_points)
+            points = errors.in_estimate(landmarks.world_points)
             cloud = self._writer.messages.point_cloud2(
                 first_ns, self._map_frame, landmarks.ids, points
             )
@@ -114,7 +113,7 @@ class EstimateWriter:
         self._write('/odometry', messages.odometry(uncertain, velocity, covariance), stamp_ns)
         if self._publishes_tf:
             self._write('/tf', messages.transform(stamp_ns, pose), stamp_ns)
-        if _is_due(stamp_ns, self._path_ns, PATH_SPACING_NS):
+        if is_due(stamp_ns, self._path_ns, PATH_SPACING_NS):
             self._path_ns = stamp_ns
             self._path.append(messages.path_pose(stamp_ns, pose))
 
@@ -136,7 +135,3 @@ class EstimateWriter:
 
     def _write(self, topic: str, message: Any, stamp_ns: int, latched: bool = False) -> None:
         self._writer.write_message(topic, message, stamp_ns, latched=latched)
-
-
-def _is_due(stamp_ns: int, last_ns: int | None, period_ns: int) -> bool:
-    return last_ns is None or not 0 <= stamp_ns - last_ns < period_ns

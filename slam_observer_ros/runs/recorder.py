@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.run_record import Innovations, Instant
@@ -39,7 +40,9 @@ class RunRecorder:
     def note_stamp(self, estimator: Estimator) -> None:
         """Take in the state when all events of a stamp have been used, if one is due."""
         stamp_ns = estimator.stamp_ns
-        if stamp_ns is None or not estimator.is_localised or not self._is_due(stamp_ns):
+        if stamp_ns is None or not estimator.is_localised:
+            return
+        if not is_due(stamp_ns, self._last_ns, self._period_ns):
             return
         self._instants.append(_instant(estimator, stamp_ns))
         kept = sum(len(instant.ids) for instant in self._instants)
@@ -47,10 +50,9 @@ class RunRecorder:
             del self._instants[1::2]
             self._period_ns *= 2
 
-    def _is_due(self, stamp_ns: int) -> bool:
-        if not self._instants:
-            return True
-        return not 0 <= stamp_ns - self._instants[-1].stamp_ns < self._period_ns
+    @property
+    def _last_ns(self) -> int | None:
+        return self._instants[-1].stamp_ns if self._instants else None
 
     def finish(self, estimator: Estimator) -> tuple[Instant, ...]:
         """Return the instants in the order of their stamps, the end of the run as the last."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.trajectory import Trajectory
@@ -27,7 +28,8 @@ class PoseSamples:
 
     def is_due(self, stamp_ns: int) -> bool:
         """Return whether a pose of that stamp is to be added."""
-        return not self.stamps_ns or not 0 <= stamp_ns - self.stamps_ns[-1] < SAMPLE_PERIOD_NS
+        last_ns = self.stamps_ns[-1] if self.stamps_ns else None
+        return is_due(stamp_ns, last_ns, SAMPLE_PERIOD_NS)
 
     def add(self, stamp_ns: int, pose: FloatArray) -> None:
         """Append a pose."""

@@ -30,12 +30,21 @@ MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
 
 
-def several(publishers: Sequence[TopicEndpointInfo]) -> str:
-    """Return who publishes on a topic, if more than one does; else ''."""
+def rivals(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
+    """Report who publishes on a topic, if more than one does; else ''."""
     if len(publishers) < 2:
         return ''
     names = sorted(f'{p.node_namespace.rstrip("/")}/{p.node_name}' for p in publishers)
-    return f'{len(names)} publishers ({", ".join(names)})'
+    return f"{len(names)} publishers ({', '.join(names)}) publish on '{topic}': remap all but one"
+
+
+def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
+    """Take the next raw message that waits, with what DDS knows of it; None if there is none."""
+    with subscription.handle:
+        taken: tuple[bytes, Mapping[str, int]] | None = subscription.handle.take_message(
+            subscription.msg_type, subscription.raw
+        )
+    return taken
 
 
 class InputTopic(Generic[MessageT]):
@@ -169,14 +178,7 @@ class InputTopic(Generic[MessageT]):
 
     def _take(self) -> tuple[bytes, Mapping[str, int]] | None:
         """Take the next message that waits, with what DDS knows of it; None if there is none."""
-        subscription = self._subscription
-        if subscription is None:
-            return None
-        with subscription.handle:
-            taken: tuple[bytes, Mapping[str, int]] | None = subscription.handle.take_message(
-                subscription.msg_type, subscription.raw
-            )
-        return taken
+        return None if self._subscription is None else take(self._subscription)
 
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
         for waiting in self._newest(raw, info) if self._is_shedding else self._decode(raw, info):
@@ -229,8 +231,8 @@ class InputTopic(Generic[MessageT]):
             found = ', '.join(sorted({publisher.topic_type for publisher in publishers}))
             hint = ''.join(f'; set {self.advice[t]}' for t in self.advice if t in found)
             return f"'{self.topic}' carries {found}; {wanted} is needed{hint}"
-        if not self.is_shared and (rivals := several(publishers)):
-            return f"{rivals} publish on '{self.topic}': remap all but one"
+        if not self.is_shared and (text := rivals(self.topic, publishers)):
+            return text
         for publisher in publishers:
             compatibility, reason = qos_check_compatible(publisher.qos_profile, self._qos)
             if compatibility == QoSCompatibility.ERROR:

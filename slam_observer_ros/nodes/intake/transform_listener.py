@@ -17,6 +17,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
 from slam_observer_ros.messages.poses_and_velocities import decode_transforms, pose_matrices
+from slam_observer_ros.nodes.intake.input_topic import take
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
@@ -141,8 +142,7 @@ def _ignore(_parent: str, _child: str, _stamp_ns: int) -> None:
 def _read_waiting(subscription: Subscription) -> None:
     """Give a subscription's callback what waits, which an executor does one by one."""
     for _ in range(TF_QOS.depth):
-        with subscription.handle:
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        taken = take(subscription)
         if taken is None:
             return
         subscription.callback(taken[0])

@@ -13,12 +13,13 @@ from sensor_msgs.msg import PointCloud, PointCloud2
 from std_msgs.msg import Float64
 from visualization_msgs.msg import MarkerArray
 
+from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
 from slam_observer_ros.messages.outgoing import encode_point_cloud
-from slam_observer_ros.nodes.intake.input_topic import several
+from slam_observer_ros.nodes.intake.input_topic import rivals
 from slam_observer_ros.nodes.intake.transform_listener import LiveTransforms
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
@@ -84,11 +85,9 @@ class EstimatePublisher:
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""
         topic = self._node.resolve_topic_name('odometry')
-        names = several(self._node.get_publishers_info_by_topic(topic))
-        if not names:
-            return ''
-        text = f"{names} publish on '{topic}': remap all but one"
-        self._log.warning(topic, text)
+        text = rivals(topic, self._node.get_publishers_info_by_topic(topic))
+        if text:
+            self._log.warning(topic, text)
         return text
 
     @property
@@ -187,8 +186,6 @@ class EstimatePublisher:
         self._estimates.publish(raw)
 
     def _extend_path(self, stamp_ns: int, pose: FloatArray) -> None:
-        last_ns = self._path_stamp_ns
-        if last_ns is not None and 0 <= stamp_ns - last_ns < PATH_SPACING_NS:
-            return
-        self._path_stamp_ns = stamp_ns
-        self._path.append(self._messages.path_pose(stamp_ns, pose))
+        if is_due(stamp_ns, self._path_stamp_ns, PATH_SPACING_NS):
+            self._path_stamp_ns = stamp_ns
+            self._path.append(self._messages.path_pose(stamp_ns, pose))
