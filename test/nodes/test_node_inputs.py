@@ -491,3 +491,13 @@ def test_a_second_publisher_of_velocities_or_of_the_odometry_is_named(ros, tmp_p
         ros.node.destroy_publisher(estimates)
         assert "publish on '/rivals/landmarks'" not in node.output
         robot.send_zeros()
+
+
+def test_another_type_of_cloud_than_is_asked_for_is_said_by_its_own_name():
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/{topic}'
+    publisher = Mock(topic_type='sensor_msgs/msg/PointCloud2', qos_profile=QOS)
+    node.get_publishers_info_by_topic.return_value = [publisher]
+    _, landmarks = open_inputs(node, ObserverNodeSettings(landmarks_type='PoseArray'), Mock())
+    landmarks.check_publishers()
+    assert landmarks.problem.endswith('PoseArray is needed; set landmarks_type: PointCloud2')

@@ -228,9 +228,9 @@ class InputTopic(Generic[MessageT]):
         if not publishers:
             return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
         if not usable:
-            found = ', '.join(sorted({publisher.topic_type for publisher in publishers}))
-            hint = ''.join(f'; set {self.advice[t]}' for t in self.advice if t in found)
-            return f"'{self.topic}' carries {found}; {wanted} is needed{hint}"
+            found = sorted({publisher.topic_type for publisher in publishers})
+            hint = ''.join(f'; set {self.advice[t]}' for t in found if t in self.advice)
+            return f"'{self.topic}' carries {', '.join(found)}; {wanted} is needed{hint}"
         if not self.is_shared and (text := rivals(self.topic, publishers)):
             return text
         for publisher in publishers:
