@@ -13,7 +13,12 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import block_diagonal, kalman_update, transpose
+from slam_observer_ros.geometry.matrices import (
+    block_diagonal,
+    kalman_update,
+    transpose,
+    with_blocks,
+)
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
@@ -58,6 +63,28 @@ class JointCovariance:
         """Return ξ_i (n, 3) of x, and the changes of velocities, None where there are none."""
         return self._axes.full_points(x[self.first :]), None
 
+    # Landmarks that are not in P, see :mod:`.compressed_covariance`: here there are none
+
+    @property
+    def active(self) -> IntArray | slice:
+        """Rows of the landmarks that are in P, in its order; a correction moves these."""
+        return slice(None)
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether all landmarks are in P."""
+        return True
+
+    def activate(self, rows: IntArray) -> None:
+        """See to it that landmarks (m,), which are going to be observed, are in P."""
+
+    def expand(self) -> None:
+        """See to it that all landmarks are in P."""
+
+    def postponed_shifts(self) -> FloatArray:
+        """Return how far landmarks (n, 3) have yet to be moved, metres."""
+        raise NotImplementedError
+
     # The step
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
@@ -101,6 +128,12 @@ class JointCovariance:
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the same of all together, (p, m k) and (m k, m k)."""
         return self._output(C.reshape(-1, self._p), self._columns(rows))
+
+    def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
+        """Return −K r of residuals r (m, k) of noise R (m, k, k), K = P Hᵀ S⁻¹, and update P."""
+        HP, HPH = self.project(C, rows)
+        x: FloatArray = -self.update(HP, with_blocks(HPH, R)) @ r.ravel()
+        return x
 
     def update(self, HP: FloatArray, S: FloatArray) -> FloatArray:
         """Update P by what :meth:`project` projected; return the gain K = P Hᵀ S⁻¹."""
@@ -197,6 +230,11 @@ class ExactMapCovariance(JointCovariance):
         self._axes, self._p, self.first = axes, axes.p, joint.first
         self.P = joint.P[: self.first, : self.first].copy()
         self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
+
+    @property
+    def active(self) -> IntArray | slice:
+        """No landmark: none is moved."""
+        return slice(0)
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
         """Return the covariances (n, 3, 3) of the landmarks, as the map has them."""

@@ -20,6 +20,7 @@ from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, wit
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
 from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
 from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
 from slam_observer_ros.observer.robust import observation_weights
@@ -41,13 +42,22 @@ class RiccatiFilter(Filter):
         self.joint = (
             MovingLandmarksCovariance(self.axes, self.calibration, error)
             if error > 0.0
-            else JointCovariance(self.axes, self.calibration)
+            else CompressedCovariance(self.axes, self.calibration, self.observer)
         )
 
     def propagate(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to P."""
         super().propagate(motion)
-        self.joint.propagate(motion, self.observer.points, self.observer.u)
+        observer, active = self.observer, self.joint.active
+        points = observer.y_ref[active] + observer.a[active]
+        self.joint.propagate(motion, points, observer.u[active])
+
+    def residuals(
+        self, rows: IntArray, points: FloatArray, covariances: FloatArray, dt_s: FloatArray
+    ) -> Residuals:
+        """Return what landmarks ``rows`` (m,), active from now on, seen at ``points`` say (29)."""
+        self.joint.activate(rows)
+        return super().residuals(rows, points, covariances, dt_s)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
@@ -59,9 +69,7 @@ class RiccatiFilter(Filter):
         repeated = repetition_factors(used.dt_s, self._settings.observation_correlation_time)
         R = R / (weights[passed] / repeated)[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
-        HP, HPH = self.joint.project(self.joint.output_matrix(used), used.rows)
-        K = self.joint.update(HP, with_blocks(HPH, R))
-        self._move(-K @ r.ravel())
+        self._move(self.joint.correct(self.joint.output_matrix(used), used.rows, R, r))
         return weights
 
     def distances(self, residuals: Residuals) -> FloatArray:
@@ -92,6 +100,7 @@ class RiccatiFilter(Filter):
 
     def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
+        self.joint.activate(rows)
         super().relocate(rows, points, covariances)
         self.joint.relocate(rows, self.observer.turned(covariances))
 
@@ -108,13 +117,14 @@ class RiccatiFilter(Filter):
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
         super().set_pose(pose, covariance)
-        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.observer.points)
+        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.points)
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
         # A motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v (G), and the positions
         # of the known landmarks by J γ.
         k, joint = self.axes.point, self.joint
+        joint.expand()
         G = joint.gauge(len(self.observer.y_ref))
         J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
@@ -139,12 +149,24 @@ class RiccatiFilter(Filter):
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
         """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
-        points = self.observer.points + duration_s * self.observer.u
+        points = self.points + duration_s * self.observer.u
         return self.joint.landmarks(points, duration_s)
 
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
-        return self.joint.with_pose(rows, self.observer.points[rows])
+        return self.joint.with_pose(rows, self.points[rows])
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 3) estimated landmarks, reference frame, metres."""
+        points = self.observer.points
+        return points if self.joint.is_dense else points + self.joint.postponed_shifts()
+
+    def expected_points(self, rows: IntArray) -> FloatArray:
+        """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
+        if self.joint.is_dense:
+            return super().expected_points(rows)
+        return self.observer.in_body_frame(self.points[rows])
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
@@ -152,7 +174,7 @@ class RiccatiFilter(Filter):
         self.calibration.shift(x[p:first])
         xi, u = self.joint.split(x)
         X = slam_group.exp(self.axes.full_pose(x[:p]), xi)
-        moved = slice(len(xi))  # none in an exact map
+        moved = self.joint.active  # none in an exact map
         turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
         observer.correct(X.A, moved, X.a + turned)
         if u is not None:
