@@ -12,8 +12,8 @@ import sys
 import time
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from slam_observer_ros.common.threads import use_one_thread
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.observer.designs import DESIGNS
@@ -28,7 +28,7 @@ REPEATS = 12
 def main() -> None:
     """Measure all designs and print one table a design."""
     argparse.ArgumentParser(description=__doc__).parse_args()
-    use_one_thread()  # as the nodes do
+    threadpool_limits(1)  # as the nodes do
     measured = {
         (design, n, m): update_s(design, n, m)
         for design in DESIGNS
