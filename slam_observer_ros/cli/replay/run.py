@@ -127,7 +127,7 @@ def _replay(
 
 
 def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
-    if args.report is not None:
+    if args.report is not None or args.plot is not None:
         return RunRecorder()
     return NisTally() if args.json else None
 
