@@ -2,12 +2,12 @@
 
 VENV := .venv
 PYTHON_IN_VENV := $(VENV)/bin/python
-READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),wheels)
+READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),$(ROS_WHEELS:%=%-wheels),wheels)
 
 ifdef ROS_DISTRO
-PIP_LIMITS := 'numpy<2'
+PIP_LIMITS = "numpy==$$($(PYTHON_IN_VENV) -c 'import numpy; print(numpy.__version__)')"
 else
-PIP_LIMITS := --constraint constraints.txt
+PIP_LIMITS := $(if $(ROS_WHEELS),,--constraint constraints.txt)
 # where ament_index finds the wheels' packages
 export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 endif
@@ -64,7 +64,7 @@ venv: $(READY)  ## only set up .venv
 lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt names
 	$(PYTHON_IN_VENV) -m pip install --quiet uv
 	$(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
-		--extra test --extra dev --extra ros --constraint constraints.txt \
+		--extra cli --extra test --extra dev --extra ros-jazzy --constraint constraints.txt \
 		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
 
 $(READY): setup.py constraints.txt requirements.lock \

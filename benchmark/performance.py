@@ -26,7 +26,7 @@ from step_costs import measure_large, measure_steps
 from world_costs import measure_passing, measure_worlds
 import worlds
 
-from slam_observer_ros.common.threads import use_one_thread
+from threadpoolctl import threadpool_limits
 
 PARTS: dict[str, Callable[[], Tables]] = {
     'start': measure_start,
@@ -48,7 +48,7 @@ def main() -> None:
     args = parse_arguments()
     logging.basicConfig(format='benchmark: %(message)s', level=logging.INFO)
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
-    use_one_thread()  # as the nodes do
+    threadpool_limits(1)  # as the nodes do
     figures = performance_page.read_figures()
     for name in args.parts or PARTS:
         if name in NEED_DATA and not worlds.data_folder().is_dir():

@@ -9,16 +9,11 @@ import logging
 import sys
 from typing import TypeVar
 
-from rich.console import Console
-from rich.progress import track
-
-from slam_observer_ros.common.tables import table_of
+from slam_observer_ros.cli.interrupts import leaving_at_once
 
 PROGRAM = 'slam-observer'
 
 _Item = TypeVar('_Item')
-
-_stderr = Console(stderr=True, highlight=False)
 
 
 class MessageHandler(logging.Handler):
@@ -54,19 +49,24 @@ def kept_warnings() -> Iterator[list[str]]:
 
 def show_message(kind: str, text: str) -> None:
     """Write ``slam-observer: kind: text`` to standard error, above any progress bar."""
-    line = f'{PROGRAM}: {kind}: {" ".join(text.split())}'
-    _stderr.print(line, markup=False, soft_wrap=True)
+    if sys.stderr is not None:  # a shell may have closed it
+        sys.stderr.write(f'{PROGRAM}: {kind}: {" ".join(text.split())}\n')
 
 
 def show_progress(items: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
     """Pass items on, with a progress bar on standard error where that is a terminal."""
+    with leaving_at_once():
+        from rich.console import Console
+        from rich.progress import track
+
+    console = Console(stderr=True, highlight=False)
     yield from track(
         items,
         description,
         total=total,
-        console=_stderr,
+        console=console,
         transient=True,
-        disable=not _stderr.is_terminal,
+        disable=not console.is_terminal,
     )
 
 
@@ -77,4 +77,9 @@ def print_json(result: Mapping[str, object]) -> None:
 
 def print_table(title: str, rows: Mapping[str, str]) -> None:
     """Print names and values on standard output."""
+    with leaving_at_once():
+        from rich.console import Console
+
+        from slam_observer_ros.common.tables import table_of
+
     Console(highlight=False, markup=False).print(table_of(title, rows))

@@ -34,6 +34,9 @@ COMMANDS = {
 }
 """The module of each command, and what it does; only the one that is given is imported."""
 
+OPTIONAL_PACKAGES = ('rosbags', 'mcap', 'matplotlib', 'rich')
+"""What the extra ``cli`` of setup.py installs: a robot that only runs a node does without."""
+
 EXAMPLES = """\
 examples:
   slam-observer simulate --plot figures
@@ -95,8 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
         words = sys.argv[1:] if arguments is None else arguments
-        args = make_parser(words).parse_args(words)
         use_one_thread()
+        args = make_parser(words).parse_args(words)
         # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
         signal.signal(signal.SIGTERM, lambda number, _stack: sys.exit(EXIT_SIGNAL + number))
         args.run(args)
@@ -106,9 +109,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _leave_broken_pipe()
         show_message('error', str(error))
         return EXIT_LOSS if isinstance(error, LossError) else EXIT_ERROR
+    except ModuleNotFoundError as error:
+        _explain_missing(error)
+        return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_SIGNAL + signal.SIGINT
     return 0
+
+
+def _explain_missing(error: ModuleNotFoundError) -> None:
+    """Show how a package comes that only the command line needs; raise for any other one."""
+    package = (error.name or '').partition('.')[0]
+    if package not in OPTIONAL_PACKAGES:
+        raise error
+    needed = ' '.join(OPTIONAL_PACKAGES)
+    show_message(
+        'error', f"{package} is not installed: 'pip install {needed}' brings what is used"
+    )
 
 
 def _leave_broken_pipe() -> int:

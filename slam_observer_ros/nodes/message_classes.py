@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from functools import cache
 import importlib
+import os
 from typing import Any
 
 from slam_observer_ros.common.errors import ParameterError
@@ -18,9 +19,10 @@ def message_class(type_name: str) -> Any:
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except ImportError as error:
+        distribution = os.environ.get('ROS_DISTRO', '$ROS_DISTRO')  # a shell puts it in, too
         raise ParameterError(
             f'{type_name} needs the package {package}: '
-            f'apt install ros-jazzy-{package.replace("_", "-")}'
+            f'apt install ros-{distribution}-{package.replace("_", "-")}'
         ) from error
 
 

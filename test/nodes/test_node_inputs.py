@@ -368,7 +368,8 @@ def seen(maps):
     return dict(zip(event.ids.tolist(), event.points, strict=True))
 
 
-def test_optional_packages_are_named_when_they_are_missing(tmp_path):
+def test_optional_packages_are_named_when_they_are_missing(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_DISTRO', 'kilted')
     packages = {'Detection3DArray': 'vision_msgs', 'AprilTagDetectionArray': 'apriltag_msgs'}
     nodes = {
         package: NodeProcess('observer_node', tmp_path / package, landmarks_type=landmarks_type)
@@ -377,7 +378,7 @@ def test_optional_packages_are_named_when_they_are_missing(tmp_path):
     }
     for package, node in nodes.items():
         assert node.wait() == 2
-        assert f'apt install ros-jazzy-{package.replace("_", "-")}' in node.output
+        assert f'apt install ros-kilted-{package.replace("_", "-")}' in node.output
         assert 'Traceback' not in node.output
 
 
