@@ -17,13 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import symmetric, transpose, with_blocks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance, sheared
 from slam_observer_ros.observer.riccati.outside_landmarks import OutsideLandmarks
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
-from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
 REFERENCE_SHIFT_M = 0.1
@@ -49,24 +47,21 @@ class BlockSize:
 class CompressedCovariance(JointCovariance):
     """P of pose, calibration and active landmarks, and what all others need to follow."""
 
-    def __init__(
-        self,
-        axes: EstimatedAxes,
-        calibration: Calibration,
-        observer: Observer,
-        size: BlockSize | None = None,
-    ) -> None:
-        super().__init__(axes, calibration)
-        self._observer, self._size = observer, size or BlockSize()
-        self._calibration = calibration
-        self._rows: IntArray = np.empty(0, dtype=np.int64)  # (q,) active landmarks, as in P
-        self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) where in P each is, or −1
-        self._slots: IntArray = np.empty(0, dtype=np.int64)  # (n,) where outside, −1 for nowhere
-        self._outside = OutsideLandmarks(axes.point, len(self.P))
-        self._postponed = PostponedCorrection(self.P, axes.point)
-        self._dense = True  # whether all landmarks are active
+    active: IntArray
+    is_dense = False
+
+    def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
+        vars(self).update(vars(dense))
+        self._form, self._observer, self._size = copy(dense), observer, size
+        self._form.P = self.P[: self.first, : self.first]
+        n = len(observer.y_ref)
+        self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
+        self._set_active(np.arange(n), n)
+        self._slots = np.full(n, -1)  # (n,) where each landmark is outside, −1 for nowhere
+        self._outside = OutsideLandmarks(self._axes.point, len(self.P))
+        self._postponed = PostponedCorrection(self.P, self._axes.point)
         self._shifts: FloatArray | None = None  # what :meth:`postponed_shifts` has found
-        self._unchecked, self._most = 0, 0
+        self._unchecked, self._most = 0, size.most
 
     def __deepcopy__(self, memo: dict[int, object]) -> CompressedCovariance:
         """Return an independent copy, which shares what takes much memory until it changes."""
@@ -74,16 +69,6 @@ class CompressedCovariance(JointCovariance):
         other.P, other._observer = self.P.copy(), deepcopy(self._observer, memo)
         other._outside, other._postponed = self._outside.copy(), deepcopy(self._postponed, memo)
         return other
-
-    @property
-    def active(self) -> IntArray | slice:
-        """Rows of the landmarks of which P is, in its order."""
-        return slice(None) if self._dense else self._rows
-
-    @property
-    def is_dense(self) -> bool:
-        """Whether all landmarks are active."""
-        return self._dense
 
     @property
     def nbytes(self) -> int:
@@ -95,17 +80,14 @@ class CompressedCovariance(JointCovariance):
     def references(self) -> FloatArray:
         """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
         points = self._observer.points
-        if not self._dense:
-            others = self._others
-            points[others] = self._outside.references[self._slots[others]]
+        others = self._others
+        points[others] = self._outside.references[self._slots[others]]
         return points
 
     # The step
 
     def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
         """Update P and return the error x of pose, calibration and active landmarks."""
-        if self._dense:
-            return super().correct(C, rows, R, r)
         columns = self._columns(rows)
         HP, HPH = self.project(C, rows)
         S = with_blocks(HPH, R)
@@ -121,12 +103,8 @@ class CompressedCovariance(JointCovariance):
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks ``rows`` (m,), of an observation, are active."""
-        if self._dense:
-            if len(self._rows) > self._size.dense and not self._observer.have_moved:
-                self._switch(self._chosen(rows))
-            return
         missing = rows[self._places[rows] < 0]
-        if len(missing) or len(self._rows) > self._most:
+        if len(missing) or len(self.active) > self._most:
             self._switch(self._chosen(rows))
             return
         self._unchecked += 1
@@ -142,7 +120,7 @@ class CompressedCovariance(JointCovariance):
         # Not done here: those who look at the map must not change the bits of the estimate.
         if self._shifts is None:
             self._shifts = np.zeros((len(self._places), 3))
-            if not self._dense and self._postponed.has_moved:
+            if self._postponed.has_moved:
                 others, k = self._others, self._axes.point
                 a = self._off(others)[:, :k]
                 X = self._outside.blocks(self._slots[others])
@@ -151,7 +129,7 @@ class CompressedCovariance(JointCovariance):
 
     def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
         super()._propagate(motion, J_landmarks)
-        if not self._dense and self._p < self.first:
+        if self._p < self.first:
             Phi = self._postponed.Phi
             growth = motion.sensitivity @ Phi[self._p : self.first]
             Phi[: self._p] += growth
@@ -189,12 +167,7 @@ class CompressedCovariance(JointCovariance):
 
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
-        n, m, k = len(self._places), len(points), self._axes.point
-        if n + m <= self._size.dense:
-            super().add_known(points, covariances)
-            return
-        if self._dense:
-            self._start_postponing()
+        m, k = len(points), self._axes.point
         slots = self._outside.add_independent(points, covariances[:, :k, :k])
         self._slots = np.concatenate([self._slots, slots])
         self._places = np.concatenate([self._places, np.full(m, -1)])
@@ -205,43 +178,28 @@ class CompressedCovariance(JointCovariance):
         places, slots = self._places[rows], self._slots[rows]
         columns = JointCovariance._columns(self, places[places >= 0])
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
-        if not self._dense:
-            self._postponed.remove(columns)
-            self._outside.remove(slots[slots >= 0])
+        self._postponed.remove(columns)
+        self._outside.remove(slots[slots >= 0])
         kept = np.ones(len(self._places), dtype=np.bool_)
         kept[rows] = False
         number = np.cumsum(kept) - 1
-        self._set_active(number[self._rows[kept[self._rows]]], int(kept.sum()))
+        self._set_active(number[self.active[kept[self.active]]], int(kept.sum()))
         self._slots, self._shifts = self._slots[kept], None
 
     # All of it
 
-    def expand(self) -> None:
-        """Make all landmarks active: P is as large as it gets."""
-        if self._dense:
-            return
+    def dense(self) -> JointCovariance:
+        """Return the same with all landmarks in P, which the observer has moved."""
         self._apply()
-        everything = np.arange(len(self._places))
-        self.P = self.marginal(everything).P
-        self._set_active(everything, len(everything))
-        self._slots = np.full(len(everything), -1)
-        self._dense, self._shifts = True, None
-
-    def of_positions(self, points: FloatArray) -> FloatArray:
-        """Return the covariance of (ε, c̃, ã_1 … ã_n) for estimates ``points`` (n, 3)."""
-        self.expand()
-        return super().of_positions(points)
+        return self.marginal(np.arange(len(self._places)))
 
     def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
         """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
-        if self._dense:
-            super().set_pose(covariance, points)
-            return
         self._apply(0.0)
-        P = super().of_positions(points[self._rows])
+        P = super().of_positions(points[self.active])
         # Errors of all others are those of their positions now, too.
         outside, p = self._outside, self._p
-        T = self._all_turning(points[self._rows])
+        T = self._all_turning(points[self.active])
         X = outside.X.copy()
         X[:, self.first :] -= X[:, :p] @ T.T
         X[:, :p] = 0.0
@@ -266,7 +224,7 @@ class CompressedCovariance(JointCovariance):
         # From η to ξ, and in the order of the rows.
         P = sheared(P, len(local), self._all_turning(self._outside.references[slots]))
         order = np.argsort(np.append(np.flatnonzero(is_active), others))
-        joint = JointCovariance(self._axes, self._calibration)
+        joint = copy(self._form)
         columns = np.append(np.arange(self.first), joint._columns(order))
         joint.P = P[np.ix_(columns, columns)]
         return joint
@@ -285,16 +243,13 @@ class CompressedCovariance(JointCovariance):
         near = np.argpartition(distances, min(kept, len(arms)) - 1)[:kept]
         wanted = np.union1d(rows, near)
         self._most = max(self._size.most, 2 * len(wanted))
-        with_active = np.union1d(wanted, self._rows)
+        with_active = np.union1d(wanted, self.active)
         return with_active if len(with_active) <= self._most else wanted
 
     def _switch(self, rows: IntArray) -> None:
         """Make landmarks active, and no others."""
-        if self._dense:
-            self._start_postponing()
-        else:
-            self._apply()
-        self._release(self._rows[~np.isin(self._rows, rows)])
+        self._apply()
+        self._release(self.active[~np.isin(self.active, rows)])
         self._take_in(rows[self._places[rows] < 0])
         self._postponed = PostponedCorrection(self.P, self._axes.point)
         self._shifts = None
@@ -342,7 +297,7 @@ class CompressedCovariance(JointCovariance):
         outside.X = outside.X[:, kept]
         outside.put(slots, points, to_x[:, kept], symmetric(own), to_others)
         self.P = P[np.ix_(kept, kept)]
-        self._set_active(self._rows[~np.isin(self._rows, rows)], len(self._places))
+        self._set_active(self.active[~np.isin(self.active, rows)], len(self._places))
 
     def _take_in(self, rows: IntArray) -> None:
         """Make landmarks (m,) active, too."""
@@ -359,18 +314,13 @@ class CompressedCovariance(JointCovariance):
         own = to_others[at] + outside.X[at, :p] @ T.T + T @ to_x[:, :p].T
         outside.X = np.hstack([outside.X, to_others + outside.X[:, :p] @ T.T])
         self.P = np.block([[P, to_x.T], [to_x, symmetric(own)]])
-        self._set_active(np.append(self._rows, rows), len(self._places))
-        inside = self._slots[self._rows]
+        self._set_active(np.append(self.active, rows), len(self._places))
+        inside = self._slots[self.active]
         outside.X[outside.rows(inside[inside >= 0])] = 0.0
 
     def _set_active(self, rows: IntArray, n: int) -> None:
-        self._rows, self._places = rows, np.full(n, -1)
+        self.active, self._places = rows, np.full(n, -1)
         self._places[rows] = np.arange(len(rows))
-
-    def _start_postponing(self) -> None:
-        self._outside = OutsideLandmarks(self._axes.point, len(self.P))
-        self._postponed = PostponedCorrection(self.P, self._axes.point)
-        self._dense = False
 
     def _of_others(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariances with ε (m, k, p) and own (m, k, k) of ξ_i outside."""
@@ -384,20 +334,18 @@ class CompressedCovariance(JointCovariance):
 
     def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
         super()._insert(rows, C, covariances)
-        if not self._dense:
-            Phi = self._postponed.Phi
-            Phi[self._columns(rows)] = C.reshape(-1, self._p) @ Phi[: self._p]
+        Phi = self._postponed.Phi
+        Phi[self._columns(rows)] = C.reshape(-1, self._p) @ Phi[: self._p]
 
     def _make_room(self, m: int) -> IntArray:
         """Append rows and columns for m landmarks; return which landmarks they are."""
         super()._make_room(m)
         new = len(self._places) + np.arange(m)
-        self._set_active(np.append(self._rows, new), len(self._places) + m)
+        self._set_active(np.append(self.active, new), len(self._places) + m)
         self._slots = np.append(self._slots, np.full(m, -1))
         self._shifts = None
-        if not self._dense:
-            self._postponed.extend(self._stride * m)
+        self._postponed.extend(self._stride * m)
         return new
 
     def _columns(self, rows: IntArray) -> IntArray:
-        return super()._columns(rows if self._dense else self._places[rows])
+        return super()._columns(self._places[rows])

@@ -27,6 +27,11 @@ from slam_observer_ros.sensor_models.motion import Motion
 class JointCovariance:
     """P, and which of its columns are whose."""
 
+    # Whether all landmarks are in P, and the rows of those that are, in its order: a correction
+    # moves these. See :mod:`.compressed_covariance`.
+    is_dense = True
+    active: IntArray | slice = slice(None)
+
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         self._axes, self._p = axes, axes.p
         self.P = calibration.initial_covariance()  # (p + c + k n, p + c + k n) of x
@@ -63,23 +68,12 @@ class JointCovariance:
         """Return ξ_i (n, 3) of x, and the changes of velocities, None where there are none."""
         return self._axes.full_points(x[self.first :]), None
 
-    # Landmarks that are not in P, see :mod:`.compressed_covariance`: here there are none
-
-    @property
-    def active(self) -> IntArray | slice:
-        """Rows of the landmarks that are in P, in its order; a correction moves these."""
-        return slice(None)
-
-    @property
-    def is_dense(self) -> bool:
-        """Whether all landmarks are in P."""
-        return True
-
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks (m,), which are going to be observed, are in P."""
 
-    def expand(self) -> None:
-        """See to it that all landmarks are in P."""
+    def dense(self) -> JointCovariance:
+        """Return the same with all landmarks in P."""
+        return self
 
     def postponed_shifts(self) -> FloatArray:
         """Return how far landmarks (n, 3) have yet to be moved, metres."""
@@ -224,17 +218,14 @@ class JointCovariance:
 class ExactMapCovariance(JointCovariance):
     """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
 
+    active = slice(0)
+
     def __init__(
         self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray
     ) -> None:
         self._axes, self._p, self.first = axes, axes.p, joint.first
         self.P = joint.P[: self.first, : self.first].copy()
         self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
-
-    @property
-    def active(self) -> IntArray | slice:
-        """No landmark: none is moved."""
-        return slice(0)
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
         """Return the covariances (n, 3, 3) of the landmarks, as the map has them."""

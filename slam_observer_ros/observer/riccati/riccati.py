@@ -20,7 +20,10 @@ from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, wit
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.observer.riccati.compressed_covariance import CompressedCovariance
+from slam_observer_ros.observer.riccati.compressed_covariance import (
+    BlockSize,
+    CompressedCovariance,
+)
 from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
 from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
 from slam_observer_ros.observer.robust import observation_weights
@@ -35,6 +38,7 @@ class RiccatiFilter(Filter):
     joint: JointCovariance
     has_joint_covariance: ClassVar[bool] = True
     ignores = OF_CONSTANT_GAINS
+    block = BlockSize()  # of large maps
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
@@ -42,7 +46,7 @@ class RiccatiFilter(Filter):
         self.joint = (
             MovingLandmarksCovariance(self.axes, self.calibration, error)
             if error > 0.0
-            else CompressedCovariance(self.axes, self.calibration, self.observer)
+            else JointCovariance(self.axes, self.calibration)
         )
 
     def propagate(self, motion: Motion) -> None:
@@ -51,13 +55,6 @@ class RiccatiFilter(Filter):
         observer, active = self.observer, self.joint.active
         points = observer.y_ref[active] + observer.a[active]
         self.joint.propagate(motion, points, observer.u[active])
-
-    def residuals(
-        self, rows: IntArray, points: FloatArray, covariances: FloatArray, dt_s: FloatArray
-    ) -> Residuals:
-        """Return what landmarks ``rows`` (m,), active from now on, seen at ``points`` say (29)."""
-        self.joint.activate(rows)
-        return super().residuals(rows, points, covariances, dt_s)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
@@ -92,9 +89,13 @@ class RiccatiFilter(Filter):
         """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
         super().add(points, covariances)
         self.joint.add_seen(self.observer.turned(covariances))
+        if self.joint.is_dense and len(self.observer.y_ref) > self.block.dense:
+            self._compress()
 
     def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks whose errors are independent of all else."""
+        if self.joint.is_dense and len(self.observer.y_ref) + len(y_ref) > self.block.dense:
+            self._compress()
         super().add_known(y_ref, covariances)
         self.joint.add_known(y_ref, covariances)
 
@@ -123,8 +124,8 @@ class RiccatiFilter(Filter):
         """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
         # A motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v (G), and the positions
         # of the known landmarks by J γ.
-        k, joint = self.axes.point, self.joint
-        joint.expand()
+        self.joint = joint = self.joint.dense()
+        k = self.axes.point
         G = joint.gauge(len(self.observer.y_ref))
         J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
@@ -167,6 +168,17 @@ class RiccatiFilter(Filter):
         if self.joint.is_dense:
             return super().expected_points(rows)
         return self.observer.in_body_frame(self.points[rows])
+
+    def translations(self, rows: IntArray) -> FloatArray:
+        """Return â_i (m, 3) of landmarks, metres."""
+        a = super().translations(rows)
+        return a if self.joint.is_dense else a + self.joint.postponed_shifts()[rows]
+
+    def _compress(self) -> None:
+        """Go on with a covariance for many landmarks, unless they move."""
+        if self._settings.landmark_velocity_stddev or self.observer.have_moved:
+            return
+        self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
