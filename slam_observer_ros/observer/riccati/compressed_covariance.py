@@ -60,7 +60,6 @@ class CompressedCovariance(JointCovariance):
         self._slots = np.full(n, -1)  # (n,) where each landmark is outside, −1 for nowhere
         self._outside = OutsideLandmarks(self._axes.point, len(self.P))
         self._postponed = PostponedCorrection(self.P, self._axes.point)
-        self._shifts: FloatArray | None = None  # what :meth:`postponed_shifts` has found
         self._unchecked, self._most = 0, size.most
 
     def __deepcopy__(self, memo: dict[int, object]) -> CompressedCovariance:
@@ -97,7 +96,6 @@ class CompressedCovariance(JointCovariance):
         x: FloatArray = -K @ r.ravel()
         turn = self._axes.full_pose(x[: self._p])[:3]
         self._postponed.correct(H_Phi, K, S, r.ravel(), turn)
-        self._shifts = None
         self._outside.matrix.fold(FOLDING)
         return x
 
@@ -111,21 +109,21 @@ class CompressedCovariance(JointCovariance):
         if self._unchecked >= CHECK_INTERVAL:
             self._unchecked = 0
             others = self._others
-            off = self._off(others) + self.postponed_shifts()[others]
+            off = self._off(others) + self.postponed_shifts(others)
             if np.linalg.norm(off, axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
                 self._apply()
 
-    def postponed_shifts(self) -> FloatArray:
-        """Return how far the observer has yet to move each landmark (n, 3), metres."""
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far the observer has yet to move landmarks (m, 3), metres."""
         # Not done here: those who look at the map must not change the bits of the estimate.
-        if self._shifts is None:
-            self._shifts = np.zeros((len(self._places), 3))
-            if self._postponed.has_moved:
-                others, k = self._others, self._axes.point
-                a = self._off(others)[:, :k]
-                X = self._outside.blocks(self._slots[others])
-                self._shifts[others, :k] = self._postponed.shifted(a, X) - a
-        return self._shifts
+        shifts, k = np.zeros((len(rows), 3)), self._axes.point
+        at = np.flatnonzero(self._places[rows] < 0)
+        if len(at) and self._postponed.has_moved:
+            others = rows[at]
+            a = self._off(others)[:, :k]
+            X = self._outside.blocks(self._slots[others])
+            shifts[at, :k] = self._postponed.shifted(a, X) - a
+        return shifts
 
     def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
         super()._propagate(motion, J_landmarks)
@@ -171,7 +169,6 @@ class CompressedCovariance(JointCovariance):
         slots = self._outside.add_independent(points, covariances[:, :k, :k])
         self._slots = np.concatenate([self._slots, slots])
         self._places = np.concatenate([self._places, np.full(m, -1)])
-        self._shifts = None
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
@@ -184,7 +181,7 @@ class CompressedCovariance(JointCovariance):
         kept[rows] = False
         number = np.cumsum(kept) - 1
         self._set_active(number[self.active[kept[self.active]]], int(kept.sum()))
-        self._slots, self._shifts = self._slots[kept], None
+        self._slots = self._slots[kept]
 
     # All of it
 
@@ -238,7 +235,9 @@ class CompressedCovariance(JointCovariance):
     def _chosen(self, rows: IntArray) -> IntArray:
         """Return the landmarks to be active when ``rows`` (m,) are seen."""
         kept = max(self._size.kept, self._size.kept_per_seen * len(rows))
-        arms = self._observer.points + self.postponed_shifts() - self._observer.A[:3, 3]
+        everything = np.arange(len(self._places))
+        points = self._observer.points + self.postponed_shifts(everything)
+        arms = points - self._observer.A[:3, 3]
         distances = np.einsum('ij,ij->i', arms, arms)
         near = np.argpartition(distances, min(kept, len(arms)) - 1)[:kept]
         wanted = np.union1d(rows, near)
@@ -248,25 +247,30 @@ class CompressedCovariance(JointCovariance):
 
     def _switch(self, rows: IntArray) -> None:
         """Make landmarks active, and no others."""
-        self._apply()
-        self._release(self.active[~np.isin(self.active, rows)])
+        self._release(self.active[~np.isin(self.active, rows)], self._subtract())
         self._take_in(rows[self._places[rows] < 0])
         self._postponed = PostponedCorrection(self.P, self._axes.point)
-        self._shifts = None
 
     def _apply(self, tolerance_m: float = 0.5 * REFERENCE_SHIFT_M) -> None:
         """Do what is postponed; refer to present estimates if references are further off."""
+        Phi = self._subtract(tolerance_m)
+        self._outside.X = self._outside.X @ Phi.T
+        self._postponed = PostponedCorrection(self.P, self._axes.point)
+
+    def _subtract(self, tolerance_m: float = 0.5 * REFERENCE_SHIFT_M) -> FloatArray:
+        """Do the same, but X has yet to become X Φᵀ with the Φ (q, q₀) that is returned."""
         others, outside, k = self._others, self._outside, self._axes.point
-        slots = self._slots[others]
-        self._observer.a[others] += self.postponed_shifts()[others]
-        outside.apply(self._postponed.root(), self._postponed.Phi)
+        slots, Phi = self._slots[others], self._postponed.Phi
+        self._observer.a[others] += self.postponed_shifts(others)
+        outside.subtract(self._postponed.root())
+        self._unchecked = 0
         off = self._off(others)
         if np.linalg.norm(off, axis=1).max(initial=0.0) > tolerance_m:
             angles = self._p - k
             turns = self._axes.turn_matrix(off)[:, :, :angles].reshape(-1, angles)
+            outside.X, Phi = outside.X @ Phi.T, np.eye(len(Phi))
             outside.set_references(slots, self._observer.points[others], turns, self.P)
-        self._postponed = PostponedCorrection(self.P, k)
-        self._shifts, self._unchecked = None, 0
+        return Phi
 
     def _off(self, others: IntArray) -> FloatArray:
         """Return how far the observer has landmarks (m,) from their references (m, 3), metres."""
@@ -274,10 +278,8 @@ class CompressedCovariance(JointCovariance):
         off -= self._outside.references[self._slots[others]]
         return off
 
-    def _release(self, rows: IntArray) -> None:
-        """Let landmarks (m,) not be active any more."""
-        if not len(rows):
-            return
+    def _release(self, rows: IntArray, Phi: FloatArray) -> None:
+        """Let landmarks (m,) not be active any more, and X become X Φᵀ, Φ (q, q₀)."""
         outside, P, p = self._outside, self.P, self._p
         new = rows[self._slots[rows] < 0]
         self._slots = self._slots.copy()
@@ -292,9 +294,9 @@ class CompressedCovariance(JointCovariance):
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]
         own = to_x[:, columns] - to_x[:, :p] @ T.T
-        to_others = outside.X[:, columns] - outside.X[:, :p] @ T.T
+        to_others = outside.X @ (Phi[columns] - T @ Phi[:p]).T
         kept = np.delete(np.arange(len(P)), columns)
-        outside.X = outside.X[:, kept]
+        outside.X = outside.X @ Phi[kept].T
         outside.put(slots, points, to_x[:, kept], symmetric(own), to_others)
         self.P = P[np.ix_(kept, kept)]
         self._set_active(self.active[~np.isin(self.active, rows)], len(self._places))
@@ -343,7 +345,6 @@ class CompressedCovariance(JointCovariance):
         new = len(self._places) + np.arange(m)
         self._set_active(np.append(self.active, new), len(self._places) + m)
         self._slots = np.append(self._slots, np.full(m, -1))
-        self._shifts = None
         self._postponed.extend(self._stride * m)
         return new
 

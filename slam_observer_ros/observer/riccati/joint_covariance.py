@@ -75,8 +75,8 @@ class JointCovariance:
         """Return the same with all landmarks in P."""
         return self
 
-    def postponed_shifts(self) -> FloatArray:
-        """Return how far landmarks (n, 3) have yet to be moved, metres."""
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far landmarks (m, 3) have yet to be moved, metres."""
         raise NotImplementedError
 
     # The step

@@ -89,15 +89,13 @@ class OutsideLandmarks:
         rows = self.rows(slots)
         to_others[rows] = own
         self.matrix.set_columns(rows, to_others)
-        self.X = self.X.copy()
-        self.X[rows] = to_x
+        self.X[rows] = to_x  # it has just been made
         self.own, self.references = self.own.copy(), self.references.copy()
         self.own[slots], self.references[slots] = diagonal_blocks(own, self._k), points
 
-    def apply(self, F: FloatArray, Phi: FloatArray) -> None:
-        """Let B become B − X F Fᵀ Xᵀ, and X become X Φᵀ."""
+    def subtract(self, F: FloatArray) -> None:
+        """Let B become B − X F Fᵀ Xᵀ."""
         U = self.X @ F
-        self.X = self.X @ Phi.T
         self._add(U, -np.ones(U.shape[1]))
 
     def set_references(

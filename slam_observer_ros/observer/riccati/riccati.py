@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
@@ -161,18 +163,22 @@ class RiccatiFilter(Filter):
     def points(self) -> FloatArray:
         """(n, 3) estimated landmarks, reference frame, metres."""
         points = self.observer.points
-        return points if self.joint.is_dense else points + self.joint.postponed_shifts()
+        if not self.joint.is_dense:
+            points += self.joint.postponed_shifts(np.arange(len(points)))
+        return points
 
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
         if self.joint.is_dense:
             return super().expected_points(rows)
-        return self.observer.in_body_frame(self.points[rows])
+        observer = self.observer
+        points = observer.y_ref[rows] + self.translations(rows)
+        return observer.in_body_frame(points)
 
     def translations(self, rows: IntArray) -> FloatArray:
         """Return â_i (m, 3) of landmarks, metres."""
         a = super().translations(rows)
-        return a if self.joint.is_dense else a + self.joint.postponed_shifts()[rows]
+        return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
 
     def _compress(self) -> None:
         """Go on with a covariance for many landmarks, unless they move."""
