@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -66,7 +65,9 @@ def average_nees_band(
     or a planar pose), averaged over independent runs. Each limit is missed as often.
     """
     total = degrees_of_freedom * runs
-    # chdtri inverts the χ² tail. scipy.stats has it too, but takes a second to import.
+    from scipy import special  # which few runs need; scipy.stats takes a second to import
+
+    # chdtri inverts the χ² tail.
     tail = 0.5 * (1.0 - confidence)
     return (
         float(special.chdtri(total, 1.0 - tail) / total),

@@ -9,7 +9,8 @@ import math
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.replay.outcome import list_dropped, ReplayOutcome
+from slam_observer_ros.cli.replay.dropped import list_dropped
+from slam_observer_ros.cli.replay.outcome import ReplayOutcome
 from slam_observer_ros.common.digits import significant
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
