@@ -59,6 +59,8 @@ setup(
             'pytest-timeout',  # a ROS test that hangs must fail
             'hypothesis',  # the paper's lemmas are properties
             'catkin_pkg',  # reads package.xml
+            # finds the same errors in what a replay writes; GPL, so only run as a program
+            'evo; python_version >= "3.11"',
             'threadpoolctl',  # counts the threads that numpy takes
         ],
         'dev': [
