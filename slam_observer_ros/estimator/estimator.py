@@ -460,7 +460,7 @@ class Estimator:
         if isinstance(event, VelocityBlock):
             self._process_velocities(event)
             return
-        if event.stamp_ns > (self.stamp_ns or 0):
+        if self._on_stamps is not None and event.stamp_ns > (self.stamp_ns or 0):
             self._report_stamp()
         if isinstance(event, ObservationEvent):
             self._process_observation(event)
@@ -479,7 +479,8 @@ class Estimator:
         except InvalidEventError as error:
             self._drop(error)
             return
-        self._counts['velocity'] += is_used
+        if is_used:
+            self._counts['velocity'] += 1
         if is_late:
             self._counts['late_velocity'] += 1
             self._warnings.late_velocity()

@@ -188,5 +188,5 @@ def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic[Any]]) -> None:
         if name := outputs.get(source.topic):
             raise ParameterError(
                 f"the input '{source.name}' and the output '{name}' are both '{source.topic}': "
-                f'remap one of them, as with -r {name}:=observer/{name}'
+                f'remap one of them, as with -r {name}:=observer/{name.removeprefix("~/")}'
             )

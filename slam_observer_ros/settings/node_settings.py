@@ -100,6 +100,23 @@ class ObserverNodeSettings(InputSettings):
 
 
 @dataclass(frozen=True)
+class ManagedNodeSettings:
+    """What ``lifecycle_observer_node`` adds; both as Nav2's nodes have them."""
+
+    autostart_node: bool = parameter(
+        False, 'Whether the node configures and activates itself at its start'
+    )
+    bond_heartbeat_period: float = parameter(
+        0.0,
+        "Period of the bond's heartbeats to Nav2's lifecycle manager, which needs bondpy; 0 for "
+        'no bond',
+        unit='s',
+        minimum=0.0,
+        maximum=10.0,
+    )
+
+
+@dataclass(frozen=True)
 class SimulatorNodeSettings:
     """What ``simulator_node`` adds to the scenario."""
 

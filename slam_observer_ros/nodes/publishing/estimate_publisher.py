@@ -27,7 +27,15 @@ from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
-TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
+TOPICS = (
+    '~/odometry',
+    'pose',
+    'lyapunov',
+    'landmark_estimates',
+    'path',
+    'landmark_map',
+    'markers',
+)
 """Topics of the estimate, before remapping."""
 
 EARLY = 0.5
@@ -61,12 +69,12 @@ class EstimatePublisher:
         self._slow_stamp_ns: int | None = None
         self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
         self._path_stamp_ns: int | None = None
-        self._odometry = node.create_publisher(Odometry, 'odometry', RELIABLE_QOS)
+        self._odometry = node.create_publisher(Odometry, '~/odometry', RELIABLE_QOS)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', LATCHED_POSE_QOS)
         self._lyapunov = node.create_publisher(Float64, 'lyapunov', RELIABLE_QOS)
         self._estimates = node.create_publisher(PointCloud, 'landmark_estimates', RELIABLE_QOS)
         self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
-        self._map = node.create_publisher(PointCloud2, 'map', LATCHED_QOS)
+        self._map = node.create_publisher(PointCloud2, 'landmark_map', LATCHED_QOS)
         self._markers = node.create_publisher(MarkerArray, 'markers', RELIABLE_QOS)
         self._broadcaster: PoseBroadcaster | None = None
         if settings.publish_tf:
@@ -84,7 +92,7 @@ class EstimatePublisher:
 
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""
-        topic = self._node.resolve_topic_name('odometry')
+        topic = self._node.resolve_topic_name('~/odometry')
         text = rivals(topic, self._node.get_publishers_info_by_topic(topic))
         if text:
             self._log.warning(topic, text)
