@@ -17,7 +17,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy benchmark-speed venv lock \
+.PHONY: help demo test lint format pytest colcon docs benchmark benchmark-accuracy venv lock \
 	clean
 
 help:  ## list these targets
@@ -55,8 +55,9 @@ benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
 
-benchmark-speed: $(READY)  ## cost of an observation against landmarks seen and known
-	$(PYTHON_IN_VENV) benchmark/speed.py
+benchmark: $(READY)  ## what it costs, as ratios: rewrites docs/performance.md
+	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
+	$(PYTHON_IN_VENV) benchmark/performance.py --write-docs
 
 venv: $(READY)  ## only set up .venv
 

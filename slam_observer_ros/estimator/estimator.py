@@ -389,7 +389,7 @@ class Estimator:
         self._warnings.dropped(error)
 
     def _process(self, event: Event) -> None:
-        if event.stamp_ns > (self.stamp_ns or 0):
+        if self._on_stamp is not None and event.stamp_ns > (self.stamp_ns or 0):
             self._report_stamp()
         if isinstance(event, ObservationEvent):
             self._process_observation(event)
@@ -408,7 +408,8 @@ class Estimator:
         except InvalidEventError as error:
             self._drop(error)
             return
-        self._counts['velocity'] += is_used
+        if is_used:
+            self._counts['velocity'] += 1
         if is_late:
             self._counts['late_velocity'] += 1
             self._warnings.late_velocity()

@@ -10,7 +10,7 @@ from typing import TypeAlias
 from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import Event, ObservationEvent
+from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent
 
 Key: TypeAlias = tuple[int, bool, bytes]
 
@@ -116,25 +116,30 @@ class EventQueue:
         return self._events.pop_all()
 
     def _take_in_time(self, event: Event, newest_ns: int) -> None:
+        stamp_ns = event.stamp_ns
         self._events.insert(event, newest_ns - self._reach_ns)
-        self._reception.note(event)
-        self._window.note(event.stamp_ns, newest_ns)
+        if event.receive_ns is not None:
+            self._reception.note(stamp_ns, event.receive_ns)
+        self._window.note(stamp_ns, newest_ns)
         self._is_newest_of_kind(event)
-        self._strays.clear()
-        self._believe(max(newest_ns, event.stamp_ns), newest_ns)
+        if self._strays.last_ns is not None:
+            self._strays.clear()
+        self._believe(stamp_ns if stamp_ns > newest_ns else newest_ns, newest_ns)
 
     def _take_ahead(self, event: Event, newest_ns: int) -> None:
         """Keep an event far ahead; believe its stamp if enough agree."""
         self._events.insert(event, newest_ns - self._reach_ns)
         self._lead_ns = max(self._lead_ns, event.stamp_ns)
         if self._count_stray(event.stamp_ns, newest_ns):
-            self._reception.note(event)
+            if event.receive_ns is not None:
+                self._reception.note(event.stamp_ns, event.receive_ns)
             self._believe(self._lead_ns, newest_ns)
 
     def _believe(self, stamp_ns: int, newest_ns: int) -> None:
-        step_ns = stamp_ns - newest_ns
-        if step_ns > 0:
-            self._usual_ns = min(max(self._near_ns, 2 * step_ns), self._max_jump_ns)
+        twice_ns = 2 * (stamp_ns - newest_ns)
+        if twice_ns > 0:
+            usual_ns = twice_ns if twice_ns > self._near_ns else self._near_ns
+            self._usual_ns = usual_ns if usual_ns < self._max_jump_ns else self._max_jump_ns
         self.newest_ns = self._lead_ns = stamp_ns
 
     def _is_too_early(self, event: Event) -> bool:
@@ -146,11 +151,12 @@ class EventQueue:
 
     def _is_newest_of_kind(self, event: Event) -> bool:
         """Note the stamp if it is the newest of its kind; if not, that kind has gone back."""
-        kind = type(event)
-        is_newest = event.stamp_ns > self._newest_of_kind_ns.get(kind, event.stamp_ns - 1)
-        if is_newest:
-            self._newest_of_kind_ns[kind] = event.stamp_ns
-        return is_newest
+        kind, stamp_ns = type(event), event.stamp_ns
+        newest_ns = self._newest_of_kind_ns.get(kind)
+        if newest_ns is not None and stamp_ns <= newest_ns:
+            return False
+        self._newest_of_kind_ns[kind] = stamp_ns
+        return True
 
     def _is_held_up(self, event: Event) -> bool:
         """Return whether an event was received right after one that was in time."""
@@ -180,14 +186,14 @@ class _Window:
         if self._begin_ns is None:
             self._begin_ns = newest_ns
         oldest_ns = newest_ns - LATENESS_NS
-        late_ns = max(newest_ns - stamp_ns, 0)
-        while self._late and self._late[-1][1] <= late_ns:
-            self._late.pop()
-        self._late.append((newest_ns, late_ns))
-        while self._late[0][0] < oldest_ns:
-            self._late.popleft()
+        late, late_ns = self._late, newest_ns - stamp_ns if stamp_ns < newest_ns else 0
+        while late and late[-1][1] <= late_ns:
+            late.pop()
+        late.append((newest_ns, late_ns))
+        while late[0][0] < oldest_ns:
+            late.popleft()
         if self._begin_ns <= oldest_ns:
-            self.length_ns = min(LATENESS_MARGIN * self._late[0][1], self._longest_ns)
+            self.length_ns = min(LATENESS_MARGIN * late[0][1], self._longest_ns)
 
 
 class _SortedEvents:
@@ -200,19 +206,19 @@ class _SortedEvents:
 
     def insert(self, event: Event, oldest_ns: int) -> None:
         """Add an event; raise InvalidEventError if it is known. None before ``oldest_ns`` come."""
-        key = _key(event)
-        if key in self.known:
+        key, known = _key(event), self.known
+        if key in known:
             raise InvalidEventError('duplicate', 'this event is already known')
-        self.known.add(key)
+        known.add(key)
         heapq.heappush(self._heap, (key, event))
-        if len(self.known) > self._most_known:  # O(1) for each event
-            self.known = {key for key in self.known if key[0] >= oldest_ns}
+        if len(known) > self._most_known:  # O(1) for each event
+            self.known = {key for key in known if key[0] >= oldest_ns}
             self._most_known = max(2 * len(self.known), MIN_KNOWN)
 
     def pop_until(self, stamp_ns: int) -> list[Event]:
-        events = []
-        while self._heap and self._heap[0][0][0] <= stamp_ns:
-            events.append(heapq.heappop(self._heap)[1])
+        events, heap = [], self._heap
+        while heap and heap[0][0][0] <= stamp_ns:
+            events.append(heapq.heappop(heap)[1])
         return events
 
     def pop_all(self) -> list[Event]:
@@ -226,10 +232,9 @@ class _Reception:
         self._ahead_ns: deque[int] = deque(maxlen=RECENT)
         self._last_ns: int | None = None
 
-    def note(self, event: Event) -> None:
-        if event.receive_ns is not None:
-            self._ahead_ns.append(event.stamp_ns - event.receive_ns)
-            self._last_ns = event.receive_ns
+    def note(self, stamp_ns: int, receive_ns: int) -> None:
+        self._ahead_ns.append(stamp_ns - receive_ns)
+        self._last_ns = receive_ns
 
     def expected_ns(self, event: Event) -> int | None:
         """Return the newest stamp that can be received when this event was; None if unknown."""
@@ -246,7 +251,8 @@ class _Reception:
 
 def _key(event: Event) -> Key:
     if not isinstance(event, ObservationEvent):
-        return event.stamp_ns, False, type(event).__name__.encode()
+        is_angular = isinstance(event, AngularVelocityEvent)
+        return event.stamp_ns, False, b'angular' if is_angular else b'linear'
     # Keys outlive their events, which may be clouds of many points.
     content = event.ids.tobytes() + event.points.tobytes()
     return event.stamp_ns, True, blake2b(content, digest_size=16).digest()

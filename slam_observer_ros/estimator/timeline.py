@@ -65,7 +65,8 @@ class Timeline:
 
     def _note_stamp(self, stamp_ns: int) -> int:
         """Note the stamp of an event that is about to be used; return ``state_ns``."""
-        self.stamp_ns = max(stamp_ns, self.stamp_ns or stamp_ns)
+        if self.stamp_ns is None or stamp_ns > self.stamp_ns:
+            self.stamp_ns = stamp_ns
         if self.state_ns is None:
             self.state_ns = stamp_ns
         return self.state_ns
@@ -78,17 +79,18 @@ class Timeline:
         velocity of its kind was used before it (``'too_late'``).
         """
         # Each kind in stamp order, and none before what is already in force.
-        kind = type(event)
-        if event.stamp_ns < self._newest_ns.get(kind, 0):
+        kind, stamp_ns = type(event), event.stamp_ns
+        if stamp_ns < self._newest_ns.get(kind, 0):
             raise InvalidEventError('too_late', 'a newer velocity was already used')
-        self._newest_ns[kind] = event.stamp_ns
-        if self.is_late(event):
-            event = replace(event, stamp_ns=self._in_force_ns)
+        self._newest_ns[kind] = stamp_ns
+        if stamp_ns < self._in_force_ns:
+            stamp_ns = self._in_force_ns
+            event = replace(event, stamp_ns=stamp_ns)
         if not self.velocities.append(event):
             return False
         # In force from now on; the state follows at the next observation, or after many.
-        self._in_force_ns = event.stamp_ns
-        self._note_stamp(event.stamp_ns)
+        self._in_force_ns = stamp_ns
+        self._note_stamp(stamp_ns)
         self._pending += 1
         if self._pending >= MAX_PENDING_VELOCITIES:
             # No further: the stamp of an observation without points may be ahead of velocities.

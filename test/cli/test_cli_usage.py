@@ -200,7 +200,7 @@ def test_interrupted_while_modules_load(tmp_path, module):
         (['--help'], {'numpy', 'scipy', 'matplotlib', 'rosbags', 'mcap'}),
         (['--version'], {'numpy', 'scipy', 'matplotlib', 'rosbags', 'mcap'}),
         (['convert', '--help'], {'matplotlib'}),
-        (['replay', '--help'], {'matplotlib'}),
+        (['replay', '--help'], {'matplotlib', 'scipy.spatial', 'rosbags.rosbag1'}),
         (['simulate', '--duration', '1', '--json'], {'matplotlib'}),
     ],
 )

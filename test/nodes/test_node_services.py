@@ -249,7 +249,7 @@ def test_diagnostics_report_rates_ages_drops_and_times(ros, tmp_path):
         assert float(values['processing time, mean [ms]']) > 0.0
         assert int(values['used: observation']) > 5
         assert values['calibration: velocity_delay'].endswith(' s')
-        assert values['calibration: angular_bias_z'].endswith(' rad/s')
+        assert values['calibration: angular_bias_z'].endswith(' °/s')
         now_ns = time.time_ns()
         twins = np.array([7, 7]), np.ones((2, 3))
         diagnostics.wait(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.cli.replay.outcome import list_dropped, unused_messages
+from slam_observer_ros.cli.replay.dropped import list_dropped, unused_messages
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
