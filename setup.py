@@ -53,6 +53,7 @@ setup(
             'rich',  # live progress and tables in the terminal
             'argcomplete',  # completion in the shell
         ],
+        'cluster': ['distributed'],  # runs a batch on the machines of a Dask cluster
         # A ROS installation brings these itself, so nothing here may come with the package.
         **{f'ros-{ros}': [f'ros-{ros}-{wheel}' for wheel in ROS_WHEELS] for ros in ROS_RELEASES},
         'test': [
