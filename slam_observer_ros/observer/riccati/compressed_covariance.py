@@ -15,6 +15,8 @@ from copy import copy, deepcopy
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose, with_blocks
@@ -65,7 +67,7 @@ class CompressedCovariance(JointCovariance):
     def __deepcopy__(self, memo: dict[int, object]) -> CompressedCovariance:
         """Return an independent copy, which shares what takes much memory until it changes."""
         other = copy(self)
-        other.P, other._observer = self.P.copy(), deepcopy(self._observer, memo)
+        other.P, other._observer = self.P, deepcopy(self._observer, memo)
         other._outside, other._postponed = self._outside.copy(), deepcopy(self._postponed, memo)
         return other
 
@@ -87,15 +89,15 @@ class CompressedCovariance(JointCovariance):
 
     def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
         """Update P and return the error x of pose, calibration and active landmarks."""
-        columns = self._columns(rows)
         HP, HPH = self.project(C, rows)
-        S = with_blocks(HPH, R)
-        Phi = self._postponed.Phi
-        H_Phi = C.reshape(-1, self._p) @ Phi[: self._p] - Phi[columns]
-        K = self.update(HP, S)
-        x: FloatArray = -K @ r.ravel()
-        turn = self._axes.full_pose(x[: self._p])[:3]
-        self._postponed.correct(H_Phi, K, S, r.ravel(), turn)
+        postponed, p = self._postponed, self._p
+        H_Phi = C.reshape(-1, p) @ postponed.Phi[:p] - postponed.Phi[self._columns(rows)]
+        # L⁻¹ of all that is multiplied by S⁻¹ = L⁻ᵀ L⁻¹.
+        whitened = _whitened(with_blocks(HPH, R), np.column_stack([HP, H_Phi, r.ravel()]))
+        W, W_Phi, z = np.split(whitened, [len(self.P), whitened.shape[1] - 1], axis=1)
+        self._matrix.subtract_square(W)
+        x: FloatArray = -W.T @ z[:, 0]
+        postponed.correct(W, W_Phi, z[:, 0], self._axes.full_pose(x[:p])[:3])
         self._outside.matrix.fold(FOLDING)
         return x
 
@@ -350,3 +352,14 @@ class CompressedCovariance(JointCovariance):
 
     def _columns(self, rows: IntArray) -> IntArray:
         return super()._columns(self._places[rows])
+
+
+def _whitened(S: FloatArray, right: FloatArray) -> FloatArray:
+    """Return L⁻¹ b for b (m, …) and S = L Lᵀ (m, m); without the null space of a singular S."""
+    L, is_indefinite = dpotrf(S, lower=1)
+    if is_indefinite:  # by rounding, where all but nothing was known
+        variances, V = np.linalg.eigh(S)
+        known = variances > np.finfo(np.float64).eps * variances[-1]
+        whitened: FloatArray = (V[:, known] / np.sqrt(variances[known])).T @ right
+        return whitened
+    return np.asarray(dtrsm(1.0, L, right, lower=1))

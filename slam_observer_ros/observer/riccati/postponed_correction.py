@@ -20,7 +20,6 @@ from scipy.linalg.lapack import dpstrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.matrices import solve
 
 
 class PostponedCorrection:
@@ -35,17 +34,14 @@ class PostponedCorrection:
         self.has_moved = False
         self._deviations = np.sqrt(np.maximum(np.diagonal(P), 0.0))
 
-    def correct(
-        self, H_Phi: FloatArray, K: FloatArray, S: FloatArray, r: FloatArray, turn: FloatArray
-    ) -> None:
-        """Take in a correction by residuals r (m,), which turned the state by ``turn`` (3,), rad.
+    def correct(self, W: FloatArray, W_Phi: FloatArray, z: FloatArray, turn: FloatArray) -> None:
+        """Take in a correction which turned the state by ``turn`` (3,), rad.
 
-        H Φ (m, q₀), the gain K (q, m) and S (m, m) are those of the correction.
+        With S = L Lᵀ it is given by L⁻¹ H P (m, q), L⁻¹ H Φ (m, q₀) and L⁻¹ r (m,).
         """
-        S_inv = solve(S, np.column_stack([H_Phi, r]))
-        self.Phi -= K @ H_Phi
-        self.Psi += H_Phi.T @ S_inv[:, :-1]
-        k, g = len(self.turn), H_Phi.T @ S_inv[:, -1]
+        self.Phi -= W.T @ W_Phi
+        self.Psi += W_Phi.T @ W_Phi
+        k, g = len(self.turn), W_Phi.T @ z
         D, J = so3.exp(turn)[:k, :k], so3.left_jacobian(turn)[:k, :k]
         self.turn = D @ self.turn
         self.shift = (D @ self.shift.reshape(k, -1)).reshape(self.shift.shape)
