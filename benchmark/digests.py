@@ -19,10 +19,10 @@ import time
 
 import numpy as np
 import outliers
+from threadpoolctl import threadpool_limits
 import worlds
 from worlds import World
 
-from slam_observer_ros.common.threads import use_one_thread
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument('--save', type=Path, metavar='DIR', help='keep all estimates in DIR')
     parser.add_argument('--compare', type=Path, metavar='DIR', help='compare with those in DIR')
     args = parser.parse_args()
-    use_one_thread()
+    threadpool_limits(1)
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
     total_s = 0.0
     for name, run in runs():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 
@@ -35,6 +34,8 @@ class FieldOfView:
 
     def include(self, points: FloatArray) -> None:
         """Add points (m, 3) that were seen, metres, body frame."""
+        from scipy.spatial import ConvexHull, QhullError  # which only points without ids need
+
         k = self.corners.shape[1]
         known = self.contains(points) & self.is_known
         if known.all():

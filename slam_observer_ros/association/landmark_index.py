@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from scipy.spatial import cKDTree
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 
@@ -20,7 +21,7 @@ class LandmarkIndex:
 
     def __init__(self) -> None:
         self._built: FloatArray = np.empty((0, 3))
-        self._tree = cKDTree(self._built)
+        self._tree: Any = None  # before the first search
 
     def near(
         self, landmarks: FloatArray, points: FloatArray, radii_m: FloatArray
@@ -40,8 +41,10 @@ class LandmarkIndex:
     def _refresh(self, landmarks: FloatArray, tolerance_m: float) -> float:
         """Build the tree again if it is too old; return the largest shift since it was built."""
         shift_m = self._shift_m(landmarks)
-        if shift_m <= tolerance_m:
+        if self._tree is not None and shift_m <= tolerance_m:
             return shift_m
+        from scipy.spatial import cKDTree  # which only points without ids need
+
         self._built = landmarks.copy()
         self._tree = cKDTree(self._built)
         return 0.0

@@ -7,18 +7,16 @@ from contextlib import contextmanager
 import json
 import logging
 import sys
+import threading
 from typing import TypeVar
 
-from rich.console import Console
-from rich.progress import track
-
-from slam_observer_ros.common.tables import table_of
+from slam_observer_ros.cli.interrupts import leaving_at_once
 
 PROGRAM = 'slam-observer'
 
-_Item = TypeVar('_Item')
+_FOREVER_S = 1e9
 
-_stderr = Console(stderr=True, highlight=False)
+_Item = TypeVar('_Item')
 
 
 class MessageHandler(logging.Handler):
@@ -35,10 +33,12 @@ class _Keeper(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.warnings: list[str] = []
+        self._thread = threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep one record."""
-        self.warnings.append(' '.join(record.getMessage().split()))
+        """Keep one record, unless another thread's run gave it."""
+        if record.thread == self._thread:
+            self.warnings.append(' '.join(record.getMessage().split()))
 
 
 @contextmanager
@@ -54,20 +54,57 @@ def kept_warnings() -> Iterator[list[str]]:
 
 def show_message(kind: str, text: str) -> None:
     """Write ``slam-observer: kind: text`` to standard error, above any progress bar."""
-    line = f'{PROGRAM}: {kind}: {" ".join(text.split())}'
-    _stderr.print(line, markup=False, soft_wrap=True)
+    if sys.stderr is not None:  # a shell may have closed it
+        sys.stderr.write(f'{PROGRAM}: {kind}: {" ".join(text.split())}\n')
 
 
 def show_progress(items: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
     """Pass items on, with a progress bar on standard error where that is a terminal."""
+    with leaving_at_once():
+        from rich.console import Console
+        from rich.progress import track
+
+    console = Console(stderr=True, highlight=False)
     yield from track(
         items,
         description,
         total=total,
-        console=_stderr,
+        console=console,
         transient=True,
-        disable=not _stderr.is_terminal,
+        disable=not console.is_terminal,
     )
+
+
+def show_runs(runs: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
+    """Pass on what takes long each, with how many there were and the time left, on a terminal."""
+    with leaving_at_once():
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+    console = Console(stderr=True, highlight=False)
+    columns = (
+        TextColumn('{task.description}'),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    # Each may take minutes: the time left is judged by all of them, not by the last 30 seconds.
+    with Progress(
+        *columns,
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        speed_estimate_period=_FOREVER_S,
+    ) as progress:
+        yield from progress.track(runs, total, description=description)
 
 
 def print_json(result: Mapping[str, object]) -> None:
@@ -77,4 +114,9 @@ def print_json(result: Mapping[str, object]) -> None:
 
 def print_table(title: str, rows: Mapping[str, str]) -> None:
     """Print names and values on standard output."""
+    with leaving_at_once():
+        from rich.console import Console
+
+        from slam_observer_ros.common.tables import table_of
+
     Console(highlight=False, markup=False).print(table_of(title, rows))

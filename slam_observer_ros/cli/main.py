@@ -1,4 +1,5 @@
 """The ``slam-observer`` command: the observer on simulations and recordings, without ROS."""
+# PYTHON_ARGCOMPLETE_OK (argcomplete looks for these words where it completes all programs)
 
 from __future__ import annotations
 
@@ -16,23 +17,33 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
+    from slam_observer_ros.cli.completion import complete, typed_words
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
-    from slam_observer_ros.common.errors import LossError, SlamObserverError
+    from slam_observer_ros.common.errors import IncompleteError, LossError, SlamObserverError
     from slam_observer_ros.common.threads import use_one_thread
     from slam_observer_ros.common.version import VERSION
     from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2
 EXIT_LOSS = 3
+EXIT_INCOMPLETE = 4
 EXIT_SIGNAL = 128
 """To which the number of the signal that ended the program is added, as shells do."""
+
+EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EXIT_INCOMPLETE}
 
 COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
     'replay': ('replay.command', 'run a recording through the observer'),
+    'config': ('config', 'show parameter files, and what can be in them'),
+    'doctor': ('doctor', 'say what is installed, and what a node would hear'),
+    'batch': ('batch.command', 'run many recordings with many settings'),
 }
 """The module of each command, and what it does; only the one that is given is imported."""
+
+OPTIONAL_PACKAGES = ('rosbags', 'mcap', 'matplotlib', 'rich', 'argcomplete')
+"""What the extra ``cli`` of setup.py installs: a robot that only runs a node does without."""
 
 EXAMPLES = """\
 examples:
@@ -95,8 +106,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
         words = sys.argv[1:] if arguments is None else arguments
-        args = make_parser(words).parse_args(words)
+        if (typed := typed_words(os.environ)) is not None:
+            complete(make_parser(typed))
         use_one_thread()
+        args = make_parser(words).parse_args(words)
         # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
         signal.signal(signal.SIGTERM, lambda number, _stack: sys.exit(EXIT_SIGNAL + number))
         args.run(args)
@@ -105,10 +118,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError):
             return _leave_broken_pipe()
         show_message('error', str(error))
-        return EXIT_LOSS if isinstance(error, LossError) else EXIT_ERROR
+        return EXIT_OF.get(type(error), EXIT_ERROR)
+    except ModuleNotFoundError as error:
+        _explain_missing(error)
+        return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_SIGNAL + signal.SIGINT
     return 0
+
+
+def _explain_missing(error: ModuleNotFoundError) -> None:
+    """Show how a package comes that only the command line needs; raise for any other one."""
+    package = (error.name or '').partition('.')[0]
+    if package not in OPTIONAL_PACKAGES:
+        raise error
+    needed = ' '.join(OPTIONAL_PACKAGES)
+    show_message(
+        'error', f"{package} is not installed: 'pip install {needed}' brings what is used"
+    )
 
 
 def _leave_broken_pipe() -> int:

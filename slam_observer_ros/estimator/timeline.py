@@ -9,7 +9,13 @@ from typing import Protocol, TypeAlias
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns, to_s
-from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    VelocityBlock,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition
@@ -65,7 +71,8 @@ class Timeline:
 
     def _note_stamp(self, stamp_ns: int) -> int:
         """Note the stamp of an event that is about to be used; return ``state_ns``."""
-        self.stamp_ns = max(stamp_ns, self.stamp_ns or stamp_ns)
+        if self.stamp_ns is None or stamp_ns > self.stamp_ns:
+            self.stamp_ns = stamp_ns
         if self.state_ns is None:
             self.state_ns = stamp_ns
         return self.state_ns
@@ -78,22 +85,46 @@ class Timeline:
         velocity of its kind was used before it (``'too_late'``).
         """
         # Each kind in stamp order, and none before what is already in force.
-        kind = type(event)
-        if event.stamp_ns < self._newest_ns.get(kind, 0):
+        kind, stamp_ns = type(event), event.stamp_ns
+        if stamp_ns < self._newest_ns.get(kind, 0):
             raise InvalidEventError('too_late', 'a newer velocity was already used')
-        self._newest_ns[kind] = event.stamp_ns
-        if self.is_late(event):
-            event = replace(event, stamp_ns=self._in_force_ns)
+        self._newest_ns[kind] = stamp_ns
+        if stamp_ns < self._in_force_ns:
+            stamp_ns = self._in_force_ns
+            event = replace(event, stamp_ns=stamp_ns)
         if not self.velocities.append(event):
             return False
         # In force from now on; the state follows at the next observation, or after many.
-        self._in_force_ns = event.stamp_ns
-        self._note_stamp(event.stamp_ns)
+        self._in_force_ns = stamp_ns
+        self._note_stamp(stamp_ns)
         self._pending += 1
+        self.advance_after_many()
+        return True
+
+    def takes(self, velocities: VelocityBlock) -> bool:
+        """Return whether the velocities are newer than all that was used, of one sensor alone."""
+        newest_ns = max(self.stamp_ns or -1, self._in_force_ns - 1)
+        return bool(velocities.stamps_ns[0] > newest_ns) and self.velocities.is_of_one_sensor
+
+    @property
+    def room(self) -> int:
+        """How many velocities can be added before the hypotheses are moved on."""
+        return MAX_PENDING_VELOCITIES - self._pending
+
+    def append_velocities(self, velocities: VelocityBlock) -> None:
+        """Add velocities that it :meth:`takes`, no more than there is :attr:`room` for."""
+        first_ns, last_ns = velocities.stamps_ns[[0, -1]].tolist()
+        self.velocities.append_velocities(velocities)
+        self._note_stamp(first_ns)
+        self._note_stamp(last_ns)
+        self._newest_ns[VelocityEvent] = self._in_force_ns = last_ns
+        self._pending += len(velocities)
+
+    def advance_after_many(self) -> None:
+        """Move the hypotheses on without an observation if many velocities wait for one."""
         if self._pending >= MAX_PENDING_VELOCITIES:
             # No further: the stamp of an observation without points may be ahead of velocities.
             self._advance(self._in_force_ns)
-        return True
 
     @property
     def body_velocity(self) -> FloatArray | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry import se3
@@ -75,7 +74,9 @@ def find_transform(
 
 def _improbable(degrees_of_freedom: int) -> float:
     """Return the χ² that is as improbable as ``CONTRADICTION_SIGMAS``."""
-    # scipy.stats has it too, but takes a second to import, at the start of each node.
+    # scipy.stats has it too, but takes a second to import.
+    from scipy import special  # which few runs need
+
     both_tails = 2.0 * special.ndtr(-CONTRADICTION_SIGMAS)
     return float(special.chdtri(degrees_of_freedom, both_tails))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from functools import cache
 import importlib
+import os
 from typing import Any
 
 from slam_observer_ros.common.errors import ParameterError
@@ -19,9 +20,14 @@ def message_class(type_name: str) -> Any:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except ImportError as error:
         raise ParameterError(
-            f'{type_name} needs the package {package}: '
-            f'apt install ros-jazzy-{package.replace("_", "-")}'
+            f'{type_name} needs the package {package}: {install_command(package)}'
         ) from error
+
+
+def install_command(package: str) -> str:
+    """Return how a package of the ROS distribution at hand is installed."""
+    distribution = os.environ.get('ROS_DISTRO', '$ROS_DISTRO')  # a shell puts it in, too
+    return f'apt install ros-{distribution}-{package.replace("_", "-")}'
 
 
 MESSAGES = OutgoingMessages(message_class, lambda data: array('B', data))

@@ -16,7 +16,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.common.threads import use_one_thread
 from slam_observer_ros.nodes.stop_signal import StopSignal
 
 REFUSALS = (SlamObserverError, InvalidParameterValueException, InvalidParameterTypeException)
@@ -48,7 +47,6 @@ def run(
     for signals since the process began. The exit code that is returned is 0 after a clean stop, 1
     if something could not be saved at the end, 2 where ROS or the node refused to start.
     """
-    use_one_thread()
     stop = StopSignal() if stop is None else stop
     stop.begin()
     try:

@@ -8,7 +8,7 @@ import dataclasses
 import logging
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from slam_observer_ros.common.errors import MessageError, RecordingError
 from slam_observer_ros.common.types import FloatArray
@@ -35,9 +35,11 @@ from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
 from slam_observer_ros.recording.sources import Loss, RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
-from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
+
+if TYPE_CHECKING:
+    from slam_observer_ros.recording.writer import RecordingWriter
 
 logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')

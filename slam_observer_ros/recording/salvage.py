@@ -9,11 +9,10 @@ import mmap
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
-from rosbags.typesys import get_typestore, Stores
-
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.recording.ros1 import Ros1Messages
 from slam_observer_ros.recording.sources import Loss, MessageSource, RawMessage, Topic
 
 
@@ -55,7 +54,7 @@ class SalvagedSource:
 
     def __init__(self, path: Path, scan: Scan) -> None:
         self._path, self._scan = path, scan
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._ros1 = Ros1Messages()
         self._channels: dict[int, FoundChannel] = {}
         self._disorder_ns = 0
         self.start_ns = self.end_ns = 0
@@ -129,10 +128,10 @@ class SalvagedSource:
         channel = self._channels[found.channel]
         if channel.encoding == 'cdr':
             return found.data
-        if channel.message_type not in self._typestore.types:
-            raise RecordingError(f'messages of type {channel.message_type} are read of ROS 2 only')
         try:
-            return self._typestore.ros1_to_cdr(bytes(found.data), channel.message_type)
+            return self._ros1.to_cdr(bytes(found.data), channel.message_type)
+        except RecordingError:
+            raise
         except Exception:  # noqa: BLE001 (no list of what rosbags raises is complete)
             return b''  # which is counted as malformed
 

@@ -8,14 +8,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import heapq
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TYPE_CHECKING
 
-from rosbags import rosbag1, rosbag2
+from rosbags import rosbag2
 from rosbags.interfaces import Connection
-from rosbags.typesys import get_typestore, Stores
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.messages.cdr import Buffer
+from slam_observer_ros.recording.ros1 import Ros1Messages
+
+if TYPE_CHECKING:
+    from rosbags import rosbag1
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,10 +113,9 @@ class BagSource:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._is_ros1 = path.suffix == '.bag'
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._ros1 = Ros1Messages() if path.suffix == '.bag' else None
         with _damage_reported(path):
-            self._reader = rosbag1.Reader(path) if self._is_ros1 else rosbag2.Reader(path)
+            self._reader = _reader_of(path)
             self._reader.open()
         counts: Counter[tuple[str, str]] = Counter()
         for connection in self._reader.connections:
@@ -141,11 +143,15 @@ class BagSource:
         return self._topics[connection.topic, connection.msgtype]
 
     def _cdr(self, connection: Connection, data: bytes) -> Buffer:
-        if not self._is_ros1:
-            return data
-        if connection.msgtype not in self._typestore.types:
-            raise RecordingError(f'messages of type {connection.msgtype} are read of ROS 2 only')
-        return self._typestore.ros1_to_cdr(data, connection.msgtype)
+        return data if self._ros1 is None else self._ros1.to_cdr(data, connection.msgtype)
+
+
+def _reader_of(path: Path) -> rosbag1.Reader | rosbag2.Reader:
+    if path.suffix != '.bag':
+        return rosbag2.Reader(path)
+    from rosbags import rosbag1  # which few recordings need
+
+    return rosbag1.Reader(path)
 
 
 class SplitSource:

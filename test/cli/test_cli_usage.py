@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 
+from absent_packages import program_without
 from command_line import CommandLine
 import pytest
 import recordings
@@ -75,7 +76,7 @@ def test_a_former_name_of_a_parameter_is_refused_with_the_new_one(
         ('replay nothing.mcap --jsn', "'--json'?; see 'slam-observer replay --help'"),
         ('replay nothing.mcap --gain constant', "--gain constant; did you mean '--gains'?"),
         ('replay nothing.mcap --gains best', "--gains: invalid choice: 'best'"),
-        ('replay nothing.mcap --config nowhere', 'come with the package: observer, stereo_'),
+        ('replay nothing.mcap --config nowhere', 'come with the package: apriltags, observer'),
         (
             'replay nothing.mcap --config nowhere/a.yaml',
             "can't read parameter file nowhere/a.yaml",
@@ -199,7 +200,7 @@ def test_interrupted_while_modules_load(tmp_path, module):
         (['--help'], {'numpy', 'scipy', 'matplotlib', 'rosbags', 'mcap'}),
         (['--version'], {'numpy', 'scipy', 'matplotlib', 'rosbags', 'mcap'}),
         (['convert', '--help'], {'matplotlib'}),
-        (['replay', '--help'], {'matplotlib'}),
+        (['replay', '--help'], {'matplotlib', 'scipy.spatial', 'rosbags.rosbag1'}),
         (['simulate', '--duration', '1', '--json'], {'matplotlib'}),
     ],
 )
@@ -219,6 +220,23 @@ def test_what_is_not_needed_is_not_imported(arguments, unneeded):
     )
     assert ended.stdout
     assert not unneeded & set(ended.stderr.split())
+
+
+@pytest.mark.parametrize('absent', ['rosbags', 'rich'])
+def test_what_only_the_command_line_needs_is_named_when_missing(tmp_path, absent):
+    program = program_without([absent], 'slam_observer_ros.cli.main', tmp_path)
+    ended = subprocess.run(
+        [sys.executable, program, *('replay', 'samples/sample.mcap')],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
+    assert f'{absent} is not installed' in line
+    assert 'pip install rosbags mcap matplotlib rich' in line
 
 
 def test_reader_that_leaves_early():

@@ -12,8 +12,10 @@ import sys
 from catkin_pkg.package import parse_package
 import pytest
 import setuptools  # noqa: F401 (provides distutils)
+import yaml
 
 import slam_observer_ros
+from slam_observer_ros.cli.main import OPTIONAL_PACKAGES
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 NAME = 'slam_observer_ros'
@@ -60,6 +62,40 @@ def test_manifest_names_all_message_packages_that_are_imported():
     sources = (CHECKOUT / NAME).rglob('*.py')
     imported = {name for source in sources for name in imports.findall(source.read_text())}
     assert imported <= {dependency.name for dependency in MANIFEST.exec_depends}
+
+
+def test_a_robot_needs_only_debian_packages_and_the_command_line_can_be_asked_for():
+    manifest = parse_package(CHECKOUT / 'package.xml')
+    needed = {}
+    for asked_for in ('', 'yes'):
+        manifest.evaluate_conditions({'SLAM_OBSERVER_CLI': asked_for})
+        needed[asked_for] = {d.name for d in manifest.exec_depends if d.evaluated_condition}
+    debian = {'python3-argcomplete', 'python3-matplotlib', 'python3-rich', 'rviz2'}
+    assert needed['yes'] - needed[''] == {*debian, 'python3-rosbags-pip', 'mcap-ros2-support'}
+    assert not [name for name in needed[''] if name.endswith('-pip')]
+    setup = run_setup(str(CHECKOUT / 'setup.py'), stop_after='init')
+    names = {re.split('[><=]', requirement)[0] for requirement in setup.extras_require['cli']}
+    assert names == set(OPTIONAL_PACKAGES)
+
+
+@pytest.mark.parametrize('name', ['.github/workflows/ci.yml', '.pre-commit-config.yaml'])
+def test_what_others_run_names_targets_that_exist(name):
+    text = (CHECKOUT / name).read_text()
+    targets = re.findall(r'^([a-z-]+):', (CHECKOUT / 'Makefile').read_text(), re.MULTILINE)
+    named = set(re.findall(r'\bmake ([a-z-]+)', text))
+    assert named
+    assert named <= set(targets)
+    assert yaml.safe_load(text)
+
+
+def test_all_distributions_and_middlewares_are_tried():
+    jobs = yaml.safe_load((CHECKOUT / '.github/workflows/ci.yml').read_text())['jobs']
+    matrix = jobs['ros']['strategy']['matrix']
+    assert {'jazzy', 'kilted', 'lyrical'} <= set(matrix['distribution'])
+    assert {'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp', 'rmw_zenoh_cpp'} == set(matrix['rmw'])
+    setup = run_setup(str(CHECKOUT / 'setup.py'), stop_after='init')
+    wheels = jobs['wheels']['strategy']['matrix']['ros']
+    assert {f'ros-{name}' for name in wheels} <= set(setup.extras_require)
 
 
 def test_launch_config_and_rviz_files_are_installed(monkeypatch):

@@ -12,12 +12,10 @@ import pytest
 from slam_observer_ros.common.threads import CHOICES
 
 NODE = """
-from slam_observer_ros.common.errors import SlamObserverError
-from slam_observer_ros.nodes import plain_observer
-from slam_observer_ros.nodes.runner import run
-def refuse():
-    raise SlamObserverError('this node does not start')
-run(refuse, [])
+import sys
+sys.argv = ['observer_node', '--help']
+from slam_observer_ros.nodes.observer_node import main
+main()
 """
 COMMAND = """
 from slam_observer_ros.cli.main import main

@@ -3,51 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from dataclasses import replace
-import logging
 from pathlib import Path
 
-from slam_observer_ros.cli.console import kept_warnings, print_json, show_progress
-from slam_observer_ros.cli.options import add_settings_options, read_settings
+from slam_observer_ros.cli.console import kept_warnings, print_json
+from slam_observer_ros.cli.options import add_settings_options
 from slam_observer_ros.cli.outputs import add_force_option, add_result_options
-from slam_observer_ros.cli.replay.estimate_recording import (
-    add_recording_options,
-    estimate_writer,
-)
+from slam_observer_ros.cli.replay.asked import add_run_options, read_asked
+from slam_observer_ros.cli.replay.estimate_recording import add_recording_options
 from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
-from slam_observer_ros.cli.replay.identity import identity
-from slam_observer_ros.cli.replay.input_options import (
-    add_input_options,
-    check_frames,
-    INPUT_NAMES,
-    INSTEAD,
-    read_inputs,
-    topic_names,
-    warn_of_unused,
-    with_base_frame,
-)
-from slam_observer_ros.cli.replay.outcome import outcome_of, ReplayOutcome, with_smoothed
-from slam_observer_ros.cli.replay.outcome_checks import (
-    check_localised,
-    check_used,
-    warn_of_input,
-    warn_of_resets,
-)
+from slam_observer_ros.cli.replay.identity import identity, sha256_of
+from slam_observer_ros.cli.replay.outcome import ReplayOutcome
+from slam_observer_ros.cli.replay.run import replayed
 from slam_observer_ros.cli.replay.summary import as_json, print_summary, summary_rows
-from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
-from slam_observer_ros.common.errors import LossError, OutputError, UsageError
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_map
-from slam_observer_ros.observer.designs import DESIGNS
-from slam_observer_ros.recording.reader import Recording
-from slam_observer_ros.runs.recorder import NisTally, RunRecorder
-from slam_observer_ros.runs.replay import replay
-from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.common.errors import LossError, OutputError
 from slam_observer_ros.settings.input_settings import InputSettings
-from slam_observer_ros.settings.parameter_table import Value
-
-logger = logging.getLogger(__name__)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -62,20 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar='RECORDING',
         help='.mcap, .db3 or ROS 1 .bag file, or rosbag2 directory',
     )
-    add_input_options(parser)
-    parser.add_argument(
-        '--load-map',
-        type=Path,
-        metavar='FILE',
-        help='known landmarks, as --map writes them: the estimate is then in their frame, and has '
-        'no ANEES of the pose (nor of the configuration, if they are fixed)',
-    )
-    parser.add_argument(
-        '--smooth',
-        action='store_true',
-        help='estimate trajectory and map from all observations together, too; --tum and --map '
-        'then write these',
-    )
+    add_run_options(parser)
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument(
         '--tum',
@@ -106,90 +63,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Replay a recording, and write what was asked for."""
-    defaults = {'smoothing_window': 0} if args.smooth else {}
     with kept_warnings() as warnings:
-        outcome, map_frame = _outcome(args, defaults)
+        asked = read_asked(args)
+        check_files(args)
+        outcome, map_frame = replayed(args, asked)
     _write_and_print(args, replace(outcome, warnings=warnings), map_frame)
-
-
-def _outcome(args: argparse.Namespace, defaults: Mapping[str, Value]) -> tuple[ReplayOutcome, str]:
-    """Read what is asked for and replay; return what came of it, and the frame of outputs."""
-    settings = read_settings(args, INPUT_NAMES, INSTEAD, **defaults)
-    inputs = read_inputs(args)
-    if args.smooth and not DESIGNS[settings.gains].has_joint_covariance:
-        raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
-    check_files(args)
-    warn_of_unused(args, settings)
-    landmark_map = None if args.load_map is None else read_map(args.load_map)
-    outcome = _replay(args, settings, inputs, landmark_map)
-    return outcome, _frame_of_outputs(inputs, landmark_map)
-
-
-def _replay(
-    args: argparse.Namespace,
-    settings: Settings,
-    inputs: InputSettings,
-    landmark_map: LandmarkMap | None,
-) -> ReplayOutcome:
-    """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
-    with Recording(args.recording) as recording:
-        if recording.warning:
-            logger.warning('%s', recording.warning)
-        selected = recording.find_topics(topic_names(args), inputs)
-        inputs = with_base_frame(inputs, recording, selected)
-        check_frames(inputs)
-        truth = recording.truth(selected, inputs.base_frame)
-        truth = truth.flattened() if settings.two_d_mode else truth
-        events = show_progress(
-            recording.events(selected, inputs, settings.velocity_timeout),
-            'replaying',
-            recording.event_count(selected),
-        )
-        recorder = _recorder(args)
-        map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
-        is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
-        needs_poses = is_drawn or len(truth.stamps_ns) > 0
-        with estimate_writer(args, recording, selected, inputs, map_frame) as writer:
-            recorders = [noter for noter in (recorder, writer) if noter is not None]
-            result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
-            warn_of_resets(result)
-            check_used(args, recording, selected, inputs, result)
-            if landmark_map is not None:
-                check_localised(args, result, landmark_map)
-            outcome = outcome_of(recording, selected, result, truth)
-            if writer is not None:
-                writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
-        warn_of_input(recording, selected, result)
-        warn_of_timing(recording, selected)
-    if recorder is not None:
-        outcome = replace(outcome, recorder=recorder)
-    return with_smoothed(outcome) if args.smooth else outcome
-
-
-def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
-    if args.report is not None:
-        return RunRecorder()
-    return NisTally() if args.json else None
-
-
-def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
-    """Return the frame of what is written: that of the map that was loaded, if one was."""
-    if landmark_map is None or landmark_map.frame_id == inputs.map_frame:
-        return inputs.map_frame
-    logger.warning(
-        "The map is in frame '%s', and so is what is written; the node takes it with "
-        'map_frame: %s only.',
-        landmark_map.frame_id,
-        landmark_map.frame_id,
-    )
-    return landmark_map.frame_id
 
 
 def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
     """Write and print all that can be, and only then say what could not be written."""
     written, errors = write_files(args, outcome, map_frame, summary_rows(outcome))
     if args.json:
-        print_json(identity(args.recording, outcome) | as_json(outcome))
+        sha256 = sha256_of(args.recording)
+        print_json(identity(args.recording, sha256, outcome) | as_json(outcome))
     else:
         print_summary(args.recording, outcome, written)
     if errors:

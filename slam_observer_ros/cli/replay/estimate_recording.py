@@ -6,15 +6,18 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 import logging
+from typing import TYPE_CHECKING
 
 from slam_observer_ros.cli.outputs import recording_path
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
-from slam_observer_ros.recording.writer import RecordingWriter
-from slam_observer_ros.runs.estimate_writer import EstimateWriter, TOPICS
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+if TYPE_CHECKING:
+    from slam_observer_ros.recording.writer import RecordingWriter
+    from slam_observer_ros.runs.estimate_writer import EstimateWriter
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +49,9 @@ def estimate_writer(
             raise UsageError('--with-inputs is for --mcap')
         yield None
         return
+    from slam_observer_ros.recording.writer import RecordingWriter  # a while to import
+    from slam_observer_ros.runs.estimate_writer import EstimateWriter
+
     base_frame = inputs.base_frame or InputSettings().base_frame
     with RecordingWriter(args.mcap, overwrite=args.force) as writer:
         has_parent = False
@@ -67,6 +73,8 @@ def estimate_writer(
 
 
 def _copy_inputs(recording: Recording, selected: SelectedTopics, writer: RecordingWriter) -> None:
+    from slam_observer_ros.runs.estimate_writer import TOPICS
+
     taken = [topic.name for topic in selected.inputs if topic.name in TOPICS]
     if taken:
         raise UsageError(

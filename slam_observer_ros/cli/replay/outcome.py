@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import logging
 
+from slam_observer_ros.cli.replay.dropped import MALFORMED, unused_messages
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
@@ -18,9 +19,6 @@ from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.accuracy import Accuracy, measure, measure_smoothed, trajectory_of
 from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import Replay
-
-MALFORMED = 'malformed'
-"""Reason under which messages that can't be decoded are counted."""
 
 logger = logging.getLogger(__name__)
 
@@ -86,26 +84,16 @@ class ReplayOutcome:
     @property
     def localised_after_s(self) -> float | None:
         """Time until the pose in a loaded map was found, seconds; None without such a map."""
-        if not (self.result.in_known_map and len(self.result.trajectory)):
+        localised_ns = self.result.localised_ns
+        if localised_ns is None or not self.result.in_known_map:
             return None
-        return self.result.seconds_until(self.result.trajectory.stamps_ns[0])
+        return self.result.seconds_until(localised_ns[0])
 
     @property
     def unaligned_rmse_m(self) -> float | None:
         """See :class:`.TrajectoryErrors`; None without truth or a loaded map."""
         errors = self.accuracy.pose_errors
         return errors.unaligned_rmse_m if errors and self.result.in_known_map else None
-
-
-def unused_messages(recording: Recording, selected: SelectedTopics) -> Counter[str]:
-    """Count the messages that did not become events, by reason."""
-    malformed = sum(recording.malformed[topic.name] for topic in selected.inputs)
-    return recording.dropped + Counter({MALFORMED: malformed})
-
-
-def list_dropped(dropped: Mapping[str, int]) -> str:
-    """Return how many events were dropped, by reason, as text."""
-    return ', '.join(f'{count} {reason}' for reason, count in dropped.items()) or 'none'
 
 
 def outcome_of(

@@ -1,0 +1,103 @@
+"""A recording through the estimator, and what came of it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+import logging
+
+from slam_observer_ros.cli.console import show_progress
+from slam_observer_ros.cli.replay.asked import Asked
+from slam_observer_ros.cli.replay.estimate_recording import estimate_writer
+from slam_observer_ros.cli.replay.input_options import (
+    check_frames,
+    topic_names,
+    warn_of_unused,
+    with_base_frame,
+)
+from slam_observer_ros.cli.replay.outcome import outcome_of, ReplayOutcome, with_smoothed
+from slam_observer_ros.cli.replay.outcome_checks import (
+    check_localised,
+    check_used,
+    warn_of_input,
+    warn_of_resets,
+)
+from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.recorder import NisTally, RunRecorder
+from slam_observer_ros.runs.replay import replay
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import InputSettings
+
+logger = logging.getLogger(__name__)
+
+
+def replayed(
+    args: argparse.Namespace, asked: Asked, *, shows_progress: bool = True
+) -> tuple[ReplayOutcome, str]:
+    """Replay ``args.recording``; return what came of it, and the frame of outputs."""
+    warn_of_unused(args, asked.settings)
+    landmark_map = None if args.load_map is None else read_map(args.load_map)
+    outcome = _replay(args, asked.settings, asked.inputs, landmark_map, shows_progress)
+    return outcome, _frame_of_outputs(asked.inputs, landmark_map)
+
+
+def _replay(
+    args: argparse.Namespace,
+    settings: Settings,
+    inputs: InputSettings,
+    landmark_map: LandmarkMap | None,
+    shows_progress: bool,
+) -> ReplayOutcome:
+    """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
+    with Recording(args.recording) as recording:
+        if recording.warning:
+            logger.warning('%s', recording.warning)
+        selected = recording.find_topics(topic_names(args), inputs)
+        inputs = with_base_frame(inputs, recording, selected)
+        check_frames(inputs)
+        truth = recording.truth(selected, inputs.base_frame)
+        truth = truth.flattened() if settings.two_d_mode else truth
+        events = recording.events(selected, inputs, settings.velocity_timeout)
+        if shows_progress:
+            events = show_progress(events, 'replaying', recording.event_count(selected))
+        recorder = _recorder(args)
+        map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
+        is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
+        needs_poses = is_drawn or len(truth.stamps_ns) > 0
+        with estimate_writer(args, recording, selected, inputs, map_frame) as writer:
+            recorders = [noter for noter in (recorder, writer) if noter is not None]
+            result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
+            warn_of_resets(result)
+            check_used(args, recording, selected, inputs, result)
+            if landmark_map is not None:
+                check_localised(args, result, landmark_map)
+            outcome = outcome_of(recording, selected, result, truth)
+            if writer is not None:
+                writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
+        warn_of_input(recording, selected, result)
+        warn_of_timing(recording, selected)
+    if recorder is not None:
+        outcome = replace(outcome, recorder=recorder)
+    return with_smoothed(outcome) if args.smooth else outcome
+
+
+def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
+    if args.report is not None or args.plot is not None:
+        return RunRecorder()
+    return NisTally() if args.json else None
+
+
+def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
+    """Return the frame of what is written: that of the map that was loaded, if one was."""
+    if landmark_map is None or landmark_map.frame_id == inputs.map_frame:
+        return inputs.map_frame
+    logger.warning(
+        "The map is in frame '%s', and so is what is written; the node takes it with "
+        'map_frame: %s only.',
+        landmark_map.frame_id,
+        landmark_map.frame_id,
+    )
+    return landmark_map.frame_id
