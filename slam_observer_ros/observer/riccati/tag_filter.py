@@ -62,7 +62,7 @@ class RiccatiTagFilter(RiccatiFilter):
             )
             HP, HPH = self.joint.project_turns(seen.rows[used])
             S = with_blocks(HPH, R[used] / (weights[used] / repeated)[:, None, None])
-            self._move(-self.joint.update(HP, S) @ phi[used].ravel())
+            self._move(-self.joint.update(HP, S, phi[used].ravel()))
         return weights, are_unclear
 
     def add_orientations(self, seen: SeenOrientations) -> None:
