@@ -70,6 +70,8 @@ OUTPUTS = {
     'lyapunov': 'the Lyapunov value L (34) of the last observation',
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
     'otherwise `map_frame` → `base_frame`',
+    '~/is_localised': 'whether the pose is known, as for a behaviour tree: in the loaded map if '
+    'there is one, with standard deviations below `position_error` and `heading_error`',
     '/diagnostics': 'rates, ages, what was used, what was dropped and why, '
     'and the calibration of the velocity',
 }

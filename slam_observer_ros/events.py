@@ -168,7 +168,7 @@ class ObservationEvent:
 
     def select(self, mask: BoolArray) -> ObservationEvent:
         """Return the points that ``mask`` (m,) picks."""
-        if mask.all():
+        if np.count_nonzero(mask) == len(mask):
             return self
         return replace(
             self,

@@ -73,6 +73,31 @@ class ObserverNodeSettings(InputSettings):
     path_length: int = parameter(
         2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
     )
+    position_warn: float = parameter(
+        0.5,
+        'Standard deviation of the position, in its worst direction, from which on /diagnostics '
+        'warns',
+        unit='m',
+        minimum=0.0,
+    )
+    position_error: float = parameter(
+        2.0,
+        'The same, from which on it is an error, and ~/is_localised is false',
+        unit='m',
+        minimum=0.0,
+    )
+    heading_warn: float = parameter(
+        0.2,
+        'Standard deviation of the heading from which on /diagnostics warns',
+        unit='rad',
+        minimum=0.0,
+    )
+    heading_error: float = parameter(
+        0.5,
+        'The same, from which on it is an error, and ~/is_localised is false',
+        unit='rad',
+        minimum=0.0,
+    )
     map_file: str = parameter(
         '',
         'Map to load at the start: one saved earlier, or surveyed landmarks; empty for none',

@@ -293,8 +293,9 @@ class Publishing:
             dropped=Counter(), is_paused=False, clock_problems=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
-        self.estimate_publisher = SimpleNamespace(problem='', rivals=str)
-        parts = self.estimator, self.feed, inputs, self.estimate_publisher
+        self.estimate_publisher = SimpleNamespace(problem='', rivals=str, odometry_age_s=None)
+        localisation = SimpleNamespace(status=lambda _hardware_id: DiagnosticStatus())
+        parts = self.estimator, self.feed, inputs, self.estimate_publisher, localisation
         self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')
 
     def publish(self, **new):

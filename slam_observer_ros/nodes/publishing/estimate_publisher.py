@@ -15,6 +15,7 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
@@ -89,6 +90,15 @@ class EstimatePublisher:
         if self._broadcaster is None:
             return ''
         return self._broadcaster.problem or self._broadcaster.rival
+
+    @property
+    def odometry_age_s(self) -> float | None:
+        """Age of the newest odometry on /tf, seconds; None if there is none."""
+        newest_ns = None if self._broadcaster is None else self._broadcaster.odometry_ns()
+        if newest_ns is None:
+            return None
+        now_ns: int = self._node.get_clock().now().nanoseconds
+        return to_s(now_ns - newest_ns)
 
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""

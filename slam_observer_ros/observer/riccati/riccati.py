@@ -60,8 +60,7 @@ class RiccatiFilter(Filter):
         R = R / (weights[passed] / repeated)[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
         HP, HPH = self.joint.project(self.joint.output_matrix(used), used.rows)
-        K = self.joint.update(HP, with_blocks(HPH, R))
-        self._move(-K @ r.ravel())
+        self._move(-self.joint.update(HP, with_blocks(HPH, R), r.ravel()))
         return weights
 
     def distances(self, residuals: Residuals) -> FloatArray:
