@@ -180,8 +180,9 @@ class RiccatiFilter(Filter):
         return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
 
     def _compress(self) -> None:
-        """Go on with a covariance for many landmarks, unless they move."""
-        if self._settings.landmark_velocity_stddev or self.observer.have_moved:
+        """Go on with a covariance for many landmarks, unless they move or have orientations."""
+        may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
+        if may_move or self.orientations is not None:
             return
         self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
