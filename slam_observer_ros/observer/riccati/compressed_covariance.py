@@ -137,6 +137,13 @@ class CompressedCovariance(JointCovariance):
 
     # Landmarks
 
+    def add_seen(self, covariances: FloatArray) -> None:
+        """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3)."""
+        for start in range(0, len(covariances), self._size.most):
+            if len(self.active) > self._most:
+                self._switch(self._chosen(self.active[:0]))
+            super().add_seen(covariances[start : start + self._size.most])
+
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
         is_active = self._places[rows] >= 0
@@ -237,8 +244,8 @@ class CompressedCovariance(JointCovariance):
     def _chosen(self, rows: IntArray) -> IntArray:
         """Return the landmarks to be active when ``rows`` (m,) are seen."""
         kept = max(self._size.kept, self._size.kept_per_seen * len(rows))
-        everything = np.arange(len(self._places))
-        points = self._observer.points + self.postponed_shifts(everything)
+        everything = np.arange(len(self._places))  # but those that are just being added
+        points = self._observer.points[everything] + self.postponed_shifts(everything)
         arms = points - self._observer.A[:3, 3]
         distances = np.einsum('ij,ij->i', arms, arms)
         near = np.argpartition(distances, min(kept, len(arms)) - 1)[:kept]

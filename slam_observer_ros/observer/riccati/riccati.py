@@ -89,15 +89,13 @@ class RiccatiFilter(Filter):
 
     def add(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
+        self._compress_if_large(len(points))
         super().add(points, covariances)
         self.joint.add_seen(self.observer.turned(covariances))
-        if self.joint.is_dense and len(self.observer.y_ref) > self.block.dense:
-            self._compress()
 
     def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks whose errors are independent of all else."""
-        if self.joint.is_dense and len(self.observer.y_ref) + len(y_ref) > self.block.dense:
-            self._compress()
+        self._compress_if_large(len(y_ref))
         super().add_known(y_ref, covariances)
         self.joint.add_known(y_ref, covariances)
 
@@ -179,12 +177,12 @@ class RiccatiFilter(Filter):
         a = super().translations(rows)
         return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
 
-    def _compress(self) -> None:
+    def _compress_if_large(self, added: int) -> None:
         """Go on with a covariance for many landmarks, unless they move or have orientations."""
+        is_large = len(self.observer.y_ref) + added > self.block.dense
         may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
-        if may_move or self.orientations is not None:
-            return
-        self.joint = CompressedCovariance(self.joint, self.observer, self.block)
+        if self.joint.is_dense and is_large and not may_move and self.orientations is None:
+            self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
