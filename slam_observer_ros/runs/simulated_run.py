@@ -74,9 +74,10 @@ class _RunningSimulation:
     def _on_update(self, update: Update) -> None:
         if len(update.ids):
             self._lyapunov[update.stamp_ns] = update.lyapunov
-        if not self._samples.is_due(update.stamp_ns):
+        stamps_ns = np.array([update.stamp_ns])
+        if not self._samples.due(stamps_ns):
             return
-        self._samples.add(update.stamp_ns, update.pose)
+        self._samples.add(stamps_ns, update.pose[None])
         points = np.full((len(self._simulation.landmark_ids), 3), np.nan)
         points[self.estimator.landmark_ids] = self.estimator.world_points
         self._landmark_tracks.append(points)

@@ -77,7 +77,7 @@ class ObservationNoise(Immutable):
         else:
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2
-        return _invertible(_along_and_across(lines_of_sight, range_squared, along, across))
+        return _along_and_across(lines_of_sight, range_squared, along, across)
 
 
 def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
@@ -105,12 +105,16 @@ def _invertible(covariances: FloatArray) -> FloatArray:
 def _along_and_across(
     lines_of_sight: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
 ) -> FloatArray:
-    """Return covariances with given variances along and across the line of sight.
+    """Return covariances with given variances along and across the line of sight, invertible.
 
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """
-    across = np.where(range_squared > 0.0, across, along)
+    if np.count_nonzero(range_squared) < len(range_squared):
+        across = np.where(range_squared > 0.0, across, along)
     excess = (along - across) / np.maximum(range_squared, _TINY)
-    outer = lines_of_sight[:, :, None] * lines_of_sight[:, None, :]
-    spread: FloatArray = excess[:, None, None] * outer
-    return spread + across[:, None, None] * _IDENTITY
+    scaled = excess[:, None] * lines_of_sight
+    covariances: FloatArray = scaled[:, :, None] * lines_of_sight[:, None, :]
+    # As of _invertible, but with the trace that is known.
+    least = RESOLUTION_M**2 + MIN_SHARE * (along + 2.0 * across)
+    covariances += (across + least)[:, None, None] * _IDENTITY
+    return covariances
