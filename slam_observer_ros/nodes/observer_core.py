@@ -28,6 +28,7 @@ from slam_observer_ros.nodes.services.control_services import ControlServices
 from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
 from slam_observer_ros.nodes.services.kept_pose import KeptPose
 from slam_observer_ros.nodes.services.map_services import MapServices
+from slam_observer_ros.nodes.services.named_map_services import NamedMapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -87,6 +88,7 @@ class ObserverCore:
         )
         # What others may do to the estimate
         self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
+        NamedMapServices(node, self._maps)
         self._kept_pose = KeptPose(node, settings, self._estimator)
         self._kept_pose.restore()
         InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
