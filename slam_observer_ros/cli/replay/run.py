@@ -60,7 +60,7 @@ def _replay(
         check_frames(inputs)
         truth = recording.truth(selected, inputs.base_frame)
         truth = truth.flattened() if settings.two_d_mode else truth
-        events = recording.events(selected, inputs, settings.velocity_timeout)
+        events = recording.blocks(selected, inputs, settings.velocity_timeout)
         if shows_progress:
             events = show_progress(events, 'replaying', recording.event_count(selected))
         recorder = _recorder(args)
