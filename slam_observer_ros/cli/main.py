@@ -34,6 +34,7 @@ COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
     'replay': ('replay.command', 'run a recording through the observer'),
+    'tune': ('tune.command', 'find the noise figures that a recording shows'),
     'batch': ('batch.command', 'run many recordings with many settings'),
 }
 """The module of each command, and what it does; only the one that is given is imported."""

@@ -37,7 +37,9 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     """One step of the observer (28), from where the velocity has led it (27): the innovation."""
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     _drop_history_if_full(state, matched)
-    expected = Expected.of(state.filter, residuals) if state.judges_innovations else None
+    expected = None
+    if state.judges_innovations:
+        expected = Expected.of(state.filter, residuals, state.observation_noise.error_time_s)
     weights = _correct(state, residuals)  # (30), (31)  X̂ ← (D, d_i) · X̂
     rejected = weights == 0.0
     _count(state, matched, rejected)
