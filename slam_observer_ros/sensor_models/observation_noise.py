@@ -18,6 +18,9 @@ What claims to be better is lost in rounding beside a pose that may be off by a 
 RELATIVE_RESOLUTION = 1e-6
 """The same as a share of the distance, for points in single precision or better."""
 
+RESOLUTION_RAD = 1e-4
+"""The same of an orientation, about each axis."""
+
 MAX_ERROR_M = 1e3
 """Standard deviation of an observed point beyond which a message only says 'unknown'."""
 
@@ -62,6 +65,21 @@ class ObservationNoise(Immutable):
         if unknown.any():
             covariances[unknown] = self.at(lines_of_sight[unknown])
         return covariances
+
+    def orientation_covariances(self, event: ObservationEvent) -> FloatArray:
+        """Return what an observation's orientations may be off by (m, 3, 3), rad².
+
+        Of rotation vectors along the event's axes; all can be inverted.
+        """
+        by_settings = np.broadcast_to(
+            self._settings.orientation_noise**2 * _IDENTITY, (len(event.ids), 3, 3)
+        )
+        stated = event.orientation_covariances
+        if stated is None:
+            return by_settings
+        is_stated = np.asarray(stated.any(axis=(1, 2)))[:, None, None]
+        known = limited(stated, np.full(3, np.pi)) + RESOLUTION_RAD**2 * _IDENTITY
+        return np.where(is_stated, known, by_settings)
 
     def at(self, lines_of_sight: FloatArray) -> FloatArray:
         """Return what the settings say of points along ``lines_of_sight`` (m, 3)."""
