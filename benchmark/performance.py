@@ -23,10 +23,9 @@ import performance_page
 from performance_page import Measured, Part
 from program_costs import measure_memory, measure_replay, measure_start
 from step_costs import measure_large, measure_steps
+from threadpoolctl import threadpool_limits
 from world_costs import measure_passing, measure_worlds
 import worlds
-
-from threadpoolctl import threadpool_limits
 
 PARTS: dict[str, Callable[[], Tables]] = {
     'start': measure_start,

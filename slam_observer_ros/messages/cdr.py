@@ -1,4 +1,4 @@
-"""Reading of plain CDR, the byte format of ROS 2 messages, without building message objects."""
+"""Plain CDR, the byte format of ROS 2 messages, without building message objects."""
 
 from __future__ import annotations
 
@@ -108,3 +108,9 @@ class CdrReader:
         left = len(self._raw) - self._position
         if left > MAX_PADDING_BYTES:
             raise MessageError(f'{left} bytes too long: is it of another type?')
+
+
+def encode_string(text: str) -> bytes:
+    """Serialise a string, with padding so that a 4-byte value may follow; little endian."""
+    characters = text.encode() + b'\0'
+    return struct.pack('<I', len(characters)) + characters + bytes(-len(characters) % 4)

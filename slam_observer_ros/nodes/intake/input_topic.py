@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
 import math
 import time
 from typing import Any, Generic, TypeVar
@@ -45,6 +46,20 @@ def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
             subscription.msg_type, subscription.raw
         )
     return taken
+
+
+def with_info(receive: Callable[[bytes, Mapping[str, int]], None]) -> Callable[..., None]:
+    """Return a callback that gets a message with what DDS knows of it from every executor.
+
+    EventsExecutor gives both as one argument, in rclpy 7.1 at least.
+    """
+
+    def callback(*taken: Any) -> None:
+        receive(*(taken[0] if len(taken) == 1 else taken))
+
+    # By which rclpy sees that the callback wants both.
+    callback.__signature__ = signature(receive)  # type: ignore[attr-defined]
+    return callback
 
 
 class InputTopic(Generic[MessageT]):
@@ -162,7 +177,7 @@ class InputTopic(Generic[MessageT]):
         self.close()
         self._type_name = type_name
         self._subscription = self._node.create_subscription(
-            message_class(type_name), self.topic, self._receive, self._qos, raw=True
+            message_class(type_name), self.topic, with_info(self._receive), self._qos, raw=True
         )
         self._node.get_logger().info(f"receiving {type_name} on '{self.topic}'")
 
