@@ -64,7 +64,7 @@ venv: $(READY)  ## only set up .venv
 lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt names
 	$(PYTHON_IN_VENV) -m pip install --quiet uv
 	$(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
-		--extra cli --extra test --extra dev --extra ros-jazzy --constraint constraints.txt \
+		--extra cli --extra cluster --extra test --extra dev --extra ros-jazzy --constraint constraints.txt \
 		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
 
 $(READY): setup.py constraints.txt requirements.lock \

@@ -52,6 +52,7 @@ setup(
             'matplotlib',  # figures
             'rich',  # live progress and tables in the terminal
         ],
+        'cluster': ['distributed'],  # runs a batch on the machines of a Dask cluster
         # A ROS installation brings these itself, so nothing here may come with the package.
         **{f'ros-{ros}': [f'ros-{ros}-{wheel}' for wheel in ROS_WHEELS] for ros in ROS_RELEASES},
         'test': [
@@ -59,6 +60,8 @@ setup(
             'pytest-timeout',  # a ROS test that hangs must fail
             'hypothesis',  # the paper's lemmas are properties
             'catkin_pkg',  # reads package.xml
+            # finds the same errors in what a replay writes; GPL, so only run as a program
+            'evo; python_version >= "3.11"',
             'threadpoolctl',  # counts the threads that numpy takes
         ],
         'dev': [

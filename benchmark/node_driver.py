@@ -31,7 +31,7 @@ OTHER_TOPICS = {
     'lyapunov': Float64,
     'landmark_estimates': PointCloud,
     'path': Path,
-    'map': PointCloud2,
+    'landmark_map': PointCloud2,
     'markers': MarkerArray,
 }
 """What ``observer_node`` publishes beside the odometry and /tf."""
@@ -55,7 +55,7 @@ class Driver:
         self._tick = 0
         self.forget()
         self._subscribe(Twist, 'echo/twist', self._on_echo)
-        self._subscribe(Odometry, 'odometry', self._on_odometry)
+        self._subscribe(Odometry, 'observer_node/odometry', self._on_odometry)
         self._subscribe(TFMessage, '/tf', lambda _raw: None)
         for topic, message_class in OTHER_TOPICS.items() if reads_all else ():
             self._subscribe(message_class, topic, lambda _raw: None)

@@ -9,6 +9,7 @@ them any more.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -72,6 +73,37 @@ class VelocityEvent:
             if not is_linear_known:  # what the lever arm adds to it would pass for all of it
                 covariance[3:] = covariance[:, 3:] = 0.0
         return replace(self, body_velocity=Ad @ self.body_velocity, covariance=covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VelocityBlock:
+    """k velocity events that came one after the other, as arrays: cheaper to handle together."""
+
+    stamps_ns: IntArray  # (k,)
+    body_velocities: FloatArray  # (k, 6)
+    covariances: FloatArray | None = None  # (k, 6, 6), all of them stated
+    receive_ns: IntArray | None = None  # (k,)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def part(self, rows: slice) -> VelocityBlock:
+        """Return some of them."""
+        return VelocityBlock(
+            self.stamps_ns[rows],
+            self.body_velocities[rows],
+            None if self.covariances is None else self.covariances[rows],
+            None if self.receive_ns is None else self.receive_ns[rows],
+        )
+
+    def events(self) -> Iterator[VelocityEvent]:
+        """Yield them one by one."""
+        received = [None] * len(self) if self.receive_ns is None else self.receive_ns.tolist()
+        covariances = [None] * len(self) if self.covariances is None else self.covariances
+        for columns in zip(
+            self.stamps_ns.tolist(), self.body_velocities, covariances, received, strict=True
+        ):
+            yield VelocityEvent(*columns)
 
 
 @dataclass(frozen=True, slots=True)

@@ -151,7 +151,8 @@ def processes_of_these_tests() -> dict[int, str]:
         try:
             if mark in (folder / 'environ').read_bytes() and int(folder.name) != os.getpid():
                 command = (folder / 'cmdline').read_bytes()
-                found[int(folder.name)] = command.replace(b'\0', b' ').decode()
+                if b'multiprocessing.resource_tracker' not in command:  # that ends with its parent
+                    found[int(folder.name)] = command.replace(b'\0', b' ').decode()
         except (ProcessLookupError, FileNotFoundError, PermissionError):
             continue  # it has ended meanwhile, or is another user's
     return found

@@ -7,11 +7,14 @@ from contextlib import contextmanager
 import json
 import logging
 import sys
+import threading
 from typing import TypeVar
 
 from slam_observer_ros.cli.interrupts import leaving_at_once
 
 PROGRAM = 'slam-observer'
+
+_FOREVER_S = 1e9
 
 _Item = TypeVar('_Item')
 
@@ -30,10 +33,12 @@ class _Keeper(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.warnings: list[str] = []
+        self._thread = threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep one record."""
-        self.warnings.append(' '.join(record.getMessage().split()))
+        """Keep one record, unless another thread's run gave it."""
+        if record.thread == self._thread:
+            self.warnings.append(' '.join(record.getMessage().split()))
 
 
 @contextmanager
@@ -68,6 +73,38 @@ def show_progress(items: Iterable[_Item], description: str, total: int) -> Itera
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+def show_runs(runs: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
+    """Pass on what takes long each, with how many there were and the time left, on a terminal."""
+    with leaving_at_once():
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+    console = Console(stderr=True, highlight=False)
+    columns = (
+        TextColumn('{task.description}'),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    # Each may take minutes: the time left is judged by all of them, not by the last 30 seconds.
+    with Progress(
+        *columns,
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        speed_estimate_period=_FOREVER_S,
+    ) as progress:
+        yield from progress.track(runs, total, description=description)
 
 
 def print_json(result: Mapping[str, object]) -> None:

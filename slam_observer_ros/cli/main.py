@@ -17,20 +17,24 @@ with leaving_at_once():
     from typing import Any, NoReturn
 
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
-    from slam_observer_ros.common.errors import LossError, SlamObserverError
+    from slam_observer_ros.common.errors import IncompleteError, LossError, SlamObserverError
     from slam_observer_ros.common.threads import use_one_thread
     from slam_observer_ros.common.version import VERSION
     from slam_observer_ros.settings.parameter_table import suggestion
 
 EXIT_ERROR = 2
 EXIT_LOSS = 3
+EXIT_INCOMPLETE = 4
 EXIT_SIGNAL = 128
 """To which the number of the signal that ended the program is added, as shells do."""
+
+EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EXIT_INCOMPLETE}
 
 COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
     'replay': ('replay.command', 'run a recording through the observer'),
+    'batch': ('batch.command', 'run many recordings with many settings'),
 }
 """The module of each command, and what it does; only the one that is given is imported."""
 
@@ -108,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError):
             return _leave_broken_pipe()
         show_message('error', str(error))
-        return EXIT_LOSS if isinstance(error, LossError) else EXIT_ERROR
+        return EXIT_OF.get(type(error), EXIT_ERROR)
     except ModuleNotFoundError as error:
         _explain_missing(error)
         return EXIT_ERROR

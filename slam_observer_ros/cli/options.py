@@ -180,10 +180,10 @@ def _parse_assignment(text: str) -> tuple[str, object]:
     name, equals, value = text.partition('=')
     if not (name and equals):
         raise UsageError(f"--set takes NAME=VALUE, not '{text}'")
-    return name, _parse_value(value)
+    return name, parse_value(value)
 
 
-def _parse_value(text: str) -> object:
+def parse_value(text: str) -> object:
     """Read a number, true, false or a [list]; anything else is a string."""
     if text in ('True', 'False'):  # as YAML has it, too
         return text == 'True'
@@ -199,7 +199,7 @@ def value_of(row: Parameter) -> Callable[[str], Value]:
 
     def parse(text: str) -> Value:
         try:
-            return row.check(_parse_value(text))
+            return row.check(parse_value(text))
         except ParameterError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
 

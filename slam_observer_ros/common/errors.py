@@ -72,3 +72,7 @@ class UsageError(SlamObserverError):
 
 class OutputError(SlamObserverError):
     """Some of what was asked for could not be written."""
+
+
+class IncompleteError(SlamObserverError):
+    """A part of what was asked for could not be done, or is of no avail; the rest is done."""

@@ -18,6 +18,7 @@ from slam_observer_ros.events import (
     MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,
+    VelocityBlock,
     VelocityEvent,
 )
 from slam_observer_ros.geometry.matrices import transpose
@@ -35,6 +36,9 @@ MAX_STAMP_NS = 2**63 - 1
 
 MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
+
+NEARLY = 1.0 - 1e-9
+"""Of a limit: what is below that is below the limit, however it is rounded."""
 
 _INTEGERS = (int, np.int64)
 
@@ -62,6 +66,21 @@ def check_event(event: Event, settings: Settings) -> None:
     else:
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
     _check_times(event.stamp_ns, event.receive_ns)
+
+
+def check_velocities(velocities: VelocityBlock, settings: Settings) -> None:
+    """Raise :exc:`InvalidEventError` if :func:`check_event` might refuse one of the velocities."""
+    body_velocities, covariances = velocities.body_velocities, velocities.covariances
+    _check_coordinates('velocities', body_velocities, (len(velocities), 6))
+    squares = np.add.reduceat(body_velocities**2, [0, 3], axis=1).max(axis=0)
+    most = np.array([settings.max_angular_velocity, settings.max_linear_velocity])
+    if (squares > NEARLY * most**2).any():
+        raise InvalidEventError('too_fast', 'a velocity is near the greatest that is believed')
+    if covariances is not None:
+        _check_array('velocity covariances', covariances, (len(velocities), 6, 6))
+        _check_definite('velocity covariances', covariances)
+    if velocities.stamps_ns[0] < 0:
+        raise InvalidEventError('negative_stamp', 'a stamp is negative')
 
 
 def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:

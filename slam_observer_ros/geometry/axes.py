@@ -47,9 +47,9 @@ class EstimatedAxes(Immutable):
         return full
 
     def full_pose_covariance(self, covariance: FloatArray) -> FloatArray:
-        """Return the covariance (6, 6) of ε with zeros on the axes that are not estimated."""
-        full = np.zeros((6, 6))
-        full[self.pose, self.pose] = covariance
+        """Return the covariance (…, 6, 6) of ε with zeros on the axes that are not estimated."""
+        full = np.zeros((*covariance.shape[:-2], 6, 6))
+        full[..., self.pose, self.pose] = covariance
         return full
 
     def full_points(self, errors: FloatArray) -> FloatArray:

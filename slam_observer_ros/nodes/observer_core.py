@@ -23,6 +23,7 @@ from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.intake.transform_listener import open_transforms
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
+from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
 from slam_observer_ros.nodes.ros_parameters import read_settings
 from slam_observer_ros.nodes.services.control_services import ControlServices
 from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
@@ -55,7 +56,13 @@ class ObserverCore:
         self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
-        self._estimator = Estimator(estimator_settings, on_jump=self._on_estimator_jump)
+        noise = NoiseFit()
+        self._estimator = Estimator(
+            estimator_settings,
+            on_update=noise.add,
+            on_jump=self._on_estimator_jump,
+            judges_innovations=True,
+        )
         # What comes in and what goes out
         self._transforms = open_transforms(node, (settings.map_frame, settings.base_frame))
         self._feed = EstimatorFeed(
@@ -67,6 +74,7 @@ class ObserverCore:
         self._inputs = open_inputs(node, settings, self._feed)
         self._is_catching_up = False
         _refuse_own_outputs(node, self._inputs)
+        self._localisation = LocalisationStatus(node, settings, self._estimator, noise)
         namespace = node.get_namespace()
         self._diagnostics = DiagnosticsPublisher(
             node,
@@ -74,6 +82,7 @@ class ObserverCore:
             self._feed,
             self._inputs,
             self._publisher,
+            self._localisation,
             hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         # What others may do to the estimate
@@ -145,6 +154,7 @@ class ObserverCore:
             create(OVERVIEW_PERIOD_S, self._publisher.publish_overview),
             create(OVERVIEW_PERIOD_S, self._maps.keep_recent),
             create(DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
+            create(CHECK_PERIOD_S, self._localisation.publish),
             *(create(CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
         ]
 
@@ -218,5 +228,5 @@ def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic[Any]]) -> None:
         if name := outputs.get(source.topic):
             raise ParameterError(
                 f"the input '{source.name}' and the output '{name}' are both '{source.topic}': "
-                f'remap one of them, as with -r {name}:=observer/{name}'
+                f'remap one of them, as with -r {name}:=observer/{name.removeprefix("~/")}'
             )

@@ -19,7 +19,7 @@ from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.settings.estimator_settings import Settings
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
@@ -121,8 +121,11 @@ class Filter:
         """(c,) variances of what is estimated of the calibration."""
         return np.empty(0)
 
-    def pose_covariance(self, motion: Motion | None = None) -> FloatArray | None:
-        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come."""
+    def pose_covariance(self, motion: Motion | Passage | None = None) -> FloatArray | None:
+        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come.
+
+        (s, 6, 6) at the s instants of a passage.
+        """
         return None
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:

@@ -20,9 +20,9 @@ _PARTS = {
 
 def write_report(path: Path, run: ReportedRun) -> None:
     """Write the report of a run; it is whole or not there. Raises an OutputError if it can't."""
-    page = _asset('page.html')
+    page = asset('page.html')
     for mark, name in _PARTS.items():
-        page = page.replace(f'@{mark}@', _asset(name), 1)
+        page = page.replace(f'@{mark}@', asset(name), 1)
     # In a script element only `<` could end it.
     numbers = json.dumps(report_data(run), allow_nan=False, separators=(',', ':'))
     page = page.replace('@NUMBERS@', numbers.replace('<', '\\u003c'), 1)
@@ -33,5 +33,6 @@ def write_report(path: Path, run: ReportedRun) -> None:
         raise OutputError(f"can't write {path}: {error.strerror}") from error
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Return the text of a file that pages are made of."""
     return (resources.files(__package__) / 'assets' / name).read_text(encoding='utf-8')

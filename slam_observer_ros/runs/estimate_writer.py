@@ -25,11 +25,13 @@ POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 OVERVIEW_PERIOD_NS = 1_000_000_000
 """Time between two maps, nanoseconds."""
 
-TOPICS = ('/odometry', '/pose', '/lyapunov', '/path', '/map', '/markers')
+ODOMETRY_TOPIC = '/observer_node/odometry'
+MAP_TOPIC = '/landmark_map'
+TOPICS = (ODOMETRY_TOPIC, '/pose', '/lyapunov', '/path', MAP_TOPIC, '/markers')
 """Topics of the estimate, named as the node's."""
 
 ALIGNED_POSE_TOPIC = '/aligned_truth/pose'
-ALIGNED_LANDMARKS_TOPIC = '/aligned_truth/map'
+ALIGNED_LANDMARKS_TOPIC = '/aligned_truth/landmark_map'
 
 
 class EstimateWriter:
@@ -121,7 +123,7 @@ class EstimateWriter:
         self._writer.write('/pose', POSE, message, stamp_ns, latched=True)
         velocity = estimator.body_velocity, estimator.body_velocity_covariance
         odometry = self._state.odometry(stamp_ns, uncertain, *velocity)
-        self._writer.write('/odometry', ODOMETRY, odometry, stamp_ns)
+        self._writer.write(ODOMETRY_TOPIC, ODOMETRY, odometry, stamp_ns)
         if self._publishes_tf:
             transform = encode_transform(stamp_ns, self._map_frame, self._base_frame, pose)
             self._writer.write('/tf', TRANSFORMS, transform, stamp_ns)
@@ -137,7 +139,7 @@ class EstimateWriter:
         )
         velocities = estimator.landmark_velocities
         cloud = self._messages.landmarks(stamp_ns, *landmarks, velocities)
-        self._write('/map', cloud, stamp_ns, latched=True)
+        self._write(MAP_TOPIC, cloud, stamp_ns, latched=True)
         markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
         self._write('/markers', markers, stamp_ns)
         for part in estimator.calibration:

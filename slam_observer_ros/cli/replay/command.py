@@ -9,11 +9,12 @@ from pathlib import Path
 from slam_observer_ros.cli.console import kept_warnings, print_json
 from slam_observer_ros.cli.options import add_settings_options
 from slam_observer_ros.cli.outputs import add_force_option, add_result_options
+from slam_observer_ros.cli.replay.asked import add_run_options, read_asked
 from slam_observer_ros.cli.replay.estimate_recording import add_recording_options
 from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
-from slam_observer_ros.cli.replay.identity import identity
+from slam_observer_ros.cli.replay.identity import identity, sha256_of
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.cli.replay.run import add_run_options, read_asked, replayed
+from slam_observer_ros.cli.replay.run import replayed
 from slam_observer_ros.cli.replay.summary import as_json, print_summary, summary_rows
 from slam_observer_ros.common.errors import LossError, OutputError
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -73,7 +74,8 @@ def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame
     """Write and print all that can be, and only then say what could not be written."""
     written, errors = write_files(args, outcome, map_frame, summary_rows(outcome))
     if args.json:
-        print_json(identity(args.recording, outcome) | as_json(outcome))
+        sha256 = sha256_of(args.recording)
+        print_json(identity(args.recording, sha256, outcome) | as_json(outcome))
     else:
         print_summary(args.recording, outcome, written)
     if errors:

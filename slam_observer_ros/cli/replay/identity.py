@@ -13,12 +13,12 @@ from slam_observer_ros.settings.parameter_table import changed_names
 _BLOCK_BYTES = 1 << 20
 
 
-def identity(recording: Path, outcome: ReplayOutcome) -> dict[str, object]:
+def identity(recording: Path, sha256: str, outcome: ReplayOutcome) -> dict[str, object]:
     """Return what was replayed, by what, as ``--json`` has it first."""
     settings = outcome.result.estimator.settings
     return {
         'recording': str(recording),
-        'recording_sha256': sha256_of(recording),
+        'recording_sha256': sha256,
         'version': VERSION,
         'settings': {name: getattr(settings, name) for name in changed_names(settings)},
         'warnings': list(outcome.warnings),

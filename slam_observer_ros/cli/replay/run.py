@@ -1,21 +1,16 @@
-"""What of a replay other commands share: its options, and a recording through the estimator."""
+"""A recording through the estimator, and what came of it."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import logging
-from pathlib import Path
 
 from slam_observer_ros.cli.console import show_progress
-from slam_observer_ros.cli.options import read_settings
+from slam_observer_ros.cli.replay.asked import Asked
 from slam_observer_ros.cli.replay.estimate_recording import estimate_writer
 from slam_observer_ros.cli.replay.input_options import (
-    add_input_options,
     check_frames,
-    INPUT_NAMES,
-    INSTEAD,
-    read_inputs,
     topic_names,
     warn_of_unused,
     with_base_frame,
@@ -28,10 +23,8 @@ from slam_observer_ros.cli.replay.outcome_checks import (
     warn_of_resets,
 )
 from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
-from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
-from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import replay
@@ -41,47 +34,13 @@ from slam_observer_ros.settings.input_settings import InputSettings
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What the options of a replay ask for, checked."""
-
-    settings: Settings
-    inputs: InputSettings
-
-
-def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how a recording is replayed, beside those of settings."""
-    add_input_options(parser)
-    parser.add_argument(
-        '--load-map',
-        type=Path,
-        metavar='FILE',
-        help='known landmarks, as --map writes them: the estimate is then in their frame, and has '
-        'no ANEES of the pose (nor of the configuration, if they are fixed)',
-    )
-    parser.add_argument(
-        '--smooth',
-        action='store_true',
-        help='estimate trajectory and map from all observations together, too; --tum and --map '
-        'then write these',
-    )
-
-
-def read_asked(args: argparse.Namespace) -> Asked:
-    """Read settings; raise a SlamObserverError if they are wrong, or don't fit the options."""
-    defaults = {'smoothing_window': 0} if args.smooth else {}
-    settings = read_settings(args, INPUT_NAMES, INSTEAD, **defaults)
-    inputs = read_inputs(args)
-    if args.smooth and not DESIGNS[settings.gains].has_joint_covariance:
-        raise UsageError(f'--smooth needs riccati gains, not {settings.gains}')
-    return Asked(settings, inputs)
-
-
-def replayed(args: argparse.Namespace, asked: Asked) -> tuple[ReplayOutcome, str]:
+def replayed(
+    args: argparse.Namespace, asked: Asked, *, shows_progress: bool = True
+) -> tuple[ReplayOutcome, str]:
     """Replay ``args.recording``; return what came of it, and the frame of outputs."""
     warn_of_unused(args, asked.settings)
     landmark_map = None if args.load_map is None else read_map(args.load_map)
-    outcome = _replay(args, asked.settings, asked.inputs, landmark_map)
+    outcome = _replay(args, asked.settings, asked.inputs, landmark_map, shows_progress)
     return outcome, _frame_of_outputs(asked.inputs, landmark_map)
 
 
@@ -90,6 +49,7 @@ def _replay(
     settings: Settings,
     inputs: InputSettings,
     landmark_map: LandmarkMap | None,
+    shows_progress: bool,
 ) -> ReplayOutcome:
     """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
     with Recording(args.recording) as recording:
@@ -100,11 +60,9 @@ def _replay(
         check_frames(inputs)
         truth = recording.truth(selected, inputs.base_frame)
         truth = truth.flattened() if settings.two_d_mode else truth
-        events = show_progress(
-            recording.events(selected, inputs, settings.velocity_timeout),
-            'replaying',
-            recording.event_count(selected),
-        )
+        events = recording.events(selected, inputs, settings.velocity_timeout)
+        if shows_progress:
+            events = show_progress(events, 'replaying', recording.event_count(selected))
         recorder = _recorder(args)
         map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
         is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
@@ -127,7 +85,7 @@ def _replay(
 
 
 def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
-    if args.report is not None:
+    if args.report is not None or args.plot is not None:
         return RunRecorder()
     return NisTally() if args.json else None
 

@@ -1,0 +1,1 @@
+"""``slam-observer batch``: many recordings with many settings."""

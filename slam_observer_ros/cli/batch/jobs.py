@@ -1,0 +1,148 @@
+"""What a batch is to run: every recording with every setting, and which run that is."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+from dataclasses import dataclass
+import glob
+import hashlib
+import itertools
+import json
+from pathlib import Path
+import re
+from typing import Any
+
+from slam_observer_ros.cli.options import parse_value
+from slam_observer_ros.cli.replay.asked import Asked, check_smooth
+from slam_observer_ros.cli.replay.input_options import topic_names
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.parameter_table import changed_names, suggestion, table, Value
+
+_OF_ESTIMATOR = {row.name: row for row in table(Settings)}
+_OF_INPUTS = {row.name: row for row in table(InputSettings)}
+_KNOWN = _OF_INPUTS | _OF_ESTIMATOR
+
+_ID_DIGITS = 16
+
+Point = dict[str, Value]
+"""Values of the parameters of ``--grid``, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A run that is to be done; ``run_id`` is a hash of all that its figures depend on."""
+
+    run_id: str
+    recording: Path
+    recording_sha256: str
+    point: Point
+    asked: Asked
+
+    @property
+    def file_stem(self) -> str:
+        """Name of its files, without a suffix; no other run has it."""
+        return f'{self.recording.stem}-{self.run_id}'
+
+
+def find_recordings(patterns: Iterable[str]) -> list[Path]:
+    """Return the recordings that paths and patterns name, each once; ``**`` is any folders."""
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        paths = [pattern] if Path(pattern).exists() else _glob(pattern)
+        if not paths:
+            raise UsageError(f"no file is named '{pattern}'")
+        found |= dict.fromkeys(Path(path) for path in sorted(paths))
+    return list(found)
+
+
+def _glob(pattern: str) -> list[str]:
+    return glob.glob(pattern, recursive=True)  # noqa: PTH207 (it may begin with /)
+
+
+def grid_points(texts: Iterable[str]) -> list[Point]:
+    """Return every combination of the values of ``--grid NAME=VALUE,VALUE…``."""
+    axes: dict[str, list[Value]] = {}
+    for text in texts:
+        name, equals, values = text.partition('=')
+        if not (name and equals and values):
+            raise UsageError(f"--grid takes NAME=VALUE,VALUE…, not '{text}'")
+        if name not in _KNOWN:
+            raise UsageError(f"--grid: unknown parameter '{name}'{suggestion(name, _KNOWN)}")
+        if name in axes:
+            raise UsageError(f'--grid {name} is given twice')
+        # Not at the commas of a [list]
+        axes[name] = [
+            _KNOWN[name].check(parse_value(value)) for value in re.split(r',(?![^\[]*\])', values)
+        ]
+    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+
+
+def shard_of(text: str) -> tuple[int, int]:
+    """Take ``i/N``, 1 ≤ i ≤ N, as an argparse type."""
+    found = re.fullmatch(r'(\d{1,6})/(\d{1,6})', text)
+    number, count = (int(word) for word in found.groups()) if found else (0, 0)
+    if not 1 <= number <= count:
+        raise argparse.ArgumentTypeError(f"a shard is i/N with i from 1 to N, not '{text}'")
+    return number, count
+
+
+def part_of(recordings: Sequence[Path], points: int, shard: tuple[int, int]) -> list[range]:
+    """Return which points a shard is to run of each recording: it takes runs in a row.
+
+    So it has to read as few recordings as can be.
+    """
+    number, count = shard
+    total = len(recordings) * points
+    first, last = ((number - 1) * total // count, number * total // count)
+    starts = range(0, total, points)
+    return [range(max(first - at, 0), min(max(last - at, 0), points)) for at in starts]
+
+
+def with_values(asked: Asked, point: Mapping[str, Value]) -> Asked:
+    """Return what is asked for with other values of some parameters."""
+    settings: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
+    for name, value in point.items():
+        (settings if name in _OF_ESTIMATOR else inputs)[name] = value
+    return Asked(
+        dataclasses.replace(asked.settings, **settings),
+        dataclasses.replace(asked.inputs, **inputs).with_plain_frames(),
+    )
+
+
+def asked_at(args: argparse.Namespace, asked: Asked, points: Iterable[Point]) -> list[Asked]:
+    """Return what is asked for at each point; raise a SlamObserverError if it can't be run."""
+    found = [with_values(asked, point) for point in points]
+    for one in found:
+        check_smooth(args, one.settings)
+    return found
+
+
+def make_job(
+    args: argparse.Namespace, recording: Path, sha256: str, point: Point, asked: Asked
+) -> Job:
+    """Return the job of one recording at one point."""
+    depends_on = {
+        'recording': sha256,
+        'version': VERSION,
+        'settings': _changed(asked.settings),
+        'inputs': _changed(asked.inputs),
+        'topics': dataclasses.astuple(topic_names(args)),
+        'map': None if args.load_map is None else _sha256_of_bytes(args.load_map.read_bytes()),
+        'smooth': args.smooth,
+    }
+    run_id = _sha256_of_bytes(json.dumps(depends_on, sort_keys=True).encode())[:_ID_DIGITS]
+    return Job(run_id, recording, sha256, point, asked)
+
+
+def _changed(settings: Settings | InputSettings) -> dict[str, object]:
+    return {name: getattr(settings, name) for name in changed_names(settings)}
+
+
+def _sha256_of_bytes(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,269 @@
+"""A batch: every run once, whatever stops it, and a page that compares them."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import time
+
+from browser import open_page
+from command_line import CommandLine
+import pytest
+from recordings import write_mcap, write_rosbag1
+
+from slam_observer_ros.cli.batch.jobs import grid_points, part_of
+from slam_observer_ros.cli.batch.pool import local_pool
+from slam_observer_ros.cli.batch.run_log import opened_log, read_logs
+from slam_observer_ros.common.errors import OutputError
+
+SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
+PATIENCE_S = 60.0
+GRID = ('--grid', 'point_noise=0.02,0.05', '--grid', 'observation_model=cartesian')
+
+
+@pytest.fixture(name='slam_observer')
+def fixture_slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+@pytest.fixture(name='recordings')
+def fixture_recordings(tmp_path):
+    """Two recordings of different content."""
+    folder = tmp_path / 'recordings' / 'monday'
+    folder.mkdir(parents=True)
+    return [write_mcap(folder / 'one.mcap'), write_rosbag1(folder / 'two.bag')]
+
+
+def lines_of(directory: Path):
+    return [
+        json.loads(line)
+        for file in sorted(directory.glob('runs*.jsonl'))
+        for line in file.read_text().splitlines()
+    ]
+
+
+def figures_of(lines):
+    """What runs found, without the CPU time that it took."""
+    return {line['run']: {**line, 'seconds': None} for line in lines}
+
+
+def started(*arguments: object):
+    """Start the command as a process of its own, and in a group of its own."""
+    command = [sys.executable, '-m', 'slam_observer_ros.cli.main', 'batch', *map(str, arguments)]
+    return subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for_lines(directory: Path, count: int, process) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while len(read_logs(directory)) < count:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_every_recording_is_run_with_every_setting(slam_observer, recordings, tmp_path):
+    out = tmp_path / 'results'
+    pattern = tmp_path / 'recordings' / '**' / '*.*'
+    ended = slam_observer.succeed('batch', pattern, *GRID, '--out', out, '--json')
+    assert ended.json == {
+        'runs': 4,
+        'done_before': 0,
+        'failed': 0,
+        'index': str(out / 'index.html'),
+    }
+    done = {(line['recording'], line['grid']['point_noise']): line for line in lines_of(out)}
+    assert set(done) == {(str(path), noise) for path in recordings for noise in (0.02, 0.05)}
+    options = ('--set', 'point_noise=0.05', '--set', 'observation_model=cartesian', '--json')
+    alone = slam_observer.succeed('replay', recordings[1], *options).json
+    line = done[str(recordings[1]), 0.05]
+    assert {name: line[name] for name in alone if name != 'seconds'} == {
+        name: value for name, value in alone.items() if name != 'seconds'
+    }
+
+
+def test_what_is_done_is_not_done_again(slam_observer, recordings, tmp_path):
+    out = tmp_path / 'results'
+    first = ('batch', recordings[0], '--out', out, '--workers', 1, '--json')
+    slam_observer.succeed(*first, '--grid', 'range_noise=0.1,0.2')
+    content = (out / 'runs.jsonl').read_bytes()
+    again = slam_observer.succeed(*first, '--grid', 'range_noise=0.2,0.1').json
+    assert (again['runs'], again['done_before']) == (2, 2)
+    assert (out / 'runs.jsonl').read_bytes() == content
+    more = slam_observer.succeed(*first, '--grid', 'range_noise=0.2,0.3').json
+    assert (more['runs'], more['done_before']) == (2, 1)
+    assert (out / 'runs.jsonl').read_bytes().startswith(content)
+    # The default, said or not, is one setting.
+    assert slam_observer.succeed(*first).json['done_before'] == 1
+
+
+def test_a_recording_that_fails_is_listed_and_the_rest_done(slam_observer, recordings, tmp_path):
+    out = tmp_path / 'results'
+    bad = tmp_path / 'bad.mcap'
+    bad.write_bytes(b'no recording')
+    options = ('--out', out, '--workers', 1)
+    ended = slam_observer('batch', bad, recordings[0], *options)
+    assert ended.code == 4
+    assert f'{bad} failed' in ended.errors
+    assert [line['recording'] for line in lines_of(out)] == [str(recordings[0])]
+    (failure,) = map(json.loads, (out / 'failed.jsonl').read_text().splitlines())
+    assert (failure['recording'], failure['grid']) == (str(bad), {})
+    bad.write_bytes(SAMPLE.read_bytes())  # now it is one
+    slam_observer.succeed('batch', bad, recordings[0], *options)
+    assert len(lines_of(out)) == 2
+    assert not (out / 'failed.jsonl').exists()
+
+
+def test_the_same_recording_under_two_names_is_run_once(slam_observer, recordings, tmp_path):
+    copy = tmp_path / 'copy.mcap'
+    copy.write_bytes(recordings[0].read_bytes())
+    ended = slam_observer('batch', recordings[0], copy, '--out', tmp_path / 'r', '--workers', 1)
+    assert ended.code == 0
+    assert f'{copy} is the same as {recordings[0]}' in ended.errors
+    assert len(lines_of(tmp_path / 'r')) == 1
+
+
+@pytest.mark.parametrize(
+    ('options', 'reason'),
+    [
+        (['--grid', 'range_nois=0.1'], "did you mean 'range_noise'"),
+        (['--grid', 'range_noise=-1'], 'range_noise'),
+        (['--grid', 'range_noise'], 'NAME=VALUE,VALUE'),
+        (['--grid', 'gains=constant', '--smooth'], '--smooth needs riccati gains'),
+        (['--shard', '3/2'], 'i from 1 to N'),
+        (['nothing/*.mcap'], "no file is named 'nothing/*.mcap'"),
+        (['--workers', '0'], 'at least one'),
+    ],
+)
+def test_what_can_not_be_run_is_refused_before_anything_is(
+    slam_observer, recordings, tmp_path, options, reason
+):
+    out = tmp_path / 'results'
+    assert reason in slam_observer.fail('batch', *options, recordings[0], '--out', out)
+    assert not out.exists()
+
+
+def test_shards_do_all_runs_once(slam_observer, recordings, tmp_path):
+    whole, parts = tmp_path / 'whole', tmp_path / 'parts'
+    options = (*recordings, '--grid', 'gains=riccati,scheduled,constant', '--workers', 1)
+    slam_observer.succeed('batch', *options, '--out', whole)
+    for number in (1, 2):
+        slam_observer.succeed('batch', *options, '--out', parts, '--shard', f'{number}/2')
+    assert len(lines_of(parts)) == 6
+    assert figures_of(lines_of(parts)) == figures_of(lines_of(whole))
+    assert sorted(file.name for file in parts.iterdir()) == [
+        'index.html',
+        'runs-1-of-2.jsonl',
+        'runs-2-of-2.jsonl',
+    ]
+
+
+@pytest.mark.parametrize('count', [1, 3, 7, 50])
+def test_shards_have_each_run_once_and_in_a_row(count):
+    runs = [
+        (recording, point)
+        for number in range(1, count + 1)
+        for recording, points in enumerate(part_of([Path()] * 5, 9, (number, count)))
+        for point in points
+    ]
+    assert runs == [(recording, point) for recording in range(5) for point in range(9)]
+
+
+def test_grids_may_have_lists():
+    points = grid_points(['linear_velocity_noise=[0,0,1],[0,0,2]', 'gains=riccati,constant'])
+    assert [point['linear_velocity_noise'][2] for point in points] == [1.0, 1.0, 2.0, 2.0]
+    assert [point['gains'] for point in points] == ['riccati', 'constant'] * 2
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
+def test_a_batch_that_was_stopped_goes_on(slam_observer, tmp_path, number):
+    out = tmp_path / 'results'
+    options = (SAMPLE, '--grid', 'range_noise=0.08,0.09,0.1,0.11', '--workers', 2)
+    process = started(*options, '--out', out)
+    wait_for_lines(out, 1, process)
+    os.kill(process.pid, number)
+    _, errors = process.communicate(timeout=PATIENCE_S)
+    assert 'Traceback' not in errors
+    if number == signal.SIGINT:
+        assert process.returncode == 130
+        assert (out / 'index.html').exists()
+    done = read_logs(out)
+    assert 1 <= len(done) < 4
+    with (out / 'runs.jsonl').open('a') as file:
+        file.write('{"run": "of a line that a power cut has left')
+    slam_observer.succeed('batch', *options, '--out', out)
+    lines = lines_of(out)
+    assert len(lines) == len({line['run'] for line in lines}) == 4
+    assert lines[: len(done)] == list(done.values())
+
+
+def test_processes_end_with_a_batch_that_is_killed(tmp_path):
+    out = tmp_path / 'results'
+    process = started(SAMPLE, '--grid', 'range_noise=0.1,0.2,0.3,0.4,0.5', '--out', out)
+    wait_for_lines(out, 1, process)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + PATIENCE_S
+    while _is_alive(process.pid):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _is_alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_no_two_batches_write_to_one_file(tmp_path):
+    with opened_log(tmp_path / 'runs.jsonl') as log:
+        log.append({'run': 'a'})
+        with (
+            pytest.raises(OutputError, match='another batch'),
+            opened_log(tmp_path / 'runs.jsonl'),
+        ):
+            pass
+    assert read_logs(tmp_path) == {'a': {'run': 'a'}}
+
+
+def halve_or_die(number: int) -> float:
+    if number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 5:
+        raise ZeroDivisionError('five')
+    return number / 2
+
+
+def test_a_run_that_kills_its_process_stops_no_other():
+    ended = {one.job: one for one in local_pool(2).run(halve_or_die, range(8))}
+    assert set(ended) == set(range(8))
+    assert 'process died' in ended[3].failure
+    assert ended[5].failure == 'ZeroDivisionError: five'
+    others = [ended[number] for number in range(8) if number not in (3, 5)]
+    assert [one.result for one in others] == [one.job / 2 for one in others]
+
+
+def test_the_index_links_reports_and_sorts(slam_observer, tmp_path):
+    out = tmp_path / 'results'
+    grid = ('--grid', 'gains=constant,riccati', '--reports', '--trajectories')
+    slam_observer.succeed('batch', SAMPLE, *grid, '--out', out, '--workers', 1)
+    page = out / 'index.html'
+    for line in lines_of(out):
+        assert (out / line['report']).stat().st_size > 100_000
+        assert (out / line['trajectory']).read_text().startswith('# timestamp')
+        assert line['report'] in page.read_text()
+    settings = re.search(r'<h2>Settings.*?</section>', page.read_text(), re.S).group()
+    assert '<tr class=best><td>riccati</td>' in settings
+    opened = open_page(page)
+    assert (opened.console, opened.requested) == ([], [])
+    click = "<script>document.querySelector('thead button').click();</script></body>"
+    page.write_text(page.read_text().replace('</body>', click))
+    html = open_page(page).html
+    assert html.index('<td>constant</td>') < html.index('<td>riccati</td>')
+    assert 'aria-sort="ascending"' in html

@@ -1,0 +1,107 @@
+"""A batch on a real Dask cluster: a scheduler and two workers on loopback, one of them killed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+import re
+import subprocess
+import sys
+import time
+
+from command_line import CommandLine
+import pytest
+
+from slam_observer_ros.cli.batch.run_log import read_logs
+
+pytest.importorskip('distributed', reason="no Dask is installed (pip's extra 'cluster')")
+
+SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
+PATIENCE_S = 100.0
+RUNS = 5
+GRID = ('--grid', 'range_noise=' + ','.join(f'0.{number}' for number in range(1, RUNS + 1)))
+
+
+class Cluster:
+    """A scheduler and its workers, as processes."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._log = (folder / 'dask.log').open('w')
+        self._scheduler_file = folder / 'scheduler.json'
+        self.scheduler = self._start('scheduler', '--no-dashboard', '--no-show')
+        self.workers = [
+            self._start('worker', '--no-nanny', '--nthreads', '1', '--no-dashboard')
+            for _ in range(2)
+        ]
+        deadline = time.monotonic() + PATIENCE_S
+        while self.output.count('Starting established connection to') < 2:
+            assert time.monotonic() < deadline, self.output
+            time.sleep(0.05)
+
+    def _start(self, kind: str, *options: str) -> subprocess.Popen[bytes]:
+        listen = ('--host', '127.0.0.1', '--port', '0') if kind == 'scheduler' else ()
+        worker_host = ('--host', '127.0.0.1') if kind == 'worker' else ()
+        command = [sys.executable, '-m', f'distributed.cli.dask_{kind}', *listen, *worker_host]
+        command += ['--scheduler-file', str(self._scheduler_file), *options]
+        return subprocess.Popen(
+            command, cwd=self._folder, stdout=subprocess.DEVNULL, stderr=self._log
+        )
+
+    @property
+    def output(self) -> str:
+        return (self._folder / 'dask.log').read_text()
+
+    @property
+    def address(self) -> str:
+        found = re.search(r'"address": "(tcp://[^"]+)"', self._scheduler_file.read_text())
+        assert found
+        return found.group(1)
+
+    def stop(self) -> None:
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+        self._log.close()
+
+
+@pytest.fixture(name='cluster')
+def fixture_cluster(tmp_path) -> Iterator[Cluster]:
+    cluster = Cluster(tmp_path)
+    try:
+        yield cluster
+    finally:
+        cluster.stop()
+
+
+def figures_of(lines):
+    return {run: {**line, 'seconds': None} for run, line in lines.items()}
+
+
+@pytest.mark.timeout(400)  # Dask takes long to start on a busy machine
+def test_a_cluster_that_loses_a_worker_does_every_run_once(cluster, capsys, tmp_path):
+    remote, local = tmp_path / 'remote', tmp_path / 'local'
+    command = [sys.executable, '-m', 'slam_observer_ros.cli.main', 'batch', str(SAMPLE), *GRID]
+    batch = subprocess.Popen(
+        [*command, '--out', str(remote), '--scheduler', cluster.address, '--trajectories']
+    )
+    deadline = time.monotonic() + PATIENCE_S
+    while not read_logs(remote):
+        assert batch.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    cluster.workers[0].kill()
+    assert len(read_logs(remote)) < RUNS
+    assert batch.wait(PATIENCE_S) == 0
+    lines = read_logs(remote)
+    assert len((remote / 'runs.jsonl').read_text().splitlines()) == len(lines) == RUNS
+    CommandLine(capsys).succeed('batch', SAMPLE, *GRID, '--out', local, '--trajectories')
+    assert figures_of(lines) == figures_of(read_logs(local))
+    for line in lines.values():
+        file = line['trajectory']
+        assert (remote / file).read_bytes() == (local / file).read_bytes()
+
+
+def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(capsys, tmp_path):
+    options = ('batch', SAMPLE, '--out', tmp_path / 'r', '--scheduler', 'tcp://127.0.0.1:9')
+    assert 'no Dask scheduler answers there' in CommandLine(capsys).fail(*options)
