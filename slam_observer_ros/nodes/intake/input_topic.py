@@ -162,7 +162,11 @@ class InputTopic(Generic[MessageT]):
         found = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in found]
         if usable and self._type_name not in usable:
-            self._subscribe(usable[0])
+            # A topic has one type at a time, and the executor lets go of the old one after this.
+            if self._subscription is None:
+                self._subscribe(usable[0])
+            else:
+                self.close()
         self._fault = self._find_fault(publishers, usable)
         if problem := self.problem:
             self._log.warning(self.topic, problem)
@@ -174,7 +178,6 @@ class InputTopic(Generic[MessageT]):
             self._subscription = None
 
     def _subscribe(self, type_name: str) -> None:
-        self.close()
         self._type_name = type_name
         self._subscription = self._node.create_subscription(
             message_class(type_name), self.topic, with_info(self._receive), self._qos, raw=True
