@@ -51,15 +51,18 @@ setup(
             'mcap>=1.2,<2',  # salvages recordings that were cut off, which rosbags refuses
             'matplotlib',  # figures
             'rich',  # live progress and tables in the terminal
+            'argcomplete',  # completion in the shell
         ],
         'cluster': ['distributed'],  # runs a batch on the machines of a Dask cluster
         # A ROS installation brings these itself, so nothing here may come with the package.
         **{f'ros-{ros}': [f'ros-{ros}-{wheel}' for wheel in ROS_WHEELS] for ros in ROS_RELEASES},
+        'rerun': ['rerun-sdk>=0.41; python_version >= "3.11"'],  # replay --rerun
         'test': [
             'pytest',  # named in this extra, it is what `colcon test` runs
             'pytest-timeout',  # a ROS test that hangs must fail
             'hypothesis',  # the paper's lemmas are properties
             'catkin_pkg',  # reads package.xml
+            'jsonschema',  # holds parameter files against the schema that editors get
             # finds the same errors in what a replay writes; GPL, so only run as a program
             'evo; python_version >= "3.11"',
             'threadpoolctl',  # counts the threads that numpy takes

@@ -141,6 +141,9 @@ class ObservationEvent:
     # (m, 3) where each was measured from, by default from the base: noise grows with the distance.
     sensor: FloatArray | None = None
     receive_ns: int | None = None
+    # (m, 3, 3) of each landmark's own axes; all zero where unknown, as of a point
+    orientations: FloatArray | None = None
+    orientation_covariances: FloatArray | None = None  # (m, 3, 3) of rotation vectors, rad²
 
     def moved(self, pose: FloatArray) -> ObservationEvent:
         """Return it in the frame in which its own has ``pose`` (4, 4)."""
@@ -152,6 +155,10 @@ class ObservationEvent:
             covariances=None if self.covariances is None else _turned(self.covariances, R),
             velocities=None if self.velocities is None else se3.rotate(pose, self.velocities),
             sensor=se3.transform(pose, sensor),
+            orientations=None if self.orientations is None else R @ self.orientations,
+            orientation_covariances=None
+            if self.orientation_covariances is None
+            else _turned(self.orientation_covariances, R),
         )
 
     @property
@@ -168,7 +175,7 @@ class ObservationEvent:
 
     def select(self, mask: BoolArray) -> ObservationEvent:
         """Return the points that ``mask`` (m,) picks."""
-        if mask.all():
+        if np.count_nonzero(mask) == len(mask):
             return self
         return replace(
             self,
@@ -177,6 +184,10 @@ class ObservationEvent:
             covariances=None if self.covariances is None else self.covariances[mask],
             velocities=None if self.velocities is None else self.velocities[mask],
             sensor=None if self.sensor is None else self.sensor[mask],
+            orientations=None if self.orientations is None else self.orientations[mask],
+            orientation_covariances=None
+            if self.orientation_covariances is None
+            else self.orientation_covariances[mask],
         )
 
 

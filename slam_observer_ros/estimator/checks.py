@@ -50,8 +50,8 @@ def check_event(event: Event, settings: Settings) -> None:
     ------
     InvalidEventError
         With the reason ``'wrong_type'``, ``'negative_stamp'``, ``'wrong_shape'``,
-        ``'not_finite'``, ``'too_large'``, ``'too_fast'``, ``'negative_id'`` or
-        ``'bad_covariance'``.
+        ``'not_finite'``, ``'too_large'``, ``'too_fast'``, ``'negative_id'``,
+        ``'bad_covariance'`` or ``'bad_orientation'``.
 
     """
     if isinstance(event, VelocityEvent):
@@ -96,8 +96,7 @@ def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
     except InvalidEventError as error:
         raise ParameterError(str(error)) from error
     R = pose[:3, :3]
-    is_rotation = np.abs(R.T @ R - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0
-    if not is_rotation or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
+    if not _are_rotations(R) or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
         raise ParameterError('pose: no matrix [[R, x], [0, 1]] with a rotation R')
 
 
@@ -195,6 +194,24 @@ def _check_observation(event: ObservationEvent) -> None:
         _check_coordinates('landmark velocities', event.velocities, (m, 3))
     if event.sensor is not None:
         _check_coordinates("sensor's positions", event.sensor, (m, 3))
+    if event.orientations is not None:
+        _check_orientations(event.orientations, m)
+    if event.orientation_covariances is not None:
+        _check_array('orientation covariances', event.orientation_covariances, (m, 3, 3))
+        _check_definite('orientation covariances', event.orientation_covariances)
+
+
+def _check_orientations(orientations: FloatArray, m: int) -> None:
+    """Check that all are rotations (m, 3, 3), or all zero for unknown ones."""
+    _check_array('landmark orientations', orientations, (m, 3, 3))
+    known = orientations[orientations.any(axis=(1, 2))]
+    if not _are_rotations(known):
+        raise InvalidEventError('bad_orientation', 'a landmark orientation is no rotation')
+
+
+def _are_rotations(R: FloatArray) -> bool:
+    skew = np.abs(transpose(R) @ R - np.eye(3)).max(initial=0.0)
+    return bool(skew < ROTATION_TOLERANCE and np.all(np.linalg.det(R) > 0.0))
 
 
 def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:

@@ -88,6 +88,20 @@ class OutgoingMessages:
         header = self.header(stamp_ns, frame_id)
         return self.make('geometry_msgs/msg/PoseStamped', header=header, pose=self.pose(pose))
 
+    def transform_stamped(self, stamp_ns: int, parent: str, child: str, pose: FloatArray) -> Any:
+        """Make a geometry_msgs/TransformStamped of the pose of ``child`` in ``parent``."""
+        transform = self.make(
+            'geometry_msgs/msg/Transform',
+            translation=self.vector(pose[:3, 3]),
+            rotation=self.quaternion(pose[:3, :3]),
+        )
+        return self.make(
+            'geometry_msgs/msg/TransformStamped',
+            header=self.header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=transform,
+        )
+
     def twist(self, body_velocity: FloatArray) -> Any:
         """Make a geometry_msgs/Twist."""
         angular, linear = self.vector(body_velocity[:3]), self.vector(body_velocity[3:])

@@ -20,7 +20,7 @@ from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
-_QUATERNION_NORM_TOLERANCE = 0.1
+QUATERNION_NORM_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +170,12 @@ def _read_twist(reader: CdrReader) -> FloatArray:
 def _read_covariance(reader: CdrReader) -> FloatArray | None:
     """Read a 6 × 6 covariance; rotational part first."""
     covariance = _known(reader.float64(36).reshape(6, 6))
-    return None if covariance is None else covariance[np.ix_(_ANGULAR_FIRST, _ANGULAR_FIRST)]
+    return None if covariance is None else angular_first(covariance)
+
+
+def angular_first(covariances: FloatArray) -> FloatArray:
+    """Return covariances (…, 6, 6) as they are here, from ROS's order."""
+    return covariances[..., _ANGULAR_FIRST[:, None], _ANGULAR_FIRST]
 
 
 def _known(covariance: FloatArray) -> FloatArray | None:
@@ -212,5 +217,5 @@ def _quaternion_problem(quaternion: FloatArray) -> str:
     """Return why a quaternion is no rotation; empty if it is one."""
     norm = math.hypot(*quaternion)  # which does not overflow
     # Written so that NaN is refused too.
-    is_turn = abs(norm - 1.0) < _QUATERNION_NORM_TOLERANCE
+    is_turn = abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
     return '' if is_turn else f'quaternion of norm {norm:.3g}, not 1'

@@ -12,10 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -34,6 +35,8 @@ class Filter:
     joint: JointCovariance | None = None
     has_joint_covariance: ClassVar[bool] = False
     ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect on the filter
+    # Those of tags, where they are estimated; else only their positions are used.
+    orientations: LandmarkOrientations | None = None
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
@@ -57,12 +60,25 @@ class Filter:
         is the time since each was last seen.
         """
         # A filter that postpones moves of landmarks has made them for :meth:`expected_points`.
-        observer = self.observer
+        observer, joint = self.observer, self.joint
+        if joint is not None and not joint.is_dense:
+            joint.activate(rows)
         e, r = observer.errors(rows, points)
         return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
+        raise NotImplementedError
+
+    def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
+        """Move the state by how tags are turned; return the weights (m,), and which are unclear.
+
+        Of filters that estimate ``orientations``.
+        """
+        raise NotImplementedError
+
+    def add_orientations(self, seen: SeenOrientations) -> None:
+        """Take over orientations of which nothing is known yet, as they are seen."""
         raise NotImplementedError
 
     # Landmarks
@@ -90,6 +106,11 @@ class Filter:
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
         return self.observer.body_points(rows)
+
+    def translations(self, rows: IntArray) -> FloatArray:
+        """Return â_i (m, 3) of landmarks, metres."""
+        a: FloatArray = self.observer.a[rows]
+        return a
 
     # The frame
 

@@ -33,10 +33,9 @@ class State:
         self.observer, self.axes = self.filter.observer, self.filter.axes
         self.landmarks = LandmarkTable()
         self.relinearisation: Relinearisation | None = None  # where the filter needs it
-        if filter_.joint is not None and not self.landmark_velocity_stddev:
-            self.relinearisation = Relinearisation(
-                self.observer, filter_.calibration, filter_.joint, settings
-            )
+        takes_points = filter_.orientations is None and not self.landmark_velocity_stddev
+        if filter_.joint is not None and takes_points:
+            self.relinearisation = Relinearisation(filter_, settings)
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
         self.was_contradicted = False  # most known landmarks seen last were rejected
@@ -189,6 +188,10 @@ class State:
         if self.landmark_velocity_stddev:
             raise ParameterError(
                 "smoothing takes landmarks to rest: 'landmark_velocity_stddev' must be 0"
+            )
+        if self.filter.orientations is not None:
+            raise ParameterError(
+                "smoothing takes tags for points: 'use_tag_orientation' must be false"
             )
         if self.relinearisation is None:
             raise ParameterError(

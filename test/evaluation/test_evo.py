@@ -60,6 +60,6 @@ def test_evo_finds_the_same_error_in_a_recording(run_evo, figures, tmp_path):
     assert found == pytest.approx(figures['ate_rmse_m'], abs=1e-9)
 
 
-@pytest.mark.parametrize('topic', ['/pose', '/odometry', '/aligned_truth/pose'])
+@pytest.mark.parametrize('topic', ['/pose', '/observer_node/odometry', '/aligned_truth/pose'])
 def test_evo_reads_the_topics_of_a_recording(run_evo, figures, topic):
     assert 'poses' in run_evo('evo_traj', 'mcap', 'run.mcap', topic)

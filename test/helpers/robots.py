@@ -7,14 +7,12 @@ import time
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud, PointCloud2
 
 from slam_observer_ros.common.clock_jumps import AGREEING_STAMPS
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.outgoing import encode_point_cloud
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
-from slam_observer_ros.messages.state_messages import encode_transform
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
@@ -109,11 +107,8 @@ class TransformSender:
         publisher.publish(
             TFMessage(
                 transforms=[
-                    transform
+                    MESSAGES.transform_stamped(stamp_ns, parent, child, pose)
                     for parent, child, pose in poses
-                    for transform in deserialize_message(
-                        encode_transform(stamp_ns, parent, child, pose), TFMessage
-                    ).transforms
                 ]
             )
         )

@@ -545,6 +545,7 @@ def outgoing_messages(make):
         make.quaternion(pose[:3, :3]),
         make.pose(pose),
         make.pose_stamped(stamp, 'map', pose),
+        make.transform_stamped(stamp, 'map', 'base_link', pose),
         make.twist(velocity),
         make.twist_stamped(stamp, 'base_link', velocity),
         make.point_cloud2(stamp, 'map', *cloud),
