@@ -17,7 +17,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon docs benchmark benchmark-accuracy venv lock \
+.PHONY: help demo robot test lint format pytest colcon docs benchmark benchmark-accuracy venv lock \
 	clean
 
 help:  ## list these targets
@@ -25,6 +25,9 @@ help:  ## list these targets
 
 demo: $(READY)  ## run simulator and observer until they converge; pictures in demo_output/
 	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.demo
+
+robot: $(READY)  ## localise a simulated robot with a camera among AprilTags, as for Nav2
+	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.robot
 
 test: lint pytest colcon  ## everything that a change must pass
 
@@ -64,7 +67,8 @@ venv: $(READY)  ## only set up .venv
 lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt names
 	$(PYTHON_IN_VENV) -m pip install --quiet uv
 	$(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
-		--extra cli --extra cluster --extra test --extra dev --extra ros-jazzy --constraint constraints.txt \
+		--extra cli --extra cluster --extra rerun --extra test --extra dev --extra ros-jazzy \
+		--constraint constraints.txt \
 		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
 
 $(READY): setup.py constraints.txt requirements.lock \

@@ -26,7 +26,9 @@ from slam_observer_ros.nodes.publishing.localisation_status import LocalisationS
 from slam_observer_ros.nodes.ros_parameters import read_settings
 from slam_observer_ros.nodes.services.control_services import ControlServices
 from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
+from slam_observer_ros.nodes.services.kept_pose import KeptPose
 from slam_observer_ros.nodes.services.map_services import MapServices
+from slam_observer_ros.nodes.services.named_map_services import NamedMapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -34,6 +36,7 @@ from slam_observer_ros.settings.parameter_table import changed_names
 OVERVIEW_PERIOD_S = 0.5
 DIAGNOSTICS_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
+KEEP_PERIOD_S = 2.0
 RETRY_PERIOD_S = 0.02
 
 MOTION_INPUTS = ('twist', 'imu')
@@ -85,6 +88,9 @@ class ObserverCore:
         )
         # What others may do to the estimate
         self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
+        NamedMapServices(node, self._maps)
+        self._kept_pose = KeptPose(node, settings, self._estimator)
+        self._kept_pose.restore()
         InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
         ControlServices(node, self._estimator, self._feed, self._publisher)
         node.add_post_set_parameters_callback(self._apply_parameters)
@@ -127,6 +133,7 @@ class ObserverCore:
         Raises a MapError if the map can't be saved; all is removed nevertheless.
         """
         try:
+            self._kept_pose.keep()
             self._maps.save_at_end()
         finally:
             self._jump_handle.unregister()
@@ -151,6 +158,7 @@ class ObserverCore:
                 (OVERVIEW_PERIOD_S, self._maps.keep_recent),
                 (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
                 (CHECK_PERIOD_S, self._localisation.publish),
+                (KEEP_PERIOD_S, self._kept_pose.keep),
                 (RETRY_PERIOD_S, self._feed.retry),
                 *((CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
             )

@@ -25,8 +25,8 @@ USAGE = """\
 usage: ros2 run slam_observer_ros NODE [--ros-args [-p NAME:=VALUE] [--params-file FILE]
                                                    [-r TOPIC:=/OTHER_TOPIC] ...]
 
-README.md lists the topics and services of observer_node and its main parameters,
-docs/parameters.md all parameters; of a running node `ros2 param list` does.
+docs/topics.md lists the topics and services of observer_node, docs/parameters.md all parameters;
+of a running node `ros2 param list` does.
 """
 
 STOP_LATENCY_S = 0.1

@@ -36,9 +36,12 @@ class Observer:
 
     def body_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen, Â⁻¹ (y_i° + â_i) (m, 3), metres, body frame."""
-        arms = self.points.take(rows, axis=0, mode='wrap') - self.A[:3, 3]
-        points: FloatArray = arms.dot(self.A[:3, :3])
-        return points
+        return self.in_body_frame(self.points.take(rows, axis=0, mode='wrap'))
+
+    def in_body_frame(self, points: FloatArray) -> FloatArray:
+        """Return points (m, 3) of the reference frame in the body frame, metres."""
+        turned: FloatArray = (points - self.A[:3, 3]).dot(self.A[:3, :3])
+        return turned
 
     def turned(self, covariances: FloatArray) -> FloatArray:
         """Return covariances (m, 3, 3) from the body frame in the reference frame."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 import logging
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 from slam_observer_ros.common.errors import MessageError, RecordingError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import Event
+from slam_observer_ros.events import Event, VelocityBlock
 from slam_observer_ros.inputs.event_builder import (
     drop_reason,
     DropError,
@@ -23,17 +23,22 @@ from slam_observer_ros.inputs.event_builder import (
 )
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.pose_blocks import PoseBlock
+from slam_observer_ros.messages.velocity_blocks import BlockDecoder
 from slam_observer_ros.recording.arrivals import Arrivals
 from slam_observer_ros.recording.contents import Contents
 from slam_observer_ros.recording.decoding import (
+    block_decoder,
+    Decode,
     decode_landmarks,
     decode_pose,
+    decode_pose_block,
     decode_transform_message,
     input_decoders,
 )
 from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
-from slam_observer_ros.recording.sources import Loss, RawMessage, Topic
+from slam_observer_ros.recording.sources import Loss, RawBlock, RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -41,8 +46,23 @@ from slam_observer_ros.settings.input_settings import InputSettings
 if TYPE_CHECKING:
     from slam_observer_ros.recording.writer import RecordingWriter
 
+FEWEST_IN_BLOCK = 4
+"""Messages that cost less one by one."""
+
 logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Reading:
+    """How the messages of a recording become events."""
+
+    transforms: TransformBuffer
+    builder: EventBuilder
+    decoders: dict[Topic, Decode]
+    decode_block: BlockDecoder | None
+    simulated: set[Topic]  # of a clock that begins at zero
+    moving: Sequence[Topic]  # of transforms
 
 
 class Recording:
@@ -134,8 +154,22 @@ class Recording:
         inputs: InputSettings = InputSettings(),
         velocity_timeout_s: float = Settings.velocity_timeout,
     ) -> Iterator[Event]:
+        """Yield the events of :meth:`blocks` one by one."""
+        for item in self.blocks(selected, inputs, velocity_timeout_s):
+            if isinstance(item, VelocityBlock):
+                yield from item.events()
+            else:
+                yield item
+
+    def blocks(
+        self,
+        selected: SelectedTopics,
+        inputs: InputSettings = InputSettings(),
+        velocity_timeout_s: float = Settings.velocity_timeout,
+    ) -> Iterator[Event | VelocityBlock]:
         """Yield velocities and observations in the base frame, as the live node makes them.
 
+        Where velocities follow each other they come in blocks, which are cheaper to handle.
         They come in the order in which they were received; what waits for a transform on /tf
         comes when that has been received, or is dropped after the timeout. Stamps are those of
         the messages' headers; an unstamped Twist has its receive time, and so has what leaves its
@@ -151,19 +185,28 @@ class Recording:
             topic for topic in decoders if self.contents.begins_at_zero(topic, decoders[topic])
         }
         self.arrivals = {topic.name: Arrivals(velocity_timeout_s) for topic in decoders}
-        moving = selected.transforms.moving
-        for raw in self._source.messages((*decoders, *moving)):
-            if raw.topic in moving:
-                self._insert(transforms, raw, is_static=False)
-            # What waited for a transform, then what has just come
-            events = builder.retry(raw.receive_stamp_ns)
-            if raw.topic in decoders:
-                for measured in self._decoded(raw, decoders[raw.topic]) or ():
-                    timed = self._timed(measured, raw, raw.topic in simulated)
-                    events += builder.add(timed, raw.receive_stamp_ns)
-            for event in events:
-                yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
+        decode_block, moving = block_decoder(selected, inputs), selected.transforms.moving
+        reading = _Reading(transforms, builder, decoders, decode_block, simulated, moving)
+        for raw in self._source.blocks((*decoders, *moving), selected.velocity):
+            if isinstance(raw, RawBlock) and (block := _velocities_of(raw, reading)) is not None:
+                self.arrivals[raw.topic.name].add_all(raw.receive_stamps_ns, block.stamps_ns)
+                yield block
+                continue
+            for message in raw.messages():
+                yield from self._events_of(message, reading)
         yield from builder.finish()
+
+    def _events_of(self, raw: RawMessage, reading: _Reading) -> Iterator[Event]:
+        if raw.topic in reading.moving:
+            self._insert(reading.transforms, raw, is_static=False)
+        # What waited for a transform, then what has just come
+        events = reading.builder.retry(raw.receive_stamp_ns)
+        if raw.topic in reading.decoders:
+            for measured in self._decoded(raw, reading.decoders[raw.topic]) or ():
+                timed = self._timed(measured, raw, raw.topic in reading.simulated)
+                events += reading.builder.add(timed, raw.receive_stamp_ns)
+        for event in events:
+            yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
 
     def copy_to(self, writer: RecordingWriter, selected: SelectedTopics) -> list[Topic]:
         """Write what was read, as it was received; return topics left out, of unknown types."""
@@ -188,13 +231,24 @@ class Recording:
 
         Poses of another frame are moved to it by /tf_static, or left as they are, with a warning.
         """
-        poses = list(self._all_decoded(selected.pose_truth, decode_pose))
+        poses = list(self._true_poses(selected.pose_truth))
         base_in: dict[str, FloatArray] = {}
         if frames := other_frames(base_frame, poses):
             transforms = self._static_transforms(selected)
             base_in = base_in_frames(frames, base_frame, transforms)
         landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)
         return Truth.from_messages(poses, base_in, landmarks)
+
+    def _true_poses(self, topic: Topic | None) -> Iterator[PoseBlock]:
+        for raw in self._source.blocks((topic,), topic) if topic else ():
+            block = _pose_block(raw) if isinstance(raw, RawBlock) else None
+            if block is not None:
+                yield block
+                continue
+            for message in raw.messages():
+                pose = self._decoded(message, decode_pose)
+                if pose is not None:
+                    yield PoseBlock.of(pose)
 
     def _static_transforms(self, selected: SelectedTopics) -> TransformBuffer:
         transforms = TransformBuffer()
@@ -238,3 +292,23 @@ class Recording:
         if not self.dropped[reason]:
             logger.warning('Dropped a message (%s): %s', reason, error)
         self.dropped[reason] += 1
+
+
+def _velocities_of(raw: RawBlock, reading: _Reading) -> VelocityBlock | None:
+    """Return the velocities of messages; None if one of them needs a look for itself."""
+    if reading.decode_block is None or len(raw.data) < FEWEST_IN_BLOCK:
+        return None
+    try:
+        frame_id, velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
+    except MessageError:
+        return None
+    has_stamps = raw.topic in reading.simulated or velocities.stamps_ns.all()
+    return velocities if has_stamps and reading.builder.passes_on(frame_id) else None
+
+
+def _pose_block(raw: RawBlock) -> PoseBlock | None:
+    """Return the poses of messages; None if one of them needs a look for itself."""
+    try:
+        return decode_pose_block(raw)
+    except MessageError:
+        return None

@@ -204,6 +204,8 @@ class PoseBroadcaster:
     def _choose_child(self, child: str, reason: str) -> None:
         self._child = child
         settings = self._settings
+        if not self._publisher.can_publish:
+            return
         self._node.get_logger().info(
             f"publishing '{settings.map_frame}' to '{child}' on /tf: "
             f"{reason} '{settings.odom_frame}' to '{settings.base_frame}'"

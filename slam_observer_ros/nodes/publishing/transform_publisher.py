@@ -29,6 +29,11 @@ class TransformPublisher:
         else:
             self._publisher = node.create_publisher(TFMessage, topic, qos)
 
+    @property
+    def can_publish(self) -> bool:
+        """Whether transforms go out."""
+        return self._publisher is not None
+
     def publish(self, stamp_ns: int, parent: str, child: str, pose: FloatArray) -> None:
         """Publish the pose (4, 4) of frame ``child`` in frame ``parent``."""
         if self._publisher is None:

@@ -15,7 +15,12 @@ from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import block_diagonal, kalman_update, transpose
+from slam_observer_ros.geometry.matrices import (
+    block_diagonal,
+    kalman_update,
+    transpose,
+    with_blocks,
+)
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -24,6 +29,11 @@ from slam_observer_ros.sensor_models.motion import Motion
 
 class JointCovariance:
     """P, and which of its columns are whose."""
+
+    # Whether all landmarks are in P, and the rows of those that are, in its order: a correction
+    # moves these. See :mod:`.compressed_covariance`.
+    is_dense = True
+    active: IntArray | slice = slice(None)
 
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         self._axes, self._p = axes, axes.p
@@ -70,6 +80,17 @@ class JointCovariance:
         """Return ξ_i (n, 3) of x, and the changes of velocities, None where there are none."""
         return self._axes.full_points(x[self.first :]), None
 
+    def activate(self, rows: IntArray) -> None:
+        """See to it that landmarks (m,), which are going to be observed, are in P."""
+
+    def dense(self) -> JointCovariance:
+        """Return the same with all landmarks in P."""
+        return self
+
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far landmarks (m, 3) have yet to be moved, metres."""
+        raise NotImplementedError
+
     # The step
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
@@ -113,6 +134,11 @@ class JointCovariance:
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the same of all together, (p, m k) and (m k, m k)."""
         return self._output(C.reshape(-1, self._p), self._columns(rows))
+
+    def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
+        """Return −K r of residuals r (m, k) of noise R (m, k, k), K = P Hᵀ S⁻¹, and update P."""
+        HP, HPH = self.project(C, rows)
+        return -self.update(HP, with_blocks(HPH, R), r.ravel())
 
     def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
         """Update P by what :meth:`project` projected; return K r, K = P Hᵀ S⁻¹ the gain."""
@@ -211,6 +237,8 @@ class JointCovariance:
 
 class ExactMapCovariance(JointCovariance):
     """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
+
+    active = slice(0)
 
     def __init__(
         self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray
