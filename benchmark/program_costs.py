@@ -18,6 +18,7 @@ import worlds
 TURNS = 5
 LONGEST_S = 300.0
 FEW, MANY, SEEN = 10, 1000, 10  # landmarks, for the memory of one
+LARGE_MAPS = (1000, 5000, 10_000)  # for the memory of all, with Riccati gains
 COMMAND = [sys.executable, '-m', 'slam_observer_ros.cli.main']
 
 READ = """\
@@ -58,7 +59,14 @@ def measure_memory() -> Tables:
     rows: dict[str, list[float | None]] = {
         name: [value_kb, value_kb / grown_kb[EKF]] for name, value_kb in grown_kb.items()
     }
-    return {'memory': Table(columns=['kB', f'over the {EKF}'], rows=rows)}
+    of_few_kb = peak_kb('riccati', FEW)
+    large: dict[str, list[float | None]] = {
+        'riccati': [1e-6 * (peak_kb('riccati', known) - of_few_kb) for known in LARGE_MAPS]
+    }
+    return {
+        'memory': Table(columns=['kB', f'over the {EKF}'], rows=rows),
+        'memory_large': Table(columns=[f'n = {known}' for known in LARGE_MAPS], rows=large),
+    }
 
 
 def take_turns(first: list[str], second: list[str]) -> tuple[float, float]:

@@ -560,7 +560,9 @@ class Estimator:
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
         warnings.unexpected_poses(self._hypotheses.count)
-        warnings.large_map(len(state.landmarks), limit, state.filter.has_joint_covariance)
+        joint = state.filter.joint
+        is_dense = joint is not None and joint.is_dense and not state.is_fixed
+        warnings.large_map(len(state.landmarks), limit, is_dense)
 
     def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
         observer = self._state.observer

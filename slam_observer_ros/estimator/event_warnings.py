@@ -69,8 +69,11 @@ class EventWarnings:
         text = f'Points without an id are not used by {gains} gains, only by riccati'
         self._warn('unknown_id', text)
 
-    def large_map(self, count: int, limit: int, is_slow: bool) -> None:
-        """Say once that a map is full, with 0 < ``limit``, and once that it takes long."""
+    def large_map(self, count: int, limit: int, is_dense: bool) -> None:
+        """Say once that a map is full, with 0 < ``limit``, and once that it takes long.
+
+        That is where a joint covariance has all landmarks in it.
+        """
         if 0 < limit <= count:
             self._warn_once(
                 'full_map',
@@ -78,12 +81,11 @@ class EventWarnings:
                 'one replaces the one seen least often. If so many are right, set it higher; if '
                 'not, look for ids that the sensor makes up.',
             )
-        if is_slow and count >= MANY_LANDMARKS:
+        if is_dense and count >= MANY_LANDMARKS:
             self._warn_once(
                 'large_map',
-                f'The map has {count} landmarks, and the time that riccati gains take grows with '
-                'their square: scheduled gains take many more, if points have ids, and '
-                'max_landmarks limits them.',
+                f'The map has {count} landmarks. Where they move or have orientations, the time '
+                'that riccati gains take grows with their square; max_landmarks limits them.',
             )
 
     def loaded_map(self, count: int, limit: int) -> None:

@@ -35,7 +35,7 @@ class OutsideLandmarks:
         return other
 
     def rows(self, slots: IntArray) -> IntArray:
-        """Return the rows (m k,) of landmarks in B and X."""
+        """Return where landmarks are in B and X (m k,)."""
         return (self._k * slots[:, None] + np.arange(self._k)).ravel()
 
     def blocks(self, slots: IntArray) -> FloatArray:

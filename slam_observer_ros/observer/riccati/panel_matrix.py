@@ -59,7 +59,7 @@ class PanelMatrix:
         self._reserve(len(self._w))
 
     def columns(self, indices: IntArray) -> FloatArray:
-        """Return columns (m,), in ascending order, of M: (N, m)."""
+        """Return M (N, m) at ascending ``indices`` (m,) of its columns."""
         found = np.empty((len(self), len(indices)))
         w, rank = self._w, len(self._w)
         U = self._U.array[:, :rank]

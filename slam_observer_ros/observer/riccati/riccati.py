@@ -7,7 +7,8 @@ of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i f
 
 and what no observation can determine, the choice of the world's frame, is exactly in its null
 space: the covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
-X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²).
+X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
+in large maps less: :mod:`.compressed_covariance`.
 """
 
 from __future__ import annotations
