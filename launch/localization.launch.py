@@ -16,23 +16,13 @@ from slam_observer_ros.nodes.launch_arguments import (
     check_optional_file,
     check_packages,
 )
+from slam_observer_ros.nodes.localization_setup import (
+    ARGUMENTS,
+    is_true,
+    parameters,
+    remappings,
+)
 
-ARGUMENTS = {
-    'namespace': ('', 'namespace of the robot'),
-    'use_sim_time': ('false', 'whether time is that of /clock'),
-    'autostart': ('true', 'whether the nodes are configured and activated at once'),
-    'use_respawn': ('false', 'whether nodes that have ended are started again'),
-    'log_level': ('info', 'least severity that is logged'),
-    'twist': ('odom', 'topic of the velocity'),
-    'landmarks': ('landmarks', 'topic of the observations'),
-    'imu': ('imu', 'topic of the angular velocity'),
-    'odometry': ('~/odometry', 'topic of the estimate'),
-    'pose': ('amcl_pose', 'topic of the pose'),
-    'map_file': ('', 'landmarks to be localised among; empty: as params_file says'),
-    'map': ('', 'occupancy grid for a map server, a YAML file; empty: none is started'),
-}
-
-INPUTS_AND_OUTPUTS = ('twist', 'landmarks', 'imu', 'pose')
 RESPAWN_DELAY_S = 2.0
 
 HAS_BOND = find_spec('bondpy') is not None
@@ -53,25 +43,12 @@ def start(context):
 
 
 def observer(given, common):
-    overrides = {
-        'use_sim_time': is_true(given['use_sim_time']),
-        'autostart_node': is_true(given['autostart']) and not given['map'],
-        'bond_heartbeat_period': 0.25 if given['map'] and HAS_BOND else 0.0,
-    }
-    if given['map_file']:
-        overrides['map_file'] = given['map_file']
     return Node(
         package='slam_observer_ros',
         executable='lifecycle_observer_node',
         name='observer_node',
-        parameters=[given['params_file'], overrides],
-        remappings=[
-            *((name, given[name]) for name in INPUTS_AND_OUTPUTS),
-            ('~/odometry', given['odometry']),
-            # as Nav2's nodes have it: each robot has its own below its namespace
-            ('/tf', 'tf'),
-            ('/tf_static', 'tf_static'),
-        ],
+        parameters=[given['params_file'], parameters(given, HAS_BOND)],
+        remappings=remappings(given),
         **common,
     )
 
@@ -102,10 +79,6 @@ def map_server(given, common):
             **common,
         ),
     ]
-
-
-def is_true(written):
-    return written.lower() in ('true', '1')
 
 
 def generate_launch_description():

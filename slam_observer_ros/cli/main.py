@@ -35,7 +35,9 @@ EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EX
 COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
+    'map': ('map', 'make a map file of a map of another program'),
     'replay': ('replay.command', 'run a recording through the observer'),
+    'tune': ('tune.command', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),
     'doctor': ('doctor', 'say what is installed, and what a node would hear'),
     'batch': ('batch.command', 'run many recordings with many settings'),
@@ -51,6 +53,8 @@ examples:
       the paper's simulation, and its figures 3 and 4
   slam-observer convert mrclam MRCLAM_Dataset6 --robot 1 robot1.mcap
       a public data set as a recording
+  slam-observer map convert tags.csv tags.yaml
+      a table of surveyed landmarks as a map file
   slam-observer replay robot1.mcap --plot figures --tum robot1.tum
       a recording through the observer, and its accuracy
   slam-observer replay my_robot.mcap --config my_robot.yaml --json

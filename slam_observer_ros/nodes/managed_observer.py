@@ -30,10 +30,10 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
 
     def __init__(self) -> None:
         super().__init__('observer_node')
-        forward_logging(self.get_logger())
-        declare_settings(self, Settings, ObserverNodeSettings, ManagedNodeSettings)
         self._core: ObserverCore | None = None
         self._bond: LifecycleBond | None = None
+        forward_logging(self.get_logger())
+        declare_settings(self, Settings, ObserverNodeSettings, ManagedNodeSettings)
         self._refuse_impossible_transitions()
         if read_settings(self, ManagedNodeSettings).autostart_node:
             self._start_by_itself()

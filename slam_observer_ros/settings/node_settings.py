@@ -106,6 +106,17 @@ class ObserverNodeSettings(InputSettings):
     map_path: str = parameter(
         '', 'File of ~/save_map, ~/load_map and autosave_map', read_only=False
     )
+    pose_file: str = parameter(
+        '',
+        'File in which the pose is kept every two seconds and at the end, and from which the next '
+        'start takes it, as ~/.ros/observer_pose.yaml; empty for none',
+    )
+    pose_file_max_age: float = parameter(
+        600.0,
+        'Age of that file, by the clock of the system, up to which it is used',
+        unit='s',
+        minimum=0.0,
+    )
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
 
     def with_checked_frames(self) -> ObserverNodeSettings:

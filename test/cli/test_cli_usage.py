@@ -40,7 +40,7 @@ def test_version(slam_observer):
 
 def test_help_has_examples(slam_observer):
     output = slam_observer.succeed('--help').output
-    for command in ('simulate', 'convert', 'replay'):
+    for command in ('simulate', 'convert', 'map', 'replay'):
         assert f'slam-observer {command}' in output
         assert 'usage: ' in slam_observer.succeed(command, '--help').output
 

@@ -17,9 +17,7 @@ from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT = 300  # observations over which innovations are compared with the noise that is stated
 MIN_DEGREES = 100  # of freedom, that it takes to say so; the factor is then known to 7 %
-TOO_SMALL = (
-    2.0  # times the noise that is stated, that is no chance nor a sensor's usual correlation
-)
+TOO_SMALL = 2.0  # times as large as stated: neither chance nor a sensor's usual correlation
 
 
 class NoiseFit:

@@ -63,7 +63,7 @@ class MapServices:
         if self._autosave:
             self._check_autosave(settings.map_path)
         if settings.map_file:
-            node.get_logger().info(self._load(_absolute(settings.map_file)))
+            node.get_logger().info(self._load(absolute(settings.map_file)))
         elif estimator.settings.localization_mode != 'off':
             node.get_logger().warning("no 'map_file': mapping until a map comes by ~/load_map")
         self._warn_of_another(settings.map_path)
@@ -87,6 +87,14 @@ class MapServices:
                 self._node.get_logger().info(self._save(self._path()))
             except SlamObserverError as error:
                 raise MapError(f'the map is not saved: {error}') from error
+
+    def save_to(self, path: str, response: Trigger.Response) -> Trigger.Response:
+        """Save the map to a file, that of ``map_path`` if none is named; return the response."""
+        return self._answer(response, self._save, path)
+
+    def load_from(self, path: str, response: Trigger.Response) -> Trigger.Response:
+        """Load a map from a file, likewise."""
+        return self._answer(response, self._load, path)
 
     def keep_recent(self) -> None:
         """Have a map at hand for :meth:`end_in_haste`; a twentieth of the time goes there."""
@@ -131,11 +139,11 @@ class MapServices:
     def _check_autosave(map_path: str) -> None:
         if not map_path:
             raise ParameterError("'autosave_map' needs a file in 'map_path'")
-        check_writable(_absolute(map_path))
+        check_writable(absolute(map_path))
 
     def _warn_of_another(self, map_path: str) -> None:
         """Warn that the map of the end will replace one that is not loaded."""
-        path = _absolute(map_path)
+        path = absolute(map_path)
         if self._autosave and self._is_another(path):
             self._node.get_logger().warning(
                 f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
@@ -148,16 +156,18 @@ class MapServices:
     def _answer_save(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        return self._answer(response, self._save)
+        return self.save_to('', response)
 
     def _answer_load(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        return self._answer(response, self._load)
+        return self.load_from('', response)
 
-    def _answer(self, response: Trigger.Response, act: Callable[[Path], str]) -> Trigger.Response:
+    def _answer(
+        self, response: Trigger.Response, act: Callable[[Path], str], path: str = ''
+    ) -> Trigger.Response:
         try:
-            response.message = act(self._path())
+            response.message = act(absolute(path) if path else self._path())
             response.success = True
             self._node.get_logger().info(response.message)
         except SlamObserverError as error:
@@ -170,7 +180,7 @@ class MapServices:
         path: str = self._node.get_parameter('map_path').value
         if not path:
             raise ParameterError("no file is named: set the parameter 'map_path'")
-        return _absolute(path)
+        return absolute(path)
 
     def _save(self, path: Path) -> str:
         estimator = self._estimator
@@ -228,7 +238,8 @@ def _backup(path: Path) -> Path:
     return path.with_name(f'{path.name}~')
 
 
-def _absolute(path: str) -> Path:
+def absolute(path: str) -> Path:
+    """Return a path with ~ expanded; ParameterError where there is no such user."""
     try:
         return Path(path).expanduser().absolute()
     except RuntimeError as error:  # of a user that there is none of
