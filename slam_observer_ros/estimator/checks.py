@@ -266,7 +266,7 @@ def usable_points(
     counts['observed_point'] += len(event.ids)
     event = flatten(event) if settings.two_d_mode else event
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
-    if reserved.any():
+    if np.count_nonzero(reserved):
         warnings.reserved_ids(event.ids[reserved].tolist())
         counts['reserved_id'] += int(np.sum(reserved))
         event = event.select(~reserved)

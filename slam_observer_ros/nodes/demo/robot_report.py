@@ -14,7 +14,7 @@ from slam_observer_ros.nodes.demo.hall_robot import error_of, Estimated, HallRob
 ENOUGH_TAGS = 2  # from which position and heading in the plane follow
 MAX_ERROR_M, MAX_ERROR_RAD = 0.15, 0.08  # of the RMS; with the noise of the hall it is a third
 MAX_BACK_S = 1.0
-MIN_RATE = 0.8  # of what is asked for, on a machine with other work
+MIN_RATE = 0.9  # of what is asked for; less says something of the machine alone
 
 
 @dataclass
@@ -68,10 +68,11 @@ def report(robot: HallRobot, restart: Restart, rate_hz: float, console: Console)
     is_good = (
         position_m < MAX_ERROR_M
         and heading_rad < MAX_ERROR_RAD
-        and reached_hz > MIN_RATE * rate_hz
         and back_s is not None
         and back_s <= MAX_BACK_S
     )
+    if reached_hz < MIN_RATE * rate_hz:
+        console.print('The machine is too slow for this: try a smaller --real-time-factor.')
     console.print('The robot was localised.' if is_good else 'That is not as it should be.')
     return is_good
 
