@@ -17,7 +17,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format pytest colcon docs benchmark-accuracy benchmark-speed venv lock \
+.PHONY: help demo robot test lint format pytest colcon docs benchmark benchmark-accuracy venv lock \
 	clean
 
 help:  ## list these targets
@@ -25,6 +25,9 @@ help:  ## list these targets
 
 demo: $(READY)  ## run simulator and observer until they converge; pictures in demo_output/
 	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.demo
+
+robot: $(READY)  ## localise a simulated robot with a camera among AprilTags, as for Nav2
+	$(PYTHON_IN_VENV) -m slam_observer_ros.nodes.demo.robot
 
 test: lint pytest colcon  ## everything that a change must pass
 
@@ -55,8 +58,9 @@ benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
 
-benchmark-speed: $(READY)  ## cost of an observation against landmarks seen and known
-	$(PYTHON_IN_VENV) benchmark/speed.py
+benchmark: $(READY)  ## what it costs, as ratios: rewrites docs/performance.md
+	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
+	$(PYTHON_IN_VENV) benchmark/performance.py --write-docs
 
 venv: $(READY)  ## only set up .venv
 

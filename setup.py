@@ -51,6 +51,7 @@ setup(
             'mcap>=1.2,<2',  # salvages recordings that were cut off, which rosbags refuses
             'matplotlib',  # figures
             'rich',  # live progress and tables in the terminal
+            'argcomplete',  # completion in the shell
         ],
         'cluster': ['distributed'],  # runs a batch on the machines of a Dask cluster
         # A ROS installation brings these itself, so nothing here may come with the package.
@@ -60,6 +61,9 @@ setup(
             'pytest-timeout',  # a ROS test that hangs must fail
             'hypothesis',  # the paper's lemmas are properties
             'catkin_pkg',  # reads package.xml
+            'jsonschema',  # holds parameter files against the schema that editors get
+            # finds the same errors in what a replay writes; GPL, so only run as a program
+            'evo; python_version >= "3.11"',
             'threadpoolctl',  # counts the threads that numpy takes
         ],
         'dev': [

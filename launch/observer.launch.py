@@ -1,27 +1,12 @@
 """Start the observer alone, with a parameter file and topics of one's own robot."""
 
-from pathlib import Path
-
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-
-def check_params_file(context):
-    """Expand ~ in params_file; end the launch where there is no such file.
-
-    Launch itself would only warn, and start the node with its defaults.
-    """
-    written = context.launch_configurations['params_file']
-    try:
-        path = Path(written).expanduser().absolute()
-    except RuntimeError as error:  # of a user that there is none of
-        raise RuntimeError(f"params_file: no file '{written}': {error}") from error
-    if not path.is_file():
-        raise RuntimeError(f"params_file: no file '{path}'")
-    context.launch_configurations['params_file'] = str(path)
+from slam_observer_ros.nodes.launch_arguments import check_file
 
 
 def generate_launch_description():
@@ -42,10 +27,10 @@ def generate_launch_description():
                 'imu', default_value='imu', description='topic of the angular velocity'
             ),
             DeclareLaunchArgument(
-                'map', default_value='map', description='topic of the landmark map'
+                'landmark_map', default_value='landmark_map', description='topic of the landmarks'
             ),
             DeclareLaunchArgument(
-                'odometry', default_value='odometry', description='topic of the estimate'
+                'odometry', default_value='~/odometry', description='topic of the estimate'
             ),
             DeclareLaunchArgument(
                 'pose', default_value='pose', description='topic of the pose, as amcl_pose'
@@ -56,7 +41,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'use_sim_time', default_value='false', description='whether time is that of /clock'
             ),
-            OpaqueFunction(function=check_params_file),
+            OpaqueFunction(function=check_file, args=['params_file']),
             Node(
                 package='slam_observer_ros',
                 executable='observer_node',
@@ -70,8 +55,8 @@ def generate_launch_description():
                     ('twist', LaunchConfiguration('twist')),
                     ('landmarks', LaunchConfiguration('landmarks')),
                     ('imu', LaunchConfiguration('imu')),
-                    ('map', LaunchConfiguration('map')),
-                    ('odometry', LaunchConfiguration('odometry')),
+                    ('landmark_map', LaunchConfiguration('landmark_map')),
+                    ('~/odometry', LaunchConfiguration('odometry')),
                     ('pose', LaunchConfiguration('pose')),
                 ],
                 output='screen',

@@ -26,7 +26,11 @@ from slam_observer_ros.nodes.plain_observer import ObserverNode
 from slam_observer_ros.nodes.simulator import SimulatorNode
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import AUTO, InputSettings
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
+from slam_observer_ros.settings.node_settings import (
+    ManagedNodeSettings,
+    ObserverNodeSettings,
+    SimulatorNodeSettings,
+)
 from slam_observer_ros.settings.parameter_table import Parameter, table
 from slam_observer_ros.simulation import Scenario
 
@@ -54,11 +58,11 @@ TYPE_PARAMETERS = {'twist': 'velocity_type', 'landmarks': 'landmarks_type'}
 """Inputs of several types, and the parameters that list these."""
 
 OUTPUTS = {
-    'odometry': "pose in the map, calibrated velocity in the robot's frame",
+    '~/odometry': "pose in the map, calibrated velocity in the robot's frame",
     'pose': 'pose in the map with its covariance',
     'path': 'poses so far, at most `path_length`, at least 0.1 s apart',
-    'map': 'landmarks seen `confirmations` times or more, with ids; with covariances where the '
-    'gains know them',
+    'landmark_map': 'landmarks seen `confirmations` times or more, with ids; with covariances '
+    'where the gains know them',
     'landmark_estimates': 'the same landmarks for tools that read PointCloud; not published if '
     'an id is 2²⁴ or more, which its float32 channel cannot hold',
     'markers': 'landmarks and residuals; for the first 200 landmarks also ids and 3σ ellipsoids, '
@@ -66,6 +70,8 @@ OUTPUTS = {
     'lyapunov': 'the Lyapunov value L (34) of the last observation',
     '/tf': '`map_frame` → `odom_frame` where others publish `odom_frame` → `base_frame`, '
     'otherwise `map_frame` → `base_frame`',
+    '~/is_localised': 'whether the pose is known, as for a behaviour tree: in the loaded map if '
+    'there is one, with standard deviations below `position_error` and `heading_error`',
     '/diagnostics': 'rates, ages, what was used, what was dropped and why, '
     'and the calibration of the velocity',
 }
@@ -182,6 +188,7 @@ def tables(observer: Interface, simulator: Interface) -> dict[str, str]:
         **two_tables('estimator', table(Settings)),
         **two_tables('input', table(InputSettings)),
         **two_tables('observer-node', own_parameters()),
+        'managed-node-parameters': parameter_table(table(ManagedNodeSettings)),
         'scenario-parameters': parameter_table(table(Scenario)),
         'simulator-node-parameters': parameter_table(table(SimulatorNodeSettings)),
     }

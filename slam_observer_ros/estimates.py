@@ -94,18 +94,29 @@ class CalibrationEstimate:
         times = abs(self.value - self.nominal) / self.stated
         if times <= IMPLAUSIBLE:
             return ''
+        factor, unit = self.for_people
+        value, stated, nominal = factor * self.value, factor * self.stated, factor * self.nominal
         return (
-            f'{self.name} is {self.value:.3g}, {times:.0f} times its stated error '
-            f'({self.stated:g}) from {self.nominal:g}: are signs, units and frames of velocity '
-            'and points right?'
+            f'{self.name} is {value:.3g}, {times:.0f} times its stated error ({stated:.3g}) '
+            f'from {nominal:g}{f" {unit}" if unit else ""}: are signs, units and frames of '
+            'velocity and points right?'
         )
+
+    @property
+    def for_people(self) -> tuple[float, str]:
+        """The factor from ``unit`` to that which people read, and that: degrees for radians."""
+        if not self.unit.startswith('rad'):
+            return 1.0, self.unit
+        return math.degrees(1.0), self.unit.replace('rad', '°', 1)
 
     def __str__(self) -> str:
         """Write it with its uncertainty, of which at least two digits can be seen."""
+        factor, unit = self.for_people
+        value, deviation = factor * self.value, factor * self.deviation
         digits = 3
-        if 0.0 < self.deviation < math.inf:
-            digits = min(max(digits, 1 - math.floor(math.log10(self.deviation))), 9)
-        return f'{self.value:.{digits}f} ± {self.deviation:.{digits}f} {self.unit}'.rstrip()
+        if 0.0 < deviation < math.inf:
+            digits = min(max(digits, 1 - math.floor(math.log10(deviation))), 9)
+        return f'{value:.{digits}f} ± {deviation:.{digits}f} {unit}'.rstrip()
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ them any more.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -74,6 +75,37 @@ class VelocityEvent:
         return replace(self, body_velocity=Ad @ self.body_velocity, covariance=covariance)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class VelocityBlock:
+    """k velocity events that came one after the other, as arrays: cheaper to handle together."""
+
+    stamps_ns: IntArray  # (k,)
+    body_velocities: FloatArray  # (k, 6)
+    covariances: FloatArray | None = None  # (k, 6, 6), all of them stated
+    receive_ns: IntArray | None = None  # (k,)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def part(self, rows: slice) -> VelocityBlock:
+        """Return some of them."""
+        return VelocityBlock(
+            self.stamps_ns[rows],
+            self.body_velocities[rows],
+            None if self.covariances is None else self.covariances[rows],
+            None if self.receive_ns is None else self.receive_ns[rows],
+        )
+
+    def events(self) -> Iterator[VelocityEvent]:
+        """Yield them one by one."""
+        received = [None] * len(self) if self.receive_ns is None else self.receive_ns.tolist()
+        covariances = [None] * len(self) if self.covariances is None else self.covariances
+        for columns in zip(
+            self.stamps_ns.tolist(), self.body_velocities, covariances, received, strict=True
+        ):
+            yield VelocityEvent(*columns)
+
+
 @dataclass(frozen=True, slots=True)
 class AngularVelocityEvent:
     """Angular velocity in place of other velocities' angular part, as of an IMU.
@@ -109,6 +141,9 @@ class ObservationEvent:
     # (m, 3) where each was measured from, by default from the base: noise grows with the distance.
     sensor: FloatArray | None = None
     receive_ns: int | None = None
+    # (m, 3, 3) of each landmark's own axes; all zero where unknown, as of a point
+    orientations: FloatArray | None = None
+    orientation_covariances: FloatArray | None = None  # (m, 3, 3) of rotation vectors, rad²
 
     def moved(self, pose: FloatArray) -> ObservationEvent:
         """Return it in the frame in which its own has ``pose`` (4, 4)."""
@@ -120,6 +155,10 @@ class ObservationEvent:
             covariances=None if self.covariances is None else _turned(self.covariances, R),
             velocities=None if self.velocities is None else se3.rotate(pose, self.velocities),
             sensor=se3.transform(pose, sensor),
+            orientations=None if self.orientations is None else R @ self.orientations,
+            orientation_covariances=None
+            if self.orientation_covariances is None
+            else _turned(self.orientation_covariances, R),
         )
 
     @property
@@ -136,7 +175,7 @@ class ObservationEvent:
 
     def select(self, mask: BoolArray) -> ObservationEvent:
         """Return the points that ``mask`` (m,) picks."""
-        if mask.all():
+        if np.count_nonzero(mask) == len(mask):
             return self
         return replace(
             self,
@@ -145,6 +184,10 @@ class ObservationEvent:
             covariances=None if self.covariances is None else self.covariances[mask],
             velocities=None if self.velocities is None else self.velocities[mask],
             sensor=None if self.sensor is None else self.sensor[mask],
+            orientations=None if self.orientations is None else self.orientations[mask],
+            orientation_covariances=None
+            if self.orientation_covariances is None
+            else self.orientation_covariances[mask],
         )
 
 

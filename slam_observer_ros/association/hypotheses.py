@@ -10,6 +10,7 @@ have ids or are well separated there is nearly always one.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 import math
@@ -33,7 +34,7 @@ from slam_observer_ros.events import (
     UNKNOWN_ID,
 )
 from slam_observer_ros.geometry import se3, so3
-from slam_observer_ros.geometry.matrices import mahalanobis
+from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.matching import match, MatchedObservation
 from slam_observer_ros.state.state import State
@@ -96,19 +97,43 @@ class Hypotheses:
     ) -> FloatArray | None:
         """Return the covariance (6, 6) of the most likely pose at ``end_ns``; None if unknown.
 
-        It is Σ w_i (P_i + d_i d_iᵀ), with w_i the likelihoods of the hypotheses, moved on from
-        ``start_ns``, and d_i how far their poses are from that of the first, which may be wrong.
-        Coordinates are those of :meth:`.State.pose_after`.
+        Hypotheses are moved on from ``start_ns``, and the most likely one may be wrong.
         """
-        pose, own = self.best.pose_after(velocities, start_ns, end_ns)
+        return self._mixed(
+            [one.state.pose_after(velocities, start_ns, end_ns) for one in self._all]
+        )
+
+    def poses_until(
+        self,
+        velocities: VelocityHistory,
+        start_ns: int,
+        stamps_ns: IntArray,
+        with_covariances: bool,
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the most likely poses (s, 4, 4) at stamps (s,), and their covariances (s, 6, 6).
+
+        As :meth:`.State.poses_until` of each hypothesis.
+        """
+        if not with_covariances:
+            passage = self.best.passage(velocities, start_ns, stamps_ns)
+            return self.best.observer.reference_pose @ passage.poses, None
+        of_each = [one.state.poses_until(velocities, start_ns, stamps_ns) for one in self._all]
+        return of_each[0][0], self._mixed(of_each)
+
+    def _mixed(self, of_each: Sequence[tuple[FloatArray, FloatArray | None]]) -> FloatArray | None:
+        """Return the covariance (…, 6, 6) of the first pose (…, 4, 4), by all hypotheses.
+
+        It is Σ w_i (P_i + d_i d_iᵀ), with w_i their likelihoods, and d_i how far their poses are
+        from that of the first. Coordinates are those of :meth:`.State.pose_after`.
+        """
+        pose, own = of_each[0]
         likelihoods = np.exp(-0.5 * np.array([hypothesis.cost for hypothesis in self._all]))
         weights, total = likelihoods / likelihoods.sum(), own
-        for hypothesis, weight in zip(self._all[1:], weights[1:].tolist(), strict=True):
-            other, covariance = hypothesis.state.pose_after(velocities, start_ns, end_ns)
+        for (other, covariance), weight in zip(of_each[1:], weights[1:].tolist(), strict=True):
             if total is None or own is None or covariance is None:
                 return None
             d = _difference(pose, other)
-            total = total + weight * (covariance - own + np.outer(d, d))
+            total = total + weight * (covariance - own + d[..., :, None] * d[..., None, :])
         return total
 
     def propagate(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
@@ -229,9 +254,9 @@ def _are_one(child: _Child, other: _Child) -> bool:
 
 
 def _difference(pose: FloatArray, other: FloatArray) -> FloatArray:
-    """Return rotation vector and shift (6,) from one pose to another, along the world's axes."""
-    turn = so3.log(other[:3, :3] @ pose[:3, :3].T)
-    return np.concatenate([turn, other[:3, 3] - pose[:3, 3]])
+    """Return rotation vector and shift (…, 6) from one pose to another, along the world's axes."""
+    turn = so3.log(other[..., :3, :3] @ transpose(pose[..., :3, :3]))
+    return np.concatenate([turn, other[..., :3, 3] - pose[..., :3, 3]], axis=-1)
 
 
 def are_one(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 import json
 import logging
@@ -71,20 +71,23 @@ def show_message(kind: str, text: str) -> None:
 
 
 def show_progress(items: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:
-    """Pass items on, with a progress bar on standard error where that is a terminal."""
+    """Pass items on, with a progress bar on standard error where that is a terminal.
+
+    An item that has a length is so many of the ``total``.
+    """
     with leaving_at_once():
         from rich.console import Console
-        from rich.progress import track
+        from rich.progress import Progress
 
     console = Console(stderr=True, highlight=False)
-    yield from track(
-        items,
-        description,
-        total=total,
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
+    if not console.is_terminal:
+        yield from items
+        return
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task(description, total=total)
+        for item in items:
+            yield item
+            progress.advance(task, len(item) if isinstance(item, Sized) else 1)
 
 
 def show_runs(runs: Iterable[_Item], description: str, total: int) -> Iterator[_Item]:

@@ -1,4 +1,5 @@
 """The ``slam-observer`` command: the observer on simulations and recordings, without ROS."""
+# PYTHON_ARGCOMPLETE_OK (argcomplete looks for these words where it completes all programs)
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ with leaving_at_once():
     import sys
     from typing import Any, NoReturn
 
+    from slam_observer_ros.cli.completion import complete, typed_words
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
     from slam_observer_ros.common.errors import IncompleteError, LossError, SlamObserverError
     from slam_observer_ros.common.threads import use_one_thread
@@ -33,13 +35,16 @@ EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EX
 COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
+    'map': ('map', 'make a map file of a map of another program'),
     'replay': ('replay.command', 'run a recording through the observer'),
     'tune': ('tune.command', 'find the noise figures that a recording shows'),
+    'config': ('config', 'show parameter files, and what can be in them'),
+    'doctor': ('doctor', 'say what is installed, and what a node would hear'),
     'batch': ('batch.command', 'run many recordings with many settings'),
 }
 """The module of each command, and what it does; only the one that is given is imported."""
 
-OPTIONAL_PACKAGES = ('rosbags', 'mcap', 'matplotlib', 'rich')
+OPTIONAL_PACKAGES = ('rosbags', 'mcap', 'matplotlib', 'rich', 'argcomplete')
 """What the extra ``cli`` of setup.py installs: a robot that only runs a node does without."""
 
 EXAMPLES = """\
@@ -48,6 +53,8 @@ examples:
       the paper's simulation, and its figures 3 and 4
   slam-observer convert mrclam MRCLAM_Dataset6 --robot 1 robot1.mcap
       a public data set as a recording
+  slam-observer map convert tags.csv tags.yaml
+      a table of surveyed landmarks as a map file
   slam-observer replay robot1.mcap --plot figures --tum robot1.tum
       a recording through the observer, and its accuracy
   slam-observer replay my_robot.mcap --config my_robot.yaml --json
@@ -103,6 +110,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         logging.getLogger('slam_observer_ros').handlers = [MessageHandler(logging.WARNING)]
         words = sys.argv[1:] if arguments is None else arguments
+        if (typed := typed_words(os.environ)) is not None:
+            complete(make_parser(typed))
         use_one_thread()
         args = make_parser(words).parse_args(words)
         # SystemExit, unlike the signal's default, lets unfinished files be cleared away.

@@ -11,7 +11,9 @@ import logging
 import os
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
+from slam_observer_ros.cli.completion import completed_by
 from slam_observer_ros.common.errors import ParameterError, UsageError
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -45,19 +47,21 @@ def add_settings_options(parser: argparse.ArgumentParser, *others: type[Dataclas
     rows = [*table(Settings), *(row for other in others for row in table(other))]
     gains = next(row for row in rows if row.name == 'gains')
     group = parser.add_argument_group('estimator')
-    group.add_argument(
+    config = group.add_argument(
         '--config',
         metavar='FILE',
         help="the observer node's parameter file, or the name of one that comes with the package",
     )
+    completed_by(config, config_files)
     group.add_argument('--gains', choices=gains.choices, help='what sets the gains')
-    group.add_argument(
+    assignment = group.add_argument(
         '--set',
         action='append',
         default=[],
         metavar='NAME=VALUE',
         help='set a parameter; may be given several times',
     )
+    completed_by(assignment, lambda **_: [f'{row.name}=' for row in rows])
     basic, advanced = (
         ', '.join(row.name for row in rows if row.basic == is_basic) for is_basic in (True, False)
     )
@@ -140,18 +144,22 @@ def _listed(names: Sequence[str]) -> str:
 def find_config(name: str) -> Path:
     """Return the path of a parameter file, or of one that comes with the package, by its name."""
     path = Path(name)
-    shipped = {file.stem: file for file in _shipped_configs()}
+    shipped = _shipped_configs()
     if path.exists() or len(path.parts) > 1:
         return path
     if path.stem in shipped and path.suffix in ('', '.yaml'):
         return shipped[path.stem]
     if path.suffix:
         return path
-    usable = sorted(name for name, file in shipped.items() if _is_for_observer(file))
     raise ParameterError(
         f"no parameter file '{name}'; those that come with the package: "
-        f'{", ".join(usable) or "none"}'
+        f'{", ".join(shipped_names()) or "none"}'
     )
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the parameter files of the observer that come with the package."""
+    return sorted(name for name, file in _shipped_configs().items() if _is_for_observer(file))
 
 
 def _is_for_observer(file: Path) -> bool:
@@ -161,19 +169,28 @@ def _is_for_observer(file: Path) -> bool:
         return False
 
 
-def _shipped_configs() -> Iterable[Path]:
-    """List the files in config/ of the source tree, or of where pip or ROS has installed it."""
+def config_files(**context: Any) -> Sequence[str]:
+    """Complete the name of a parameter file that comes with the package, or of another one."""
+    from argcomplete.completers import FilesCompleter  # where completions are asked for
+
+    files: list[str] = FilesCompleter(('yaml', 'yml'))(**context)
+    return [*shipped_names(), *files]
+
+
+def _shipped_configs() -> dict[str, Path]:
+    """Return the files in config/ of the source tree, or of where pip or ROS has installed it."""
     share = Path('share') / _PACKAGE / 'config'
     names = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     prefixes = [Path(name) for name in names if name]
     installed: Iterable[metadata.PackagePath] = ()
     with suppress(metadata.PackageNotFoundError):
         installed = metadata.files(_PACKAGE) or ()
-    return (
+    files: Iterable[Path] = (
         *(Path(__file__).parents[2] / 'config').glob('*.yaml'),
         *(Path(str(file.locate())) for file in installed if file.match(f'{share}/*.yaml')),
         *(file for prefix in reversed(prefixes) for file in (prefix / share).glob('*.yaml')),
     )
+    return {file.stem: file for file in files}
 
 
 def _parse_assignment(text: str) -> tuple[str, object]:

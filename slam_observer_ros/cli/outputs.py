@@ -18,9 +18,18 @@ def add_force_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_result_options(parser: argparse._ActionsContainer, figures: Iterable[str]) -> None:
-    """Add ``--plot`` and ``--json``."""
+    """Add ``--plot``, its format, and ``--json``."""
     parser.add_argument(
-        '--plot', type=_figures_path, metavar='DIR', help=f'draw {", ".join(figures)}'
+        '--plot',
+        type=_figures_path,
+        metavar='DIR',
+        help=f'draw the figures {", ".join(figures)}',
+    )
+    parser.add_argument(
+        '--plot-format',
+        choices=('png', 'svg', 'pdf'),
+        default='png',
+        help='what the figures are written as (default png)',
     )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
@@ -72,15 +81,21 @@ def check_inputs_are_kept(
             raise UsageError(f'{option} {file} would replace {what}; give another name')
 
 
-def check_plots(directory: Path | None, names: Iterable[str], force: bool) -> None:
-    """Raise a UsageError if figures of these names can't be written to a directory.
+def figure_files(args: argparse.Namespace, figures: Iterable[str]) -> list[str]:
+    """Return the names of the files of figures, in the format that is asked for."""
+    return [f'{name}.{args.plot_format}' for name in figures]
 
-    It need not exist, but its parent must; None if no figures are asked for.
+
+def check_plots(args: argparse.Namespace, figures: Iterable[str]) -> None:
+    """Raise a UsageError if the figures can't be written to the directory of ``--plot``.
+
+    It need not exist, but its parent must.
     """
+    directory: Path | None = args.plot
     if directory is None:
         return
     if directory.is_dir():
-        check_outputs((directory / name for name in names), force)
+        check_outputs((directory / name for name in figure_files(args, figures)), args.force)
     elif directory.exists():
         raise UsageError(f'{directory} is a file; give a directory for the figures')
     elif not directory.parent.is_dir():

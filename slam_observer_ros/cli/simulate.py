@@ -16,6 +16,7 @@ from slam_observer_ros.cli.outputs import (
     add_result_options,
     check_outputs,
     check_plots,
+    figure_files,
     filled_directory,
     recording_path,
 )
@@ -34,7 +35,7 @@ MAX_STEP_S = 10.0
 MAX_STEPS = 10_000_000
 """More of them take days."""
 
-FIGURES = ('lyapunov.png', 'configuration.png')
+FIGURES = ('lyapunov', 'configuration')
 
 _SCENARIO_OPTIONS = {
     '--seed': 'seed',
@@ -99,14 +100,14 @@ def run(args: argparse.Namespace) -> None:
         max_innovation_time=max(args.step, Settings().max_innovation_time),
     )
     check_outputs([args.output], args.force)
-    check_plots(args.plot, FIGURES, args.force)
+    check_plots(args, FIGURES)
     simulation = Simulation(scenario, START_NS)
     result = run_simulation(simulation, _events(simulation, 'simulating'), settings)
     if args.output is not None:
         _record(simulation, args.output, args.force)
     if args.plot is not None:
-        with filled_directory(args.plot, FIGURES) as unfinished:
-            _draw(simulation, result, unfinished)
+        with filled_directory(args.plot, figure_files(args, FIGURES)) as unfinished:
+            _draw(simulation, result, unfinished, args.plot_format)
     if args.json:
         print_json(_as_json(args, result))
     else:
@@ -146,7 +147,7 @@ def _record(simulation: Simulation, path: Path, force: bool) -> None:
             writer.write_event(event)
 
 
-def _draw(simulation: Simulation, result: SimulatedRun, directory: Path) -> None:
+def _draw(simulation: Simulation, result: SimulatedRun, directory: Path, suffix: str) -> None:
     # matplotlib takes longer to import than the simulation
     from slam_observer_ros.evaluation.plots.simulation_plots import (
         plot_configuration,
@@ -155,9 +156,9 @@ def _draw(simulation: Simulation, result: SimulatedRun, directory: Path) -> None
 
     # Where L is zero nothing is drawn, rather than the floor.
     log10_lyapunov = np.where(result.lyapunov > 0.0, result.log10_lyapunov, -np.inf)
-    plot_lyapunov(directory / 'lyapunov.png', result.times_s, log10_lyapunov, result.slope_per_s)
+    plot_lyapunov(directory / f'lyapunov.{suffix}', result.times_s, log10_lyapunov, result.decay)
     plot_configuration(
-        directory / 'configuration.png',
+        directory / f'configuration.{suffix}',
         result.estimate,
         result.truth,
         result.landmark_tracks,
@@ -169,21 +170,20 @@ def _as_json(args: argparse.Namespace, result: SimulatedRun) -> dict[str, object
     return {
         'time_s': result.times_s.tolist(),
         'log10_lyapunov': result.log10_lyapunov.tolist(),
-        'slope_per_s': result.slope_per_s,
+        'slope_per_s': None if result.decay is None else result.decay.slope_per_s,
         'step_s': args.step,
     }
 
 
 def _print_summary(args: argparse.Namespace, result: SimulatedRun) -> None:
-    slope = result.slope_per_s
     rows = {
         'simulated': f'{args.duration:g} s in steps of {args.step:g} s',
         'landmarks': str(result.landmark_tracks.shape[1]),
         'log10 L, first': f'{result.log10_lyapunov[0]:.2f}',
         'log10 L, last': f'{result.log10_lyapunov[-1]:.2f}',
         'slope of log10 L': 'none: too few values of L that are more than rounding'
-        if slope is None
-        else f'{slope:.4f} per second after the transient',
+        if result.decay is None
+        else f'{result.decay.slope_per_s:.4f} per second after the transient',
     }
     rows |= {
         name: str(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from slam_observer_ros.common.types import IntArray
+
 AGREEING_STAMPS = 5
 """How many stamps in a row must agree before a pause or a jump of the clock is believed."""
 
@@ -15,6 +17,18 @@ def is_due(stamp_ns: int, last_ns: int | None, period_ns: int) -> bool:
     It is, too, if it has not been done so far, or stamps have gone back.
     """
     return last_ns is None or not 0 <= stamp_ns - last_ns < period_ns
+
+
+def due_rows(stamps_ns: IntArray, last_ns: int | None, period_ns: int) -> list[int]:
+    """Return the rows of increasing stamps (s,) at which it :func:`is_due`, one after another."""
+    rows = []
+    row = 0
+    if last_ns is not None and stamps_ns[0] >= last_ns:
+        row = int(stamps_ns.searchsorted(last_ns + period_ns))
+    while row < len(stamps_ns):
+        rows.append(row)
+        row = int(stamps_ns.searchsorted(stamps_ns[row] + period_ns))
+    return rows
 
 
 class StrayStamps:

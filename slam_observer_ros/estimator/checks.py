@@ -18,6 +18,7 @@ from slam_observer_ros.events import (
     MAX_ID,
     ObservationEvent,
     UNKNOWN_ID,
+    VelocityBlock,
     VelocityEvent,
 )
 from slam_observer_ros.geometry.matrices import transpose
@@ -36,6 +37,9 @@ MAX_STAMP_NS = 2**63 - 1
 MAX_MEASURED = 1e6
 """Size of a coordinate or velocity beyond which it can only be a sensor's way to say 'none'."""
 
+NEARLY = 1.0 - 1e-9
+"""Of a limit: what is below that is below the limit, however it is rounded."""
+
 _INTEGERS = (int, np.int64)
 
 
@@ -46,8 +50,8 @@ def check_event(event: Event, settings: Settings) -> None:
     ------
     InvalidEventError
         With the reason ``'wrong_type'``, ``'negative_stamp'``, ``'wrong_shape'``,
-        ``'not_finite'``, ``'too_large'``, ``'too_fast'``, ``'negative_id'`` or
-        ``'bad_covariance'``.
+        ``'not_finite'``, ``'too_large'``, ``'too_fast'``, ``'negative_id'``,
+        ``'bad_covariance'`` or ``'bad_orientation'``.
 
     """
     if isinstance(event, VelocityEvent):
@@ -64,6 +68,21 @@ def check_event(event: Event, settings: Settings) -> None:
     _check_times(event.stamp_ns, event.receive_ns)
 
 
+def check_velocities(velocities: VelocityBlock, settings: Settings) -> None:
+    """Raise :exc:`InvalidEventError` if :func:`check_event` might refuse one of the velocities."""
+    body_velocities, covariances = velocities.body_velocities, velocities.covariances
+    _check_coordinates('velocities', body_velocities, (len(velocities), 6))
+    squares = np.add.reduceat(body_velocities**2, [0, 3], axis=1).max(axis=0)
+    most = np.array([settings.max_angular_velocity, settings.max_linear_velocity])
+    if (squares > NEARLY * most**2).any():
+        raise InvalidEventError('too_fast', 'a velocity is near the greatest that is believed')
+    if covariances is not None:
+        _check_array('velocity covariances', covariances, (len(velocities), 6, 6))
+        _check_definite('velocity covariances', covariances)
+    if velocities.stamps_ns[0] < 0:
+        raise InvalidEventError('negative_stamp', 'a stamp is negative')
+
+
 def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
     """Check that ``pose`` (4, 4) is a rigid motion, and ``covariance`` (6, 6) a covariance.
 
@@ -77,8 +96,7 @@ def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
     except InvalidEventError as error:
         raise ParameterError(str(error)) from error
     R = pose[:3, :3]
-    is_rotation = np.abs(R.T @ R - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0
-    if not is_rotation or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
+    if not _are_rotations(R) or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
         raise ParameterError('pose: no matrix [[R, x], [0, 1]] with a rotation R')
 
 
@@ -176,6 +194,24 @@ def _check_observation(event: ObservationEvent) -> None:
         _check_coordinates('landmark velocities', event.velocities, (m, 3))
     if event.sensor is not None:
         _check_coordinates("sensor's positions", event.sensor, (m, 3))
+    if event.orientations is not None:
+        _check_orientations(event.orientations, m)
+    if event.orientation_covariances is not None:
+        _check_array('orientation covariances', event.orientation_covariances, (m, 3, 3))
+        _check_definite('orientation covariances', event.orientation_covariances)
+
+
+def _check_orientations(orientations: FloatArray, m: int) -> None:
+    """Check that all are rotations (m, 3, 3), or all zero for unknown ones."""
+    _check_array('landmark orientations', orientations, (m, 3, 3))
+    known = orientations[orientations.any(axis=(1, 2))]
+    if not _are_rotations(known):
+        raise InvalidEventError('bad_orientation', 'a landmark orientation is no rotation')
+
+
+def _are_rotations(R: FloatArray) -> bool:
+    skew = np.abs(transpose(R) @ R - np.eye(3)).max(initial=0.0)
+    return bool(skew < ROTATION_TOLERANCE and np.all(np.linalg.det(R) > 0.0))
 
 
 def _check_coordinates(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:

@@ -5,14 +5,24 @@ from __future__ import annotations
 from collections import deque
 from hashlib import blake2b
 import heapq
-from typing import TypeAlias
+from itertools import repeat
+from typing import Literal, TypeAlias
+
+import numpy as np
 
 from slam_observer_ros.common.clock_jumps import NEAR_NS, StrayStamps
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    VelocityBlock,
+    VelocityEvent,
+)
 
 Key: TypeAlias = tuple[int, bool, bytes]
+Ready: TypeAlias = Event | VelocityBlock
 
 RECENT = 1000
 """Events from which it is known how far ahead of their reception stamps are.
@@ -31,6 +41,12 @@ LATENESS_MARGIN = 2
 
 MIN_KNOWN = 1024
 """Events that may be known before those too old to come again are looked for and forgotten."""
+
+
+_LINEAR, _ANGULAR = b'linear', b'angular'
+
+_NO_STAMP_NS = 2**63 - 1
+"""Beyond all stamps."""
 
 
 class EventQueue:
@@ -66,8 +82,8 @@ class EventQueue:
         self._max_jump_ns = max_jump_ns
         self._reach_ns = window_ns + late_limit_ns
         self._near_ns = max(self._reach_ns, NEAR_NS)
-        # How far ahead a stamp may be that is believed at once.
-        self._usual_ns = min(self._near_ns, max_jump_ns)
+        # How far ahead a stamp may be that is believed at once: never less than at first.
+        self._least_usual_ns = self._usual_ns = min(self._near_ns, max_jump_ns)
         self._events = _SortedEvents()
         self._reception = _Reception()
         self._strays = StrayStamps()
@@ -103,15 +119,36 @@ class EventQueue:
         self._take_ahead(event, self.newest_ns)
         return False
 
-    def pop_ready(self) -> list[Event]:
+    def push_velocities(self, velocities: VelocityBlock) -> bool:
+        """Take velocities if :meth:`push` would find each of them in time, and newest of all.
+
+        Return whether it would; if not, none is taken.
+        """
+        if self.newest_ns is None:
+            return False
+        steps_ns = np.diff(velocities.stamps_ns, prepend=self.newest_ns)
+        if steps_ns.min() <= 0 or steps_ns.max() > self._least_usual_ns:
+            return False
+        newest_ns = int(velocities.stamps_ns[-1])
+        before_ns = newest_ns - int(steps_ns[-1])
+        if not self._events.insert_velocities(velocities, before_ns - self._reach_ns):
+            return False
+        self._reception.note_velocities(velocities)
+        self._window.note(newest_ns, before_ns)
+        self._newest_of_kind_ns[VelocityEvent] = newest_ns
+        self._strays.clear()
+        self._believe(newest_ns, before_ns)
+        return True
+
+    def pop_ready(self) -> list[Ready]:
         """Return, in order, the events that have left the window."""
         return self._events.pop_until((self.newest_ns or 0) - self._window.length_ns)
 
-    def pop_believed(self) -> list[Event]:
+    def pop_believed(self) -> list[Ready]:
         """Return, in order, all events but those with a stamp that waits for others."""
         return self._events.pop_until(self.newest_ns or 0)
 
-    def pop_all(self) -> list[Event]:
+    def pop_all(self) -> list[Ready]:
         """Return all events that are left, in order."""
         return self._events.pop_all()
 
@@ -201,6 +238,7 @@ class _SortedEvents:
 
     def __init__(self) -> None:
         self._heap: list[tuple[Key, Event]] = []
+        self._blocks: deque[VelocityBlock] = deque()  # each behind the end of the one before
         self.known: set[Key] = set()
         self._most_known = MIN_KNOWN
 
@@ -211,18 +249,49 @@ class _SortedEvents:
             raise InvalidEventError('duplicate', 'this event is already known')
         known.add(key)
         heapq.heappush(self._heap, (key, event))
-        if len(known) > self._most_known:  # O(1) for each event
-            self.known = {key for key in known if key[0] >= oldest_ns}
+        self._forget_known(oldest_ns)
+
+    def insert_velocities(self, velocities: VelocityBlock, oldest_ns: int) -> bool:
+        """Add velocities newer than all others; return False, and add none, if one is known."""
+        keys = list(zip(velocities.stamps_ns.tolist(), repeat(False), repeat(_LINEAR)))
+        if not self.known.isdisjoint(keys):
+            return False
+        self.known.update(keys)
+        self._blocks.append(velocities)
+        self._forget_known(oldest_ns)
+        return True
+
+    def _forget_known(self, oldest_ns: int) -> None:
+        if len(self.known) > self._most_known:  # O(1) for each event
+            self.known = {key for key in self.known if key[0] >= oldest_ns}
             self._most_known = max(2 * len(self.known), MIN_KNOWN)
 
-    def pop_until(self, stamp_ns: int) -> list[Event]:
-        events, heap = [], self._heap
-        while heap and heap[0][0][0] <= stamp_ns:
-            events.append(heapq.heappop(heap)[1])
-        return events
+    def pop_until(self, stamp_ns: int) -> list[Ready]:
+        ready: list[Ready] = []
+        while self._heap and self._heap[0][0][0] <= stamp_ns:
+            key, event = heapq.heappop(self._heap)
+            ready += self._blocks_before(key)
+            ready.append(event)
+        return ready + self._blocks_before((stamp_ns, True, b''))
 
-    def pop_all(self) -> list[Event]:
-        return [heapq.heappop(self._heap)[1] for _ in range(len(self._heap))]
+    def pop_all(self) -> list[Ready]:
+        return self.pop_until(_NO_STAMP_NS)
+
+    def _blocks_before(self, key: Key) -> list[VelocityBlock]:
+        """Take out the velocities that come before a key, of blocks."""
+        side: Literal['left', 'right'] = 'right' if (*key[:1], False, _LINEAR) < key else 'left'
+        before = []
+        while self._blocks:
+            block = self._blocks[0]
+            count = int(block.stamps_ns.searchsorted(key[0], side))
+            if count == len(block):
+                before.append(self._blocks.popleft())
+                continue
+            if count:
+                before.append(block.part(slice(count)))
+                self._blocks[0] = block.part(slice(count, None))
+            break
+        return before
 
 
 class _Reception:
@@ -235,6 +304,11 @@ class _Reception:
     def note(self, stamp_ns: int, receive_ns: int) -> None:
         self._ahead_ns.append(stamp_ns - receive_ns)
         self._last_ns = receive_ns
+
+    def note_velocities(self, velocities: VelocityBlock) -> None:
+        if velocities.receive_ns is not None:
+            self._ahead_ns.extend((velocities.stamps_ns - velocities.receive_ns).tolist())
+            self._last_ns = int(velocities.receive_ns[-1])
 
     def expected_ns(self, event: Event) -> int | None:
         """Return the newest stamp that can be received when this event was; None if unknown."""
@@ -252,7 +326,7 @@ class _Reception:
 def _key(event: Event) -> Key:
     if not isinstance(event, ObservationEvent):
         is_angular = isinstance(event, AngularVelocityEvent)
-        return event.stamp_ns, False, b'angular' if is_angular else b'linear'
+        return event.stamp_ns, False, _ANGULAR if is_angular else _LINEAR
     # Keys outlive their events, which may be clouds of many points.
     content = event.ids.tobytes() + event.points.tobytes()
     return event.stamp_ns, True, blake2b(content, digest_size=16).digest()

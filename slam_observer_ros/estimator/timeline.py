@@ -9,7 +9,13 @@ from typing import Protocol, TypeAlias
 from slam_observer_ros.common.errors import InvalidEventError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns, to_s
-from slam_observer_ros.events import AngularVelocityEvent, Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    Event,
+    ObservationEvent,
+    VelocityBlock,
+    VelocityEvent,
+)
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.integration import transition
@@ -92,10 +98,33 @@ class Timeline:
         self._in_force_ns = stamp_ns
         self._note_stamp(stamp_ns)
         self._pending += 1
+        self.advance_after_many()
+        return True
+
+    def takes(self, velocities: VelocityBlock) -> bool:
+        """Return whether the velocities are newer than all that was used, of one sensor alone."""
+        newest_ns = max(self.stamp_ns or -1, self._in_force_ns - 1)
+        return bool(velocities.stamps_ns[0] > newest_ns) and self.velocities.is_of_one_sensor
+
+    @property
+    def room(self) -> int:
+        """How many velocities can be added before the hypotheses are moved on."""
+        return MAX_PENDING_VELOCITIES - self._pending
+
+    def append_velocities(self, velocities: VelocityBlock) -> None:
+        """Add velocities that it :meth:`takes`, no more than there is :attr:`room` for."""
+        first_ns, last_ns = velocities.stamps_ns[[0, -1]].tolist()
+        self.velocities.append_velocities(velocities)
+        self._note_stamp(first_ns)
+        self._note_stamp(last_ns)
+        self._newest_ns[VelocityEvent] = self._in_force_ns = last_ns
+        self._pending += len(velocities)
+
+    def advance_after_many(self) -> None:
+        """Move the hypotheses on without an observation if many velocities wait for one."""
         if self._pending >= MAX_PENDING_VELOCITIES:
             # No further: the stamp of an observation without points may be ahead of velocities.
             self._advance(self._in_force_ns)
-        return True
 
     @property
     def body_velocity(self) -> FloatArray | None:

@@ -5,12 +5,14 @@ NEES: normalised estimation error squared, εᵀ Σ⁻¹ ε; ANEES: its mean, pe
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.evaluation.metrics import pose_errors
+from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
 from slam_observer_ros.evaluation.trajectory import associate, Trajectory
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import transpose
@@ -94,6 +96,44 @@ def anchored_average_nees(
         )
     anchored = true_paired.moved(paired.poses[0] @ se3.inverse(true_paired.poses[0]))
     return average_nees(pose_errors(paired.poses, anchored.poses), covariances[covered])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NeesOverTime:
+    """NEES per degree of freedom (k,) at ``stamps_ns`` (k,), where anything is uncertain.
+
+    Of honest covariances 95 % lie within ``band``.
+    """
+
+    stamps_ns: IntArray
+    values: FloatArray
+    band: tuple[float, float]
+
+
+def nees_over_time(
+    errors: TrajectoryErrors, covariances: FloatArray, is_anchored: bool
+) -> NeesOverTime | None:
+    """Return the NEES of the k poses that the truth covers; None where all are known exactly.
+
+    ``covariances`` (k, 6, 6) are of rotation vector and position along the estimate's axes. If it
+    ``is_anchored`` the truth is moved onto the first pose, as for the ANEES; else the errors are
+    those after the alignment.
+    """
+    poses = errors.estimate.moved(se3.inverse(errors.alignment)).poses
+    true_poses = errors.aligned_truth.poses
+    if is_anchored:
+        true_poses = poses[0] @ se3.inverse(true_poses[0]) @ true_poses
+    nees, degrees_of_freedom = normalised_squared_errors(
+        pose_errors(poses, true_poses), covariances
+    )
+    known = degrees_of_freedom > 0
+    if not known.any():
+        return None
+    return NeesOverTime(
+        errors.estimate.stamps_ns[known],
+        nees[known] / degrees_of_freedom[known],
+        average_nees_band(int(degrees_of_freedom.max()), 1),
+    )
 
 
 def _nees_of_anchor(estimate: Trajectory, covariances: FloatArray) -> float:

@@ -17,6 +17,8 @@ class EstimatedAxes(Immutable):
         EstimatedAxes of the pose error ε = (Ω, v), and how many these are.
     point : int
         Leading axes of a point, 2 or 3.
+    turn : int
+        Leading axes of ε that are turns, 1 or 3: about z, or about all.
 
     """
 
@@ -24,6 +26,8 @@ class EstimatedAxes(Immutable):
         self.pose = pose
         self.p: int = pose.stop - pose.start
         self.point = point
+        self.turn: int = 3 - pose.start
+        self._turned = slice(pose.start, 3)
         self._shape = (-1, point, self.p)
         turns = np.concatenate([-so3.hat(np.eye(3)), np.zeros((3, 3, 3))], axis=2)
         self._turns = turns[:, :point, pose].reshape(3, -1)
@@ -47,9 +51,23 @@ class EstimatedAxes(Immutable):
         return full
 
     def full_pose_covariance(self, covariance: FloatArray) -> FloatArray:
-        """Return the covariance (6, 6) of ε with zeros on the axes that are not estimated."""
-        full = np.zeros((6, 6))
-        full[self.pose, self.pose] = covariance
+        """Return the covariance (…, 6, 6) of ε with zeros on the axes that are not estimated."""
+        full = np.zeros((*covariance.shape[:-2], 6, 6))
+        full[..., self.pose, self.pose] = covariance
+        return full
+
+    def turns(self, vectors: FloatArray) -> FloatArray:
+        """Return what of rotation vectors (m, 3) is estimated (m, turn)."""
+        return vectors[:, self._turned]
+
+    def turn_covariances(self, covariances: FloatArray) -> FloatArray:
+        """Return what of covariances (m, 3, 3) of rotation vectors is (m, turn, turn)."""
+        return covariances[:, self._turned, self._turned]
+
+    def full_turns(self, turns: FloatArray) -> FloatArray:
+        """Return rotation vectors (m, 3) with zeros about the axes that are not estimated."""
+        full = np.zeros((len(turns), 3))
+        full[:, self._turned] = turns
         return full
 
     def full_points(self, errors: FloatArray) -> FloatArray:

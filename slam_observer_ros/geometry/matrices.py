@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dgesv
+from scipy.linalg.lapack import dgesv, dposv
 
 from slam_observer_ros.common.types import FloatArray
 
 LARGE = 500
 """Equations whose solution takes longer than NumPy's overhead."""
+
+VERY_LARGE = 1500
+"""Equations that take so long that other threads would wait, which SciPy keeps from running."""
 
 
 def transpose(M: FloatArray) -> FloatArray:
@@ -36,6 +39,15 @@ def solve(S: FloatArray, right: FloatArray) -> FloatArray:
     if is_singular:
         raise np.linalg.LinAlgError('Singular matrix')
     return np.asarray(solution, dtype=np.float64)
+
+
+def solve_definite(S: FloatArray, right: FloatArray) -> FloatArray:
+    """Return S⁻¹ b for a symmetric, positive definite S (q, q) and b (q, …)."""
+    if right.size and len(S) <= VERY_LARGE:
+        _, solution, is_indefinite = dposv(S, right)
+        if not is_indefinite:
+            return np.asarray(solution, dtype=np.float64)
+    return solve(S, right)  # what rounding has made indefinite, too
 
 
 def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
@@ -72,9 +84,13 @@ def with_blocks(matrix: FloatArray, blocks: FloatArray) -> FloatArray:
 
 def diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
     """Return the blocks (m, k, k) on the diagonal of a matrix (m k, m k), as a view of it."""
-    m = len(matrix) // k
-    blocks: FloatArray = np.einsum('ijik->ijk', matrix.reshape(m, k, m, k))
-    return blocks
+    down, along = matrix.strides
+    shape, strides = (len(matrix) // k, k, k), (k * (down + along), down, along)
+    # Half the cost of einsum('ijik->ijk'), where the matrix is contiguous.
+    if matrix.flags.c_contiguous:
+        blocks: FloatArray = np.ndarray(shape, np.float64, matrix, 0, strides)
+        return blocks
+    return np.lib.stride_tricks.as_strided(matrix, shape, strides)
 
 
 def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:

@@ -9,6 +9,9 @@ Near zero, a and b are quotients without cancellation: they need a guard against
 
 from __future__ import annotations
 
+import math
+from typing import TypeAlias
+
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
@@ -38,11 +41,20 @@ def vee(K: FloatArray) -> FloatArray:
     return K[..., (2, 0, 1), (1, 2, 0)]
 
 
-def coefficients(phi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+Scale: TypeAlias = FloatArray | float
+"""What scales a stack of matrices, or one."""
+
+
+def coefficients(phi: FloatArray) -> tuple[Scale, Scale, Scale]:
     """Return θ² (≥ 1e-300, as it may divide), a and b, exact to rounding at any angle.
 
-    Each is (…, 1, 1), to scale matrices.
+    Each is (…, 1, 1), to scale matrices; a number for a single vector (3,).
     """
+    if phi.ndim == 1:  # as in each correction, at a third of the cost
+        square = float(phi.dot(phi)) + _ZERO_GUARD
+        half_angle = 0.5 * math.sqrt(square)
+        ratio = math.sin(half_angle) / half_angle
+        return square, ratio * math.cos(half_angle), 0.5 * ratio * ratio
     theta_squared = phi[..., None, :] @ phi[..., :, None] + _ZERO_GUARD
     half = 0.5 * np.sqrt(theta_squared)
     half_sinc = np.sin(half) / half

@@ -91,6 +91,11 @@ class EventBuilder:
             measured = Measurement(measured.child_frame_id, velocity)
         return self._attempt(_Waiting(now_ns + self._transform_timeout_ns, measured), now_ns)
 
+    def passes_on(self, frame_id: str) -> bool:
+        """Return whether velocities in a frame become events as they are, and nothing waits."""
+        is_decided = frame_id not in self._taken_as_base
+        return is_decided and not self._waiting and self._base_frame.is_base(frame_id)
+
     def retry(self, now_ns: int) -> list[Event]:
         """Return the events of what has waited long enough, or for what is known by now."""
         waiting, self._waiting = self._waiting, deque()

@@ -99,6 +99,11 @@ class BaseFrame:
             raise TransformError(f"'{frame_id}' does not move with the robot")
         return self._moved(event, frame_id)
 
+    def is_base(self, frame_id: str) -> bool:
+        """Return whether velocities in a frame are those of the base as they are."""
+        plain = frame_id.lstrip('/')
+        return plain in ('', self.name) and plain not in self._world_frames
+
     def angular_velocity(self, event: AngularVelocityEvent, frame_id: str) -> AngularVelocityEvent:
         """Return an angular velocity in the base frame's axes."""
         return self._moved(event, frame_id)

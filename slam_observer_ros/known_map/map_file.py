@@ -68,9 +68,11 @@ _NOT_FINITE = re.compile(r'[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)')
 
 
 def write_map(
-    path: Path, landmark_map: LandmarkMap, settings: Settings, backup: Path | None = None
+    path: Path, landmark_map: LandmarkMap, settings: Settings | None, backup: Path | None = None
 ) -> None:
-    """Write a map, and with which settings it was made; the file appears whole or not at all.
+    """Write a map, and with which settings it was made, if with any.
+
+    The file appears whole or not at all.
 
     ``backup`` is a file to be a copy of the one that is replaced, once the new one is written.
 
@@ -78,16 +80,17 @@ def write_map(
     """
     if not len(landmark_map.ids):
         raise MapError(f'the map is empty: nothing is written to {path}')
-    head = {
+    head: dict[str, object] = {
         'format': FORMAT,
         'version': FORMAT_VERSION,
         'frame': landmark_map.frame_id,
         'package_version': VERSION,
-        'settings': {
+    }
+    if settings is not None:
+        head['settings'] = {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(settings).items()
-        },
-    }
+        }
     lines = [_on_one_line(landmark) for landmark in _as_mappings(landmark_map)]
     try:
         with unfinished_file(path) as file:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import struct
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_observer_ros.common.errors import MessageError
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
@@ -108,3 +109,50 @@ class CdrReader:
         left = len(self._raw) - self._position
         if left > MAX_PADDING_BYTES:
             raise MessageError(f'{left} bytes too long: is it of another type?')
+
+
+class CdrBlockReader(CdrReader):
+    """Cursor over k messages of one size (k, size), as :class:`CdrReader` is over the first.
+
+    They must have the strings in common that are read: else a MessageError is raised.
+    """
+
+    __slots__ = ('_rows',)
+
+    def __init__(self, rows: NDArray[np.uint8]) -> None:
+        super().__init__(rows[0].tobytes())
+        self._rows = rows
+        self._check_common(0, 2)
+
+    def headers(self) -> tuple[IntArray, str]:
+        """Read headers: stamps (k,) in nanoseconds, and their frame id."""
+        times = self._columns(2, np.dtype(np.uint32), alignment=4)
+        if (times[:, 1] >= NANOSECONDS_PER_SECOND).any():
+            raise MessageError('a stamp with too much in its nanosecond field')
+        seconds = times[:, 0].astype(np.int32).astype(np.int64)
+        return seconds * NANOSECONDS_PER_SECOND + times[:, 1].astype(
+            np.int64
+        ), self.common_string()
+
+    def common_string(self) -> str:
+        """Read a string that is the same in all messages."""
+        begin = self._position
+        text = self.string()
+        self._check_common(begin, self._position)
+        return text
+
+    def float64s(self, count: int) -> FloatArray:
+        """Read ``count`` float64 values of each message, (k, count)."""
+        values = self._columns(count, np.dtype(np.float64), alignment=8)
+        with np.errstate(invalid='ignore'):  # as in _array
+            quiet: FloatArray = np.multiply(values, 1.0, dtype=np.float64)
+        return quiet
+
+    def _columns(self, count: int, dtype: np.dtype[Any], alignment: int) -> NDArray[Any]:
+        start = self._take(count * dtype.itemsize, alignment)
+        columns = np.ascontiguousarray(self._rows[:, start : self._position])
+        return columns.view(dtype.newbyteorder('<' if self._byte_order == '<' else '>'))
+
+    def _check_common(self, begin: int, end: int) -> None:
+        if (self._rows[:, begin:end] != self._rows[0, begin:end]).any():
+            raise MessageError('a string, or the byte order, is not the same in all messages')

@@ -170,7 +170,12 @@ def _read_twist(reader: CdrReader) -> FloatArray:
 def _read_covariance(reader: CdrReader) -> FloatArray | None:
     """Read a 6 × 6 covariance; rotational part first."""
     covariance = _known(reader.float64(36).reshape(6, 6))
-    return None if covariance is None else covariance[np.ix_(_ANGULAR_FIRST, _ANGULAR_FIRST)]
+    return None if covariance is None else angular_first(covariance)
+
+
+def angular_first(covariances: FloatArray) -> FloatArray:
+    """Return covariances (…, 6, 6) as they are here, from ROS's order."""
+    return covariances[..., _ANGULAR_FIRST[:, None], _ANGULAR_FIRST]
 
 
 def _known(covariance: FloatArray) -> FloatArray | None:

@@ -7,13 +7,18 @@ from typing import Any
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.common.errors import ParameterError, SlamObserverError
+from slam_observer_ros.nodes.bond import LifecycleBond
 from slam_observer_ros.nodes.entities import Entities
 from slam_observer_ros.nodes.log_bridge import forward_logging
 from slam_observer_ros.nodes.observer_core import ObserverCore
-from slam_observer_ros.nodes.ros_parameters import declare_settings, RepeatableParameters
+from slam_observer_ros.nodes.ros_parameters import (
+    declare_settings,
+    read_settings,
+    RepeatableParameters,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.node_settings import ManagedNodeSettings, ObserverNodeSettings
 
 
 class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignore[misc]
@@ -25,15 +30,20 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
 
     def __init__(self) -> None:
         super().__init__('observer_node')
-        forward_logging(self.get_logger())
-        declare_settings(self, Settings, ObserverNodeSettings)
         self._core: ObserverCore | None = None
+        self._bond: LifecycleBond | None = None
+        forward_logging(self.get_logger())
+        declare_settings(self, Settings, ObserverNodeSettings, ManagedNodeSettings)
         self._refuse_impossible_transitions()
+        if read_settings(self, ManagedNodeSettings).autostart_node:
+            self._start_by_itself()
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Create all parts."""
         entities = Entities(self)
         try:
+            period_s = read_settings(self, ManagedNodeSettings).bond_heartbeat_period
+            self._bond = LifecycleBond(self, period_s)
             self._core = ObserverCore(self)
         except SlamObserverError as error:
             entities.remove_new()
@@ -43,13 +53,15 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to estimate and to publish, or go on."""
-        if self._core is not None:
+        if self._core is not None and self._bond is not None:
             self._core.start()
+            self._bond.start()
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the estimate."""
-        if self._core is not None:
+        if self._core is not None and self._bond is not None:
+            self._bond.end()
             self._core.stop()
         return TransitionCallbackReturn.SUCCESS
 
@@ -74,6 +86,12 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
         finally:
             super().destroy_node()
 
+    def _start_by_itself(self) -> None:
+        """Become active; raise a ParameterError if that fails, so that the process ends."""
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                raise ParameterError('autostart_node: the reason is logged above')
+
     def _refuse_impossible_transitions(self) -> None:
         """Answer no to what the state does not allow; rclpy would end with a traceback."""
         service = next(each for each in self.services if each.srv_type.__name__ == 'ChangeState')
@@ -97,6 +115,9 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
             self.get_logger().error(str(error))
 
     def _close(self) -> None:
+        bond, self._bond = self._bond, None
+        if bond is not None:
+            bond.end()
         core, self._core = self._core, None
         if core is not None:
             core.close()

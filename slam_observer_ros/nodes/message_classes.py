@@ -19,11 +19,15 @@ def message_class(type_name: str) -> Any:
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except ImportError as error:
-        distribution = os.environ.get('ROS_DISTRO', '$ROS_DISTRO')  # a shell puts it in, too
         raise ParameterError(
-            f'{type_name} needs the package {package}: '
-            f'apt install ros-{distribution}-{package.replace("_", "-")}'
+            f'{type_name} needs the package {package}: {install_command(package)}'
         ) from error
+
+
+def install_command(package: str) -> str:
+    """Return how a package of the ROS distribution at hand is installed."""
+    distribution = os.environ.get('ROS_DISTRO', '$ROS_DISTRO')  # a shell puts it in, too
+    return f'apt install ros-{distribution}-{package.replace("_", "-")}'
 
 
 MESSAGES = OutgoingMessages(message_class, lambda data: array('B', data))

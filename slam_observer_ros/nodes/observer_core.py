@@ -22,9 +22,11 @@ from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.intake.transform_listener import open_transforms
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
+from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
 from slam_observer_ros.nodes.ros_parameters import read_settings
 from slam_observer_ros.nodes.services.control_services import ControlServices
 from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
+from slam_observer_ros.nodes.services.kept_pose import KeptPose
 from slam_observer_ros.nodes.services.map_services import MapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -33,6 +35,7 @@ from slam_observer_ros.settings.parameter_table import changed_names
 OVERVIEW_PERIOD_S = 0.5
 DIAGNOSTICS_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
+KEEP_PERIOD_S = 2.0
 RETRY_PERIOD_S = 0.02
 
 MOTION_INPUTS = ('twist', 'imu')
@@ -54,7 +57,13 @@ class ObserverCore:
         self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
-        self._estimator = Estimator(estimator_settings, on_jump=self._on_estimator_jump)
+        noise = NoiseFit()
+        self._estimator = Estimator(
+            estimator_settings,
+            on_update=noise.add,
+            on_jump=self._on_estimator_jump,
+            judges_innovations=True,
+        )
         # What comes in and what goes out
         self._transforms = open_transforms(node, (settings.map_frame, settings.base_frame))
         self._feed = EstimatorFeed(
@@ -65,6 +74,7 @@ class ObserverCore:
         self._inputs = open_inputs(node, settings, self._feed)
         self._is_catching_up = False
         _refuse_own_outputs(node, self._inputs)
+        self._localisation = LocalisationStatus(node, settings, self._estimator, noise)
         namespace = node.get_namespace()
         self._diagnostics = DiagnosticsPublisher(
             node,
@@ -72,10 +82,13 @@ class ObserverCore:
             self._feed,
             self._inputs,
             self._publisher,
+            self._localisation,
             hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         # What others may do to the estimate
         self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
+        self._kept_pose = KeptPose(node, settings, self._estimator)
+        self._kept_pose.restore()
         InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
         ControlServices(node, self._estimator, self._feed, self._publisher)
         node.add_post_set_parameters_callback(self._apply_parameters)
@@ -118,6 +131,7 @@ class ObserverCore:
         Raises a MapError if the map can't be saved; all is removed nevertheless.
         """
         try:
+            self._kept_pose.keep()
             self._maps.save_at_end()
         finally:
             self._jump_handle.unregister()
@@ -141,6 +155,8 @@ class ObserverCore:
                 (OVERVIEW_PERIOD_S, self._publisher.publish_overview),
                 (OVERVIEW_PERIOD_S, self._maps.keep_recent),
                 (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
+                (CHECK_PERIOD_S, self._localisation.publish),
+                (KEEP_PERIOD_S, self._kept_pose.keep),
                 (RETRY_PERIOD_S, self._feed.retry),
                 *((CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
             )
@@ -188,5 +204,5 @@ def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic[Any]]) -> None:
         if name := outputs.get(source.topic):
             raise ParameterError(
                 f"the input '{source.name}' and the output '{name}' are both '{source.topic}': "
-                f'remap one of them, as with -r {name}:=observer/{name}'
+                f'remap one of them, as with -r {name}:=observer/{name.removeprefix("~/")}'
             )

@@ -14,6 +14,7 @@ class ObserverNode(RepeatableParameters):
 
     def __init__(self) -> None:
         super().__init__('observer_node')
+        self._core: ObserverCore | None = None  # till it is made: rclpy may end a node before
         forward_logging(self.get_logger())
         declare_settings(self, Settings, ObserverNodeSettings)
         self._core = ObserverCore(self)
@@ -21,11 +22,12 @@ class ObserverNode(RepeatableParameters):
 
     def end_in_haste(self) -> int | None:
         """See :meth:`.ObserverCore.end_in_haste`."""
-        return self._core.end_in_haste()
+        return None if self._core is None else self._core.end_in_haste()
 
     def destroy_node(self) -> None:
         """Save the map if that was asked for, and end; raise a MapError if it can't be saved."""
         try:
-            self._core.close()
+            if self._core is not None:
+                self._core.close()
         finally:
             super().destroy_node()

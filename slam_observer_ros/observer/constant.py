@@ -48,6 +48,8 @@ class ConstantFilter(Filter):
         'calibration_drift',
         'landmark_velocity_stddev',
         'observation_correlation_time',
+        'use_tag_orientation',
+        'orientation_noise',
     )
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:

@@ -12,14 +12,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.settings.estimator_settings import Settings
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
@@ -34,6 +35,8 @@ class Filter:
     joint: JointCovariance | None = None
     has_joint_covariance: ClassVar[bool] = False
     ignores: ClassVar[tuple[str, ...]] = ()  # settings without effect on the filter
+    # Those of tags, where they are estimated; else only their positions are used.
+    orientations: LandmarkOrientations | None = None
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
@@ -63,6 +66,17 @@ class Filter:
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
+        raise NotImplementedError
+
+    def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
+        """Move the state by how tags are turned; return the weights (m,), and which are unclear.
+
+        Of filters that estimate ``orientations``.
+        """
+        raise NotImplementedError
+
+    def add_orientations(self, seen: SeenOrientations) -> None:
+        """Take over orientations of which nothing is known yet, as they are seen."""
         raise NotImplementedError
 
     # Landmarks
@@ -121,8 +135,11 @@ class Filter:
         """(c,) variances of what is estimated of the calibration."""
         return np.empty(0)
 
-    def pose_covariance(self, motion: Motion | None = None) -> FloatArray | None:
-        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come."""
+    def pose_covariance(self, motion: Motion | Passage | None = None) -> FloatArray | None:
+        """Return the covariance (6, 6) of ε in Â = exp(ε) A, maybe after a motion yet to come.
+
+        (s, 6, 6) at the s instants of a passage.
+        """
         return None
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray | None:

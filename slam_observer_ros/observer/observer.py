@@ -36,8 +36,8 @@ class Observer:
 
     def body_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen, Â⁻¹ (y_i° + â_i) (m, 3), metres, body frame."""
-        arms = self.y_ref[rows] + self.a[rows] - self.A[:3, 3]
-        points: FloatArray = arms @ self.A[:3, :3]
+        arms = self.points.take(rows, axis=0, mode='wrap') - self.A[:3, 3]
+        points: FloatArray = arms.dot(self.A[:3, :3])
         return points
 
     def turned(self, covariances: FloatArray) -> FloatArray:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 
@@ -31,7 +33,7 @@ class Residuals:
 
     def select(self, mask: BoolArray) -> Residuals:
         """Return the part of it that ``mask`` (m,) picks."""
-        if mask.all():
+        if np.count_nonzero(mask) == len(mask):
             return self
         return replace(
             self,

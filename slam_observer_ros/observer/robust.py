@@ -10,7 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, solve, with_blocks
+from slam_observer_ros.geometry.matrices import (
+    diagonal_blocks,
+    mahalanobis,
+    solve_definite,
+    with_blocks,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
 
 REWEIGHTINGS = 2
@@ -30,21 +35,21 @@ def observation_weights(
     Else Huber's of what the correction leaves of the residual, R S⁻¹ r, judged by the noise R as
     in an M-estimator: where the state is uncertain, a large residual says nothing against it.
     """
-    gate, weights = settings.rejection_threshold, np.ones(len(r))
+    gate = settings.rejection_threshold
     S_inv_r = _solve_residuals(r, predicted, noise)
     # The gate. No residual is further out than all of them together are.
     if np.vdot(r, S_inv_r) > gate**2:
         passed, predicted_passed = gated(r, predicted, noise, settings)
         if not passed.all():
-            weights[~passed] = 0.0
+            weights = np.zeros(len(r))
             weights[passed] = observation_weights(
                 r[passed], predicted_passed, noise[passed], settings
             )
             return weights
     # Huber's weights, by reweighted least squares.
-    weights = huber_weights(S_inv_r, noise, weights, settings.huber_threshold)
+    weights = huber_weights(S_inv_r, noise, np.ones(len(r)), settings.huber_threshold)
     for _ in range(REWEIGHTINGS - 1):
-        if weights.min(initial=1.0) == 1.0:
+        if np.count_nonzero(weights == 1.0) == len(r):
             break
         S_inv_r = _solve_residuals(r, predicted, noise / weights[:, None, None])
         weights = huber_weights(S_inv_r, noise, weights, settings.huber_threshold)
@@ -100,4 +105,4 @@ def huber_weights(
 
 
 def _solve_residuals(r: FloatArray, predicted: FloatArray, noise: FloatArray) -> FloatArray:
-    return solve(with_blocks(predicted, noise), r.ravel()).reshape(r.shape)
+    return solve_definite(with_blocks(predicted, noise), r.ravel()).reshape(r.shape)

@@ -6,6 +6,7 @@ from array import array
 
 import numpy as np
 
+from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.common.units import to_s
 
 MOST_SAMPLES = 8192
@@ -50,6 +51,23 @@ class Arrivals:
             self._every *= 2
         self.last_s = received_s
         self._count += 1
+
+    def add_all(self, received_ns: IntArray, stamps_ns: IntArray) -> None:
+        """Note the same of several measurements (k,)."""
+        received_s = np.array([to_s(received) for received in received_ns.tolist()])
+        if not self._count:
+            self.first_s = self.last_s = float(received_s[0])
+        pauses_s = np.diff(received_s, prepend=self.last_s) - self._timeout_s
+        self._silence_s += float(np.maximum(pauses_s, 0.0).sum())
+        numbers = self._count + np.arange(len(received_s))
+        kept = numbers % self._every == 0
+        self._received_s.extend(received_s[kept].tolist())
+        self._delays_s.extend(map(to_s, (received_ns - stamps_ns)[kept].tolist()))
+        while len(self._received_s) > MOST_SAMPLES:
+            del self._received_s[1::2], self._delays_s[1::2]
+            self._every *= 2
+        self.last_s = float(received_s[-1])
+        self._count += len(received_s)
 
     def silence_s(self, start_s: float, end_s: float) -> float:
         """Return for how long nothing was known, as each measurement holds until the timeout."""

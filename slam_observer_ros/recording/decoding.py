@@ -28,6 +28,7 @@ from slam_observer_ros.messages.poses_and_velocities import (
     decode_transforms,
     PoseMessage,
 )
+from slam_observer_ros.messages.velocity_blocks import BLOCK_DECODERS, BlockDecoder
 from slam_observer_ros.recording.sources import RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
@@ -57,6 +58,13 @@ def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topi
     if selected.imu is not None:
         decoders[selected.imu] = _one(decode_imu)
     return decoders
+
+
+def block_decoder(selected: SelectedTopics, inputs: InputSettings) -> BlockDecoder | None:
+    """Return what decodes velocities in blocks; None if they are differences of poses."""
+    if inputs.velocity_source == POSE_DIFFERENCES:
+        return None
+    return BLOCK_DECODERS[selected.velocity.message_type]
 
 
 def decode_landmarks(raw: RawMessage) -> Measurement[ObservationEvent]:

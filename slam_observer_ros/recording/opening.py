@@ -8,6 +8,7 @@ from pathlib import Path, PurePath
 
 from slam_observer_ros.common.errors import RecordingError, YamlError
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
+from slam_observer_ros.recording.mcap_source import McapSource
 from slam_observer_ros.recording.salvage import MendedSource, SalvagedSource
 from slam_observer_ros.recording.salvage_formats import is_intact_mcap, SCANS
 from slam_observer_ros.recording.sources import BagSource, Loss, MessageSource, SplitSource
@@ -76,6 +77,8 @@ def _open_directory(path: Path) -> tuple[MessageSource, str | None]:
         for file in files:
             if file.suffix == '.mcap':
                 _check_sums(file, whole)
+        if [file.suffix for file in files] == ['.mcap'] and not whole.compresses_messages:
+            return MendedSource(McapSource(files[0], whole), lambda: _open_parts(files)[0]), None
         return MendedSource(whole, lambda: _open_parts(files)[0]), None
     except RecordingError:
         # A recorder that was killed leaves a truncated file, which its metadata calls whole.
@@ -159,6 +162,7 @@ def _open_file(path: Path) -> tuple[MessageSource, str | None]:
         whole = BagSource(path)
         if path.suffix == '.mcap':
             _check_sums(path, whole)
+            return MendedSource(McapSource(path, whole), lambda: _salvaged(path)), None
         return MendedSource(whole, lambda: _salvaged(path)), None
     except RecordingError as error:
         return _salvage(path, error)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import dataclasses
 import logging
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 from slam_observer_ros.common.errors import MessageError, RecordingError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.events import Event
+from slam_observer_ros.events import Event, VelocityBlock
 from slam_observer_ros.inputs.event_builder import (
     drop_reason,
     DropError,
@@ -23,9 +23,12 @@ from slam_observer_ros.inputs.event_builder import (
 )
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.velocity_blocks import BlockDecoder
 from slam_observer_ros.recording.arrivals import Arrivals
 from slam_observer_ros.recording.contents import Contents
 from slam_observer_ros.recording.decoding import (
+    block_decoder,
+    Decode,
     decode_landmarks,
     decode_pose,
     decode_transform_message,
@@ -33,7 +36,7 @@ from slam_observer_ros.recording.decoding import (
 )
 from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
-from slam_observer_ros.recording.sources import Loss, RawMessage, Topic
+from slam_observer_ros.recording.sources import Loss, RawBlock, RawMessage, Topic
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -41,8 +44,23 @@ from slam_observer_ros.settings.input_settings import InputSettings
 if TYPE_CHECKING:
     from slam_observer_ros.recording.writer import RecordingWriter
 
+FEWEST_IN_BLOCK = 4
+"""Messages that cost less one by one."""
+
 logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Reading:
+    """How the messages of a recording become events."""
+
+    transforms: TransformBuffer
+    builder: EventBuilder
+    decoders: dict[Topic, Decode]
+    decode_block: BlockDecoder | None
+    simulated: set[Topic]  # of a clock that begins at zero
+    moving: Sequence[Topic]  # of transforms
 
 
 class Recording:
@@ -134,8 +152,22 @@ class Recording:
         inputs: InputSettings = InputSettings(),
         velocity_timeout_s: float = Settings.velocity_timeout,
     ) -> Iterator[Event]:
+        """Yield the events of :meth:`blocks` one by one."""
+        for item in self.blocks(selected, inputs, velocity_timeout_s):
+            if isinstance(item, VelocityBlock):
+                yield from item.events()
+            else:
+                yield item
+
+    def blocks(
+        self,
+        selected: SelectedTopics,
+        inputs: InputSettings = InputSettings(),
+        velocity_timeout_s: float = Settings.velocity_timeout,
+    ) -> Iterator[Event | VelocityBlock]:
         """Yield velocities and observations in the base frame, as the live node makes them.
 
+        Where velocities follow each other they come in blocks, which are cheaper to handle.
         They come in the order in which they were received; what waits for a transform on /tf
         comes when that has been received, or is dropped after the timeout. Stamps are those of
         the messages' headers; an unstamped Twist has its receive time, and so has what leaves its
@@ -151,19 +183,43 @@ class Recording:
             topic for topic in decoders if self.contents.begins_at_zero(topic, decoders[topic])
         }
         self.arrivals = {topic.name: Arrivals(velocity_timeout_s) for topic in decoders}
-        moving = selected.transforms.moving
-        for raw in self._source.messages((*decoders, *moving)):
-            if raw.topic in moving:
-                self._insert(transforms, raw, is_static=False)
-            # What waited for a transform, then what has just come
-            events = builder.retry(raw.receive_stamp_ns)
-            if raw.topic in decoders:
-                for measured in self._decoded(raw, decoders[raw.topic]) or ():
-                    timed = self._timed(measured, raw, raw.topic in simulated)
-                    events += builder.add(timed, raw.receive_stamp_ns)
-            for event in events:
-                yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
+        decode_block, moving = block_decoder(selected, inputs), selected.transforms.moving
+        reading = _Reading(transforms, builder, decoders, decode_block, simulated, moving)
+        for raw in self._source.blocks((*decoders, *moving), selected.velocity):
+            if isinstance(raw, RawMessage):
+                yield from self._events_of(raw, reading)
+            elif (velocities := self._velocities_of(raw, reading)) is not None:
+                yield velocities
+            else:
+                for message in raw.messages():
+                    yield from self._events_of(message, reading)
         yield from builder.finish()
+
+    def _events_of(self, raw: RawMessage, reading: _Reading) -> Iterator[Event]:
+        if raw.topic in reading.moving:
+            self._insert(reading.transforms, raw, is_static=False)
+        # What waited for a transform, then what has just come
+        events = reading.builder.retry(raw.receive_stamp_ns)
+        if raw.topic in reading.decoders:
+            for measured in self._decoded(raw, reading.decoders[raw.topic]) or ():
+                timed = self._timed(measured, raw, raw.topic in reading.simulated)
+                events += reading.builder.add(timed, raw.receive_stamp_ns)
+        for event in events:
+            yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
+
+    def _velocities_of(self, raw: RawBlock, reading: _Reading) -> VelocityBlock | None:
+        """Return what :meth:`_events_of` gives of all messages; None if one needs it."""
+        if reading.decode_block is None or len(raw.data) < FEWEST_IN_BLOCK:
+            return None
+        try:
+            frame_id, velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
+        except MessageError:
+            return None
+        has_stamps = raw.topic in reading.simulated or velocities.stamps_ns.all()
+        if not (has_stamps and reading.builder.passes_on(frame_id)):
+            return None
+        self.arrivals[raw.topic.name].add_all(raw.receive_stamps_ns, velocities.stamps_ns)
+        return velocities
 
     def copy_to(self, writer: RecordingWriter, selected: SelectedTopics) -> list[Topic]:
         """Write what was read, as it was received; return topics left out, of unknown types."""

@@ -13,7 +13,14 @@ from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.recording.ros1 import Ros1Messages
-from slam_observer_ros.recording.sources import Loss, MessageSource, RawMessage, Topic
+from slam_observer_ros.recording.sources import (
+    in_blocks,
+    Loss,
+    MessageSource,
+    RawBlock,
+    RawMessage,
+    Topic,
+)
 
 
 class FoundChannel(NamedTuple):
@@ -113,6 +120,12 @@ class SalvagedSource:
                 yield heapq.heappop(held)[-1]
         yield from (raw for *_, raw in sorted(held))
 
+    def blocks(
+        self, topics: Collection[Topic], together: Topic
+    ) -> Iterator[RawMessage | RawBlock]:
+        """Yield the same, those of one of the topics in blocks."""
+        return in_blocks(self.messages(topics), together)
+
     def close(self) -> None:
         """Do nothing: the file is open only while it is read."""
 
@@ -158,11 +171,19 @@ class MendedSource:
                 last_ns = raw.receive_stamp_ns
                 yield raw
         except RecordingError as error:
-            if self._salvaged is None:
-                self._salvaged = self._salvage()
-            if not self._salvaged.topics:
-                raise RecordingError(f'{error}; no whole message is left') from error
-            yield from self._rest(self._salvaged, topics, last_ns)
+            yield from self._rest(error, topics, last_ns)
+
+    def blocks(
+        self, topics: Collection[Topic], together: Topic
+    ) -> Iterator[RawMessage | RawBlock]:
+        """Yield the same, those of one of the topics in blocks."""
+        last_ns: int | None = None
+        try:
+            for raw in self._whole.blocks(topics, together):
+                last_ns = raw.last_ns
+                yield raw
+        except RecordingError as error:
+            yield from in_blocks(self._rest(error, topics, last_ns), together)
 
     def close(self) -> None:
         """Close the files."""
@@ -171,8 +192,14 @@ class MendedSource:
             self._salvaged.close()
 
     def _rest(
-        self, salvaged: MessageSource, topics: Collection[Topic], last_ns: int | None
+        self, error: RecordingError, topics: Collection[Topic], last_ns: int | None
     ) -> Iterator[RawMessage]:
+        """Yield what was received after ``last_ns`` of what is whole."""
+        if self._salvaged is None:
+            self._salvaged = self._salvage()
+        salvaged = self._salvaged
+        if not salvaged.topics:
+            raise RecordingError(f'{error}; no whole message is left') from error
         known = {(topic.name, topic.message_type): topic for topic in topics}
         wanted = [topic for topic in salvaged.topics if (topic.name, topic.message_type) in known]
         for raw in salvaged.messages(wanted):

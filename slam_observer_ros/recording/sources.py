@@ -7,18 +7,26 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import heapq
+from itertools import groupby, islice
 from pathlib import Path
 from typing import NamedTuple, Protocol, TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
 from rosbags import rosbag2
 from rosbags.interfaces import Connection
 
 from slam_observer_ros.common.errors import RecordingError
+from slam_observer_ros.common.types import IntArray
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.recording.ros1 import Ros1Messages
 
 if TYPE_CHECKING:
     from rosbags import rosbag1
+
+
+MOST_IN_BLOCK = 4096
+"""Messages of a block at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +52,29 @@ class RawMessage(NamedTuple):
     topic: Topic
     receive_stamp_ns: int
     data: Buffer
+
+    @property
+    def last_ns(self) -> int:
+        """When the last of it was received, as a block has it."""
+        return self.receive_stamp_ns
+
+
+class RawBlock(NamedTuple):
+    """Messages of one topic and size, received one after the other."""
+
+    topic: Topic
+    receive_stamps_ns: IntArray  # (k,)
+    data: NDArray[np.uint8]  # (k, size) CDR bytes
+
+    @property
+    def last_ns(self) -> int:
+        """When the last of them was received."""
+        return int(self.receive_stamps_ns[-1])
+
+    def messages(self) -> Iterator[RawMessage]:
+        """Yield them one by one."""
+        for stamp_ns, data in zip(self.receive_stamps_ns.tolist(), self.data, strict=True):
+            yield RawMessage(self.topic, stamp_ns, data.tobytes())
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +130,11 @@ class MessageSource(Protocol):
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
 
+    def blocks(
+        self, topics: Collection[Topic], together: Topic
+    ) -> Iterator[RawMessage | RawBlock]:
+        """Yield the same, those of one of the topics in blocks."""
+
     def close(self) -> None:
         """Close the file."""
 
@@ -114,7 +150,7 @@ class BagSource:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._ros1 = Ros1Messages() if path.suffix == '.bag' else None
-        with _damage_reported(path):
+        with damage_reported(path, mends=False):
             self._reader = _reader_of(path)
             self._reader.open()
         counts: Counter[tuple[str, str]] = Counter()
@@ -130,10 +166,21 @@ class BagSource:
         wanted = [c for c in self._reader.connections if self._topic(c) in topics]
         if not wanted:  # rosbags would take this for all connections.
             return
-        remedy = "; 'mcap recover' may save the rest" if self._path.suffix == '.mcap' else ''
-        with _damage_reported(self._path, remedy):
+        with damage_reported(self._path):
             for connection, stamp_ns, data in self._reader.messages(wanted):
                 yield RawMessage(self._topic(connection), stamp_ns, self._cdr(connection, data))
+
+    def blocks(
+        self, topics: Collection[Topic], together: Topic
+    ) -> Iterator[RawMessage | RawBlock]:
+        """Yield the same, those of one of the topics in blocks."""
+        return in_blocks(self.messages(topics), together)
+
+    @property
+    def compresses_messages(self) -> bool:
+        """Whether each message is compressed for itself."""
+        reader = self._reader
+        return isinstance(reader, rosbag2.Reader) and reader.compression_mode == 'message'
 
     def close(self) -> None:
         """Close the file."""
@@ -179,6 +226,12 @@ class SplitSource:
         parts = [self._messages_of(part, topics) for part in self._parts]
         return heapq.merge(*parts, key=lambda raw: raw.receive_stamp_ns)
 
+    def blocks(
+        self, topics: Collection[Topic], together: Topic
+    ) -> Iterator[RawMessage | RawBlock]:
+        """Yield the same, those of one of the topics in blocks."""
+        return in_blocks(self.messages(topics), together)
+
     def close(self) -> None:
         """Close the files."""
         for part in self._parts:
@@ -191,9 +244,27 @@ class SplitSource:
             yield raw._replace(topic=whole[raw.topic])
 
 
+def in_blocks(messages: Iterator[RawMessage], together: Topic) -> Iterator[RawMessage | RawBlock]:
+    """Yield messages, those of one topic and size that follow each other in blocks."""
+
+    def key(raw: RawMessage) -> int:
+        return len(raw.data) if raw.topic == together else -1
+
+    for size, run in groupby(messages, key):
+        if size < 0:
+            yield from run
+            continue
+        while some := list(islice(run, MOST_IN_BLOCK)):
+            data = np.frombuffer(b''.join(raw.data for raw in some), dtype=np.uint8)
+            stamps_ns = np.array([raw.receive_stamp_ns for raw in some], dtype=np.int64)
+            yield RawBlock(together, stamps_ns, data.reshape(len(some), size))
+
+
 @contextmanager
-def _damage_reported(path: Path, remedy: str = '') -> Iterator[None]:
+def damage_reported(path: Path, mends: bool = True) -> Iterator[None]:
     """Turn whatever the reading libraries raise into one line about the file.
+
+    ``mends`` is whether another program may mend a file that was opened.
 
     Fed with damaged files they pass on AssertionError, OverflowError, MemoryError, and the errors
     of their decompressors and of SQLite: no list of classes is complete.
@@ -204,4 +275,5 @@ def _damage_reported(path: Path, remedy: str = '') -> Iterator[None]:
         reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
         if isinstance(error, UnicodeError):  # bytes where text should be
             reason = f'it is damaged, or no {path.suffix} file'
+        remedy = "; 'mcap recover' may save the rest" if mends and path.suffix == '.mcap' else ''
         raise RecordingError(f'{path}: can not be read: {reason}{remedy}') from error

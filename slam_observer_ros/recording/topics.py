@@ -25,8 +25,8 @@ from slam_observer_ros.settings.input_settings import AUTO, InputSettings, ON_TF
 TRUTH_NAMES = frozenset({'ground_truth', 'groundtruth', 'truth', 'gt'})
 """Topics with one of these between the slashes of their name hold truth, not measurements."""
 
-ESTIMATE_NAMES = frozenset({'map', 'landmark_estimates'})
-"""Landmarks that an observer publishes, and does not measure."""
+ESTIMATE_NAMES = frozenset({'landmark_map', 'landmark_estimates', 'map'})
+"""Landmarks that an observer publishes, and does not measure; ``map`` in older recordings."""
 
 logger = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import average_nees_band, normalised_squared_errors
-from slam_observer_ros.report.ellipses import CHI_SQUARE_95
+from slam_observer_ros.evaluation.ellipses import CHI_SQUARE_95
 from slam_observer_ros.report.lists import Json, rounded
 from slam_observer_ros.report.reported_run import ReportedRun
 
@@ -99,20 +99,19 @@ def _nis(run: ReportedRun) -> dict[str, Json]:
 def calibration(run: ReportedRun) -> list[Json]:
     """Return what was estimated of the velocity's calibration, and its standard deviation."""
     parts = run.instants[-1].calibration if run.instants else ()
-    return [
-        {
-            'name': part.name,
-            'unit': part.unit,
-            'nominal': part.nominal,
-            'value': rounded(
-                np.array([instant.calibration[index].value for instant in run.instants]), 5
-            ),
-            'deviation': rounded(
-                np.array([instant.calibration[index].deviation for instant in run.instants]), 5
-            ),
-        }
-        for index, part in enumerate(parts)
-    ]
+    return [_calibration_curve(run, index) for index in range(len(parts))]
+
+
+def _calibration_curve(run: ReportedRun, index: int) -> dict[str, Json]:
+    parts = [instant.calibration[index] for instant in run.instants]
+    factor, unit = parts[-1].for_people
+    return {
+        'name': parts[-1].name,
+        'unit': unit,
+        'nominal': factor * parts[-1].nominal,
+        'value': rounded(factor * np.array([part.value for part in parts]), 5),
+        'deviation': rounded(factor * np.array([part.deviation for part in parts]), 5),
+    }
 
 
 def drops(run: ReportedRun) -> list[Json]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.evaluation.ellipses import ellipses
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.report.curves import calibration, consistency, drops, errors
-from slam_observer_ros.report.ellipses import ellipses
 from slam_observer_ros.report.findings import findings
 from slam_observer_ros.report.lists import Json, rounded
 from slam_observer_ros.report.reported_run import ReportedRun

@@ -17,11 +17,13 @@ from slam_observer_ros.recording.writer import RecordingWriter
 OVERVIEW_PERIOD_NS = 1_000_000_000
 """Time between two maps, nanoseconds."""
 
-TOPICS = ('/odometry', '/pose', '/lyapunov', '/path', '/map', '/markers')
+ODOMETRY_TOPIC = '/observer_node/odometry'
+MAP_TOPIC = '/landmark_map'
+TOPICS = (ODOMETRY_TOPIC, '/pose', '/lyapunov', '/path', MAP_TOPIC, '/markers')
 """Topics of the estimate, named as the node's."""
 
 ALIGNED_POSE_TOPIC = '/aligned_truth/pose'
-ALIGNED_LANDMARKS_TOPIC = '/aligned_truth/map'
+ALIGNED_LANDMARKS_TOPIC = '/aligned_truth/landmark_map'
 
 
 class EstimateWriter:
@@ -110,7 +112,7 @@ class EstimateWriter:
         uncertain = messages.pose(stamp_ns, pose, estimator.pose_covariance)
         velocity, covariance = estimator.body_velocity, estimator.body_velocity_covariance
         self._write('/pose', uncertain, stamp_ns, latched=True)
-        self._write('/odometry', messages.odometry(uncertain, velocity, covariance), stamp_ns)
+        self._write(ODOMETRY_TOPIC, messages.odometry(uncertain, velocity, covariance), stamp_ns)
         if self._publishes_tf:
             self._write('/tf', messages.transform(stamp_ns, pose), stamp_ns)
         if is_due(stamp_ns, self._path_ns, PATH_SPACING_NS):
@@ -125,7 +127,7 @@ class EstimateWriter:
         )
         velocities = estimator.landmark_velocities
         cloud = self._messages.landmarks(stamp_ns, *landmarks, velocities)
-        self._write('/map', cloud, stamp_ns, latched=True)
+        self._write(MAP_TOPIC, cloud, stamp_ns, latched=True)
         markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
         self._write('/markers', markers, stamp_ns)
         for part in estimator.calibration:

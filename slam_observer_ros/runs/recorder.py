@@ -101,9 +101,6 @@ class NisTally:
         """Forget all: the run has started again."""
         self._nis, self._degrees_of_freedom = 0.0, 0
 
-    def note_stamp(self, estimator: Estimator) -> None:
-        """Take no notice: innovations come with observations."""
-
     def note_update(self, update: Update) -> None:
         """Take in an observation, of which the estimator has judged the innovation."""
         innovation = update.innovation

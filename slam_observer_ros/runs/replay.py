@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 import time
-from typing import ParamSpec, Protocol
+from typing import ParamSpec, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from slam_observer_ros.estimates import Update, used_points
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
-from slam_observer_ros.events import AngularVelocityEvent, Event
+from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityBlock
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
@@ -36,14 +36,19 @@ NEES_PERIOD_NS = 5_000_000_000
 class Recorder(Protocol):
     """Notes of a run what is shown or written."""
 
-    def note_stamp(self, estimator: Estimator) -> None:
-        """Take in the state when all events of a stamp have been used."""
-
     def note_update(self, update: Update) -> None:
         """Take in an observation, with its innovation."""
 
     def clear(self) -> None:
         """Forget all: the run has started again."""
+
+
+@runtime_checkable
+class StampRecorder(Recorder, Protocol):
+    """Looks at the state of each stamp, too: events are then used one by one."""
+
+    def note_stamp(self, estimator: Estimator) -> None:
+        """Take in the state when all events of a stamp have been used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +72,8 @@ class Replay:
         CPU time of the estimator alone, without reading and measuring.
     start_ns : int
         Stamp of the first event that was used, nanoseconds; 0 if none was.
+    localised_ns : (int, int) or None
+        First and last stamp at which the pose in its final frame was known; None if it never was.
     events, observations, angular_velocities : int
         Events, dropped ones included; observations of which points were used; angular velocities
         of an Imu that were taken in: all of them also before the last reset.
@@ -85,6 +92,7 @@ class Replay:
     seconds: float
     in_known_map: bool
     start_ns: int
+    localised_ns: tuple[int, int] | None
     observations: int
     angular_velocities: int
 
@@ -100,19 +108,19 @@ class Replay:
 
 
 def replay(
-    events: Iterable[Event],
+    events: Iterable[Event | VelocityBlock],
     settings: Settings,
     truth: Truth | None = None,
     landmark_map: LandmarkMap | None = None,
     keep_all: bool = True,
-    recorders: Sequence[Recorder] = (),
+    recorders: Sequence[Recorder | StampRecorder] = (),
 ) -> Replay:
     """Run events through an estimator, from where the settings say or anywhere in a known map.
 
     The events are in the order in which they were received; the truth is what the configuration
-    error is measured against. Where not all is kept, memory does not grow with the recording: of
-    poses there are the first and the last, and residuals there are none. What
-    ``recorders`` note is shown or written.
+    error is measured against. Where not all is kept, memory does not grow with the recording:
+    there are no poses, of those of the velocities alone the first and the last, and no residuals.
+    What ``recorders`` note is shown or written.
     """
     run = _RunningReplay(settings, truth, landmark_map, keep_all, recorders)
     for event in events:
@@ -129,15 +137,16 @@ class _RunningReplay:
         truth: Truth | None,
         landmark_map: LandmarkMap | None,
         keep_all: bool,
-        recorders: Sequence[Recorder],
+        recorders: Sequence[Recorder | StampRecorder],
     ) -> None:
         self._settings = settings
         self._keep_all = keep_all
         self._recorders = recorders
+        self._stamp_recorders = [each for each in recorders if isinstance(each, StampRecorder)]
         self._estimator = Estimator(
             settings,
             on_update=self._untimed(self._on_update),
-            on_stamp=self._untimed(self._on_stamp),
+            on_stamps=self._untimed(self._on_stamps),
             on_motion=self._untimed(self._on_motion),
             on_jump=self._untimed(self._on_jump),
             judges_innovations=bool(recorders),
@@ -154,14 +163,27 @@ class _RunningReplay:
         self._clear_figures()
 
     def _clear_figures(self) -> None:
-        self._sampler = TrajectorySampler(self._keep_all)
+        self._sampler = TrajectorySampler()
         self._dead_reckoning = DeadReckoning(self._keep_all)
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
         self._start_ns: int | None = None
+        self._localised_ns: tuple[int, int] | None = None
         self._next_nees_ns = 0
 
-    def add(self, event: Event) -> None:
+    def add(self, event: Event | VelocityBlock) -> None:
+        if not isinstance(event, VelocityBlock):
+            self._add_event(event)
+        elif self._stamp_recorders:
+            for velocity in event.events():
+                self._add_event(velocity)
+        else:
+            self._events += len(event)
+            start_s = time.thread_time()
+            self._estimator.add_velocities(event)
+            self._seconds += time.thread_time() - start_s
+
+    def _add_event(self, event: Event) -> None:
         self._events += 1
         start_s = time.thread_time()
         is_taken = self._estimator.add(event)
@@ -189,6 +211,7 @@ class _RunningReplay:
             seconds=self._seconds,
             in_known_map=self._in_known_map,
             start_ns=self._start_ns or 0,
+            localised_ns=self._localised_ns,
             observations=self._observations,
             angular_velocities=self._angular_velocities,
         )
@@ -203,17 +226,20 @@ class _RunningReplay:
 
         return call
 
-    def _on_stamp(self) -> None:
+    def _on_stamps(self, stamps_ns: IntArray) -> None:
+        first_ns, last_ns = stamps_ns[[0, -1]].tolist()
         if self._start_ns is None:
-            self._start_ns = self._estimator.stamp_ns
-        for recorder in self._recorders:
+            self._start_ns = first_ns
+        for recorder in self._stamp_recorders:
             recorder.note_stamp(self._estimator)
-        stamp_ns, is_localised = self._estimator.stamp_ns, self._estimator.is_localised
-        if stamp_ns is None or not is_localised or not self._sampler.is_due(stamp_ns):
+        if not self._estimator.is_localised:
             return
-        has_truth = self._pose_truth is not None and len(self._pose_truth.poses) > 0
-        covariance = self._estimator.pose_covariance if has_truth else None  # takes longer
-        self._sampler.add(stamp_ns, self._estimator.pose, covariance)
+        if self._localised_ns is not None:
+            first_ns = self._localised_ns[0]
+        self._localised_ns = first_ns, last_ns
+        if self._keep_all and len(due_ns := self._sampler.due(stamps_ns)):
+            has_truth = self._pose_truth is not None and len(self._pose_truth) > 0
+            self._sampler.add(due_ns, *self._estimator.poses_at(due_ns, has_truth))
 
     def _on_motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> None:
         self._dead_reckoning.advance(velocities, start_ns, end_ns)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.clock_jumps import is_due
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.clock_jumps import due_rows
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.geometry import se3, so3
@@ -26,17 +26,17 @@ class PoseSamples:
         self.stamps_ns: list[int] = []
         self._poses: list[FloatArray] = []
 
-    def is_due(self, stamp_ns: int) -> bool:
-        """Return whether a pose of that stamp is to be added."""
+    def due(self, stamps_ns: IntArray) -> list[int]:
+        """Return the rows of increasing stamps (s,) of which poses are to be added."""
         last_ns = self.stamps_ns[-1] if self.stamps_ns else None
-        return is_due(stamp_ns, last_ns, SAMPLE_PERIOD_NS)
+        return due_rows(stamps_ns, last_ns, SAMPLE_PERIOD_NS)
 
-    def add(self, stamp_ns: int, pose: FloatArray) -> None:
-        """Append a pose."""
+    def add(self, stamps_ns: IntArray, poses: FloatArray) -> None:
+        """Append poses (s, 4, 4)."""
+        self.stamps_ns += stamps_ns.tolist()
+        self._poses += list(poses)
         if not self._keep_all:
-            del self.stamps_ns[1:], self._poses[1:]
-        self.stamps_ns.append(stamp_ns)
-        self._poses.append(pose)
+            del self.stamps_ns[1:-1], self._poses[1:-1]
 
     @property
     def trajectory(self) -> Trajectory:
@@ -47,19 +47,19 @@ class PoseSamples:
 class TrajectorySampler:
     """Collects poses and their covariances (6, 6), where these are known."""
 
-    def __init__(self, keep_all: bool = True) -> None:
-        self._samples = PoseSamples(keep_all)
+    def __init__(self) -> None:
+        self._samples = PoseSamples()
         self._covariances: list[FloatArray] = []
 
-    def is_due(self, stamp_ns: int) -> bool:
-        """Return whether a pose of that stamp is to be added."""
-        return self._samples.is_due(stamp_ns)
+    def due(self, stamps_ns: IntArray) -> IntArray:
+        """Return those of increasing stamps (s,) of which poses are to be added."""
+        return stamps_ns[self._samples.due(stamps_ns)]
 
-    def add(self, stamp_ns: int, pose: FloatArray, covariance: FloatArray | None) -> None:
-        """Append a pose, and its covariance."""
-        self._samples.add(stamp_ns, pose)
-        if covariance is not None:
-            self._covariances.append(covariance)
+    def add(self, stamps_ns: IntArray, poses: FloatArray, covariances: FloatArray | None) -> None:
+        """Append poses (s, 4, 4), and their covariances (s, 6, 6)."""
+        self._samples.add(stamps_ns, poses)
+        if covariances is not None:
+            self._covariances += list(covariances)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -90,9 +90,8 @@ class DeadReckoning:
         path = se3.path(self._pose, held.body_velocities * held.dt_s[:, None])
         elapsed_s = np.append(0.0, np.cumsum(held.dt_s + held.gap_s))
         stamps_ns = start_ns + np.rint(elapsed_s * NANOSECONDS_PER_SECOND).astype(np.int64)
-        for stamp_ns, pose in zip(stamps_ns.tolist(), path, strict=True):
-            if self._samples.is_due(stamp_ns):
-                self._samples.add(stamp_ns, pose.copy())
+        rows = self._samples.due(stamps_ns)
+        self._samples.add(stamps_ns[rows], path[rows])
         self._pose = se3.pose(so3.normalise(path[-1, :3, :3]), path[-1, :3, 3])
 
     @property

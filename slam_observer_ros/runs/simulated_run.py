@@ -11,6 +11,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.evaluation.decay import Decay, fit_decay
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.observer.innovation import lyapunov
@@ -30,14 +31,14 @@ class SimulatedRun:
     """What came of a simulated run.
 
     ``lyapunov`` (k,) is L (34) before each correction; ``times_s`` (k,) are since the start. The
-    ``slope_per_s`` is that of :func:`fit_slope`. The poses ``estimate`` and ``truth`` have the
+    ``decay`` is that of :func:`.fit_decay`. The poses ``estimate`` and ``truth`` have the
     same p stamps, and so have ``landmark_tracks`` (p, n, 3) of the estimate, in its world, metres;
     they are NaN before the first sighting.
     """
 
     times_s: FloatArray
     lyapunov: FloatArray
-    slope_per_s: float | None
+    decay: Decay | None
     estimate: Trajectory
     truth: Trajectory
     landmark_tracks: FloatArray
@@ -60,21 +61,6 @@ def run_simulation(
     return run.result()
 
 
-def fit_slope(times_s: FloatArray, lyapunov: FloatArray, floor: float) -> float | None:
-    """Fit the slope of log10 L over time, after the transient and before rounding is felt.
-
-    L (k,) at ``times_s`` (k,) counts until it first falls below ``floor``, where rounding is felt;
-    the transient is taken to be over at half of that time. Returns decades per second, or None
-    if there are fewer than two values to fit.
-    """
-    below = np.flatnonzero(lyapunov <= floor)
-    end = int(below[0]) if len(below) else len(lyapunov)
-    if end - end // 2 < 2:
-        return None
-    fitted = slice(end // 2, end)
-    return float(np.polyfit(times_s[fitted], np.log10(lyapunov[fitted]), 1)[0])
-
-
 class _RunningSimulation:
     """Keeps L of every update and, at most 20 times a second, the configuration."""
 
@@ -88,9 +74,10 @@ class _RunningSimulation:
     def _on_update(self, update: Update) -> None:
         if len(update.ids):
             self._lyapunov[update.stamp_ns] = update.lyapunov
-        if not self._samples.is_due(update.stamp_ns):
+        stamps_ns = np.array([update.stamp_ns])
+        if not self._samples.due(stamps_ns):
             return
-        self._samples.add(update.stamp_ns, update.pose)
+        self._samples.add(stamps_ns, update.pose[None])
         points = np.full((len(self._simulation.landmark_ids), 3), np.nan)
         points[self.estimator.landmark_ids] = self.estimator.world_points
         self._landmark_tracks.append(points)
@@ -102,7 +89,7 @@ class _RunningSimulation:
         return SimulatedRun(
             times_s,
             levels,
-            fit_slope(times_s, levels, ROUNDING_MARGIN * self._rounding()),
+            fit_decay(times_s, levels, ROUNDING_MARGIN * self._rounding()),
             estimate,
             Trajectory(estimate.stamps_ns, self._simulation.pose(estimate.stamps_ns)),
             np.array(self._landmark_tracks),

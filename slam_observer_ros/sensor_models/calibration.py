@@ -119,9 +119,7 @@ class Calibration:
         """
         if not self.count:
             return np.empty((Ad.shape[1], 0))
-        rates = measured_velocities[:, self._calibrated]
-        rates[:, self._scales :] = _moves(measured_velocities)[:, None]
-        shares = se3.at_poses(rates * dt_s[:, None])
+        shares = se3.at_poses(self._rates(measured_velocities) * dt_s[:, None])
         of_rates = Ad[:, :, self._calibrated] * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
         F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
@@ -129,6 +127,19 @@ class Calibration:
             first, last = self.apply(at_ends)
             F[:, -1] = Ad[0] @ first - Ad[-1] @ last
         return F
+
+    def sensitivity_until(
+        self, Ad: FloatArray, measured_velocities: FloatArray, dt_s: FloatArray
+    ) -> FloatArray:
+        """Return :meth:`sensitivity` until each pose (k + 1, p, c); no delay is estimated."""
+        shares = 0.5 * self._rates(measured_velocities) * dt_s[:, None]
+        return se3.summed_until((Ad[:-1] + Ad[1:])[:, :, self._calibrated] * shares[:, None, :])
+
+    def _rates(self, measured_velocities: FloatArray) -> FloatArray:
+        """Return (k, …) how fast each scale and bias moves the robot per unit of its error."""
+        rates = measured_velocities[:, self._calibrated]
+        rates[:, self._scales :] = _moves(measured_velocities)[:, None]
+        return rates
 
     def initial_covariance(self) -> FloatArray:
         """Return that of (ε, c̃) at the start, (p + c, p + c): the pose is the reference."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +48,24 @@ class HeldVelocities:
             gap_s=np.where(is_gap, self.gap_s[rows], 0.0),
             before_s=self.before_s[rows],
             usual_s=self.usual_s,
+        )
+
+    def counts_with_gaps_apart(self, counts: IntArray) -> IntArray:
+        """Return how many pieces the first ``counts`` (s,) are :meth:`with_gaps_apart`."""
+        has_gap = (self.gap_s > 0.0) & (self.dt_s > 0.0)
+        more: IntArray = np.append(0, np.cumsum(has_gap))
+        return counts + more[counts]
+
+    def first(self, count: int, usual_s: FloatArray) -> HeldVelocities:
+        """Return the first pieces, as when velocities were held for ``usual_s`` (2,) as a rule."""
+        return HeldVelocities(
+            body_velocities=self.body_velocities[:count],
+            covariances=self.covariances[:count],
+            is_stated=self.is_stated[:count],
+            dt_s=self.dt_s[:count],
+            gap_s=self.gap_s[:count],
+            before_s=self.before_s[:count],
+            usual_s=usual_s,
         )
 
     def averaged(self, window_s: float) -> FloatArray:

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 
@@ -66,6 +66,22 @@ def integrate(
         at_ends=at_ends,
         calibration=calibration,
     )
+
+
+def integrate_until(
+    velocities: VelocityHistory,
+    calibration: Calibration,
+    noise: MotionNoise,
+    A: FloatArray,
+    start_ns: int,
+    stamps_ns: IntArray,
+) -> Passage:
+    """Return how Â, ``A`` (4, 4) at ``start_ns``, moves on through stamps (s,) of velocities.
+
+    Where no delay is estimated: else what was known at each stamp is not what is known now.
+    """
+    held, counts, usual_s = velocities.held_until(start_ns, stamps_ns)
+    return Passage(_path(A, held, calibration), held, counts, usual_s, calibration, noise)
 
 
 def _held(

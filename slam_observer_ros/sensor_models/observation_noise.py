@@ -18,6 +18,9 @@ What claims to be better is lost in rounding beside a pose that may be off by a 
 RELATIVE_RESOLUTION = 1e-6
 """The same as a share of the distance, for points in single precision or better."""
 
+RESOLUTION_RAD = 1e-4
+"""The same of an orientation, about each axis."""
+
 MAX_ERROR_M = 1e3
 """Standard deviation of an observed point beyond which a message only says 'unknown'."""
 
@@ -63,6 +66,21 @@ class ObservationNoise(Immutable):
             covariances[unknown] = self.at(lines_of_sight[unknown])
         return covariances
 
+    def orientation_covariances(self, event: ObservationEvent) -> FloatArray:
+        """Return what an observation's orientations may be off by (m, 3, 3), rad².
+
+        Of rotation vectors along the event's axes; all can be inverted.
+        """
+        by_settings = np.broadcast_to(
+            self._settings.orientation_noise**2 * _IDENTITY, (len(event.ids), 3, 3)
+        )
+        stated = event.orientation_covariances
+        if stated is None:
+            return by_settings
+        is_stated = np.asarray(stated.any(axis=(1, 2)))[:, None, None]
+        known = limited(stated, np.full(3, np.pi)) + RESOLUTION_RAD**2 * _IDENTITY
+        return np.where(is_stated, known, by_settings)
+
     def at(self, lines_of_sight: FloatArray) -> FloatArray:
         """Return what the settings say of points along ``lines_of_sight`` (m, 3)."""
         s = self._settings
@@ -77,7 +95,7 @@ class ObservationNoise(Immutable):
         else:
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2
-        return _invertible(_along_and_across(lines_of_sight, range_squared, along, across))
+        return _along_and_across(lines_of_sight, range_squared, along, across)
 
 
 def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
@@ -105,12 +123,16 @@ def _invertible(covariances: FloatArray) -> FloatArray:
 def _along_and_across(
     lines_of_sight: FloatArray, range_squared: FloatArray, along: FloatArray, across: FloatArray
 ) -> FloatArray:
-    """Return covariances with given variances along and across the line of sight.
+    """Return covariances with given variances along and across the line of sight, invertible.
 
     A point at the sensor itself has no line of sight; it is known as well as its range is.
     """
-    across = np.where(range_squared > 0.0, across, along)
+    if np.count_nonzero(range_squared) < len(range_squared):
+        across = np.where(range_squared > 0.0, across, along)
     excess = (along - across) / np.maximum(range_squared, _TINY)
-    outer = lines_of_sight[:, :, None] * lines_of_sight[:, None, :]
-    spread: FloatArray = excess[:, None, None] * outer
-    return spread + across[:, None, None] * _IDENTITY
+    scaled = excess[:, None] * lines_of_sight
+    covariances: FloatArray = scaled[:, :, None] * lines_of_sight[:, None, :]
+    # As of _invertible, but with the trace that is known.
+    least = RESOLUTION_M**2 + MIN_SHARE * (along + 2.0 * across)
+    covariances += (across + least)[:, None, None] * _IDENTITY
+    return covariances

@@ -6,12 +6,18 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass, fields
 import math
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND, to_s
-from slam_observer_ros.events import AngularVelocityEvent, flatten_velocities, VelocityEvent
+from slam_observer_ros.events import (
+    AngularVelocityEvent,
+    flatten_velocities,
+    VelocityBlock,
+    VelocityEvent,
+)
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
@@ -42,7 +48,7 @@ class VelocityHistory:
         self._stamps_ns = [NEVER_NS]
         self._joined = _Joined.with_room_for(FIRST_CAPACITY)
         # Those that nobody has asked for yet: many written at once cost less than one by one.
-        self._unwritten: list[tuple[VelocityEvent, AngularVelocityEvent | None]] = []
+        self._unwritten: list[_InForce] = []
         self._velocity: VelocityEvent | None = None
         self._angular: AngularVelocityEvent | None = None
         self._periods, self._angular_periods = _Periods(), _Periods()
@@ -64,9 +70,23 @@ class VelocityHistory:
         angular = self._angular
         if angular is not None and not 0 <= event.stamp_ns - angular.stamp_ns <= self._timeout_ns:
             angular = None
-        self._unwritten.append((self._velocity, angular))
+        self._unwritten.append((self._velocity, angular, self._usual_s()))
         self._stamps_ns.append(event.stamp_ns)
         return True
+
+    @property
+    def is_of_one_sensor(self) -> bool:
+        """Whether there was no angular velocity of another sensor."""
+        return self._angular is None
+
+    def append_velocities(self, velocities: VelocityBlock) -> None:
+        """Add velocities that are of one sensor as :meth:`append` adds each of them."""
+        self._written()
+        stamps_ns, first = velocities.stamps_ns.tolist(), len(self._stamps_ns)
+        self._stamps_ns += stamps_ns
+        usual_s = [self._periods.add(stamp_ns) for stamp_ns in stamps_ns]
+        self._written().write_velocities(first, velocities, usual_s)
+        (self._velocity,) = velocities.part(slice(-1, None)).events()
 
     def latest(self, stamp_ns: int) -> FloatArray | None:
         """Return the velocity (6,) in force at ``stamp_ns``; None if none is or it timed out."""
@@ -95,32 +115,39 @@ class VelocityHistory:
             dt_s=np.array([0.0 if timed_out else period_s]),
             gap_s=np.array([period_s if timed_out else 0.0]),
             before_s=np.zeros((1, 2)),
-            usual_s=self._usual_s(),
+            usual_s=np.array(self._usual_s()),
         )
 
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
-        rows, begins, stops, ends = self._pieces(start_ns, end_ns)
-        joined = self._written()
-        held = HeldVelocities(
-            body_velocities=self._counting(joined.body_velocities[rows]),
-            covariances=joined.covariances[rows],
-            is_stated=joined.is_stated[rows],
-            dt_s=to_s(stops - begins),
-            gap_s=to_s(ends - stops),
-            before_s=to_s(begins[:, None] - joined.since_ns[rows]),
-            usual_s=self._usual_s(),
-        )
+        held = self._held(self._pieces(start_ns, end_ns))
         return held.with_gaps_apart() if held.gap_s.any() else held
+
+    def held_until(
+        self, start_ns: int, stamps_ns: IntArray
+    ) -> tuple[HeldVelocities, IntArray, FloatArray]:
+        """Return the velocities in force from ``start_ns`` to the last of s increasing stamps.
+
+        Also how many of them (s,) are until each stamp, which is one of a velocity, and for how
+        long they were held as a rule (s, 2) as far as it was known then.
+        """
+        pieces = self._pieces(start_ns, int(stamps_ns[-1]))
+        held, counts = self._held(pieces), pieces.ends_ns.searchsorted(stamps_ns, 'right')
+        rows = np.searchsorted(self._stamps_ns, stamps_ns, 'right') - 1
+        usual_s = self._written().usual_s[rows]
+        if held.gap_s.any():
+            counts = held.counts_with_gaps_apart(counts)
+            held = held.with_gaps_apart()
+        return held, counts, usual_s
 
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
-        rows, begins, stops, _ = self._pieces(start_ns, end_ns)
-        dt_s = to_s(stops - begins)
+        pieces = self._pieces(start_ns, end_ns)
+        dt_s = to_s(pieces.stops_ns - pieces.begins_ns)
         known_s = dt_s.sum()
         if known_s == 0.0:
             return np.zeros(6)
-        return self._counting(dt_s @ self._written().body_velocities[rows] / known_s)
+        return self._counting(dt_s @ self._written().body_velocities[pieces.rows] / known_s)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
@@ -130,19 +157,32 @@ class VelocityHistory:
             self._joined = joined.copied(kept, joined.capacity)
             del self._stamps_ns[1:first]
 
-    def _pieces(self, start_ns: int, end_ns: int) -> tuple[slice, IntArray, IntArray, IntArray]:
-        """Return rows of the velocities in force, and when each begins, times out and ends, ns."""
+    def _held(self, pieces: _Pieces) -> HeldVelocities:
+        rows, begins_ns, stops_ns, ends_ns = pieces
+        joined = self._written()
+        return HeldVelocities(
+            body_velocities=self._counting(joined.body_velocities[rows]),
+            covariances=joined.covariances[rows],
+            is_stated=joined.is_stated[rows],
+            dt_s=to_s(stops_ns - begins_ns),
+            gap_s=to_s(ends_ns - stops_ns),
+            before_s=to_s(begins_ns[:, None] - joined.since_ns[rows]),
+            usual_s=np.array(self._usual_s()),
+        )
+
+    def _pieces(self, start_ns: int, end_ns: int) -> _Pieces:
         first = bisect_right(self._stamps_ns, start_ns) - 1
         last = bisect_left(self._stamps_ns, end_ns)
         stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
         begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
         timed_out = self._written().since_ns[first:last, 1] + self._timeout_ns
-        return slice(first, last), begins, np.minimum(np.maximum(timed_out, begins), ends), ends
+        stops = np.minimum(np.maximum(timed_out, begins), ends)
+        return _Pieces(slice(first, last), begins, stops, ends)
 
-    def _usual_s(self) -> FloatArray:
+    def _usual_s(self) -> tuple[float, float]:
         linear_s = self._periods.usual_s
         angular_s = linear_s if self._angular is None else self._angular_periods.usual_s
-        return np.array([angular_s, linear_s])
+        return angular_s, linear_s
 
     def _written(self) -> _Joined:
         """Return all velocities, those that have come since the last time among them."""
@@ -162,28 +202,52 @@ class VelocityHistory:
 
 
 class _Periods:
-    """For how long messages of one sensor are in force as a rule."""
+    """For how long messages of one sensor are in force as a rule.
+
+    ``usual_s`` is the longest period lately but one, seconds; infinite before there are two.
+    """
 
     def __init__(self) -> None:
         self._block_ns: list[int] = []
         # The two longest of each block before: no others are among the two longest of all.
         self._longest_ns: deque[int] = deque(maxlen=2 * BLOCKS)
         self._last_ns: int | None = None
+        self._usual_ns = -1  # what a period must be longer than to change it
+        self.usual_s = math.inf
 
-    def add(self, stamp_ns: int) -> None:
-        """Take the stamp of the next message."""
-        if self._last_ns is not None:
-            self._block_ns.append(stamp_ns - self._last_ns)
-        self._last_ns = stamp_ns
-        if len(self._block_ns) == BLOCK:
+    def add(self, stamp_ns: int) -> float:
+        """Take the stamp of the next message; return ``usual_s``."""
+        last_ns, self._last_ns = self._last_ns, stamp_ns
+        if last_ns is None:
+            return self.usual_s
+        period_ns = stamp_ns - last_ns
+        self._block_ns.append(period_ns)
+        is_full = len(self._block_ns) == BLOCK
+        if is_full:
             self._longest_ns.extend(sorted(self._block_ns)[-2:])
             self._block_ns = []
+        if is_full or period_ns > self._usual_ns:
+            self._judge()
+        return self.usual_s
 
-    @property
-    def usual_s(self) -> float:
-        """The longest period lately but one, seconds; infinite before there are two."""
+    def _judge(self) -> None:
         longest_ns = sorted([*self._longest_ns, *self._block_ns])[-2:]
-        return math.inf if len(longest_ns) < 2 else to_s(longest_ns[0]) or math.inf
+        if len(longest_ns) == 2:
+            self._usual_ns = longest_ns[0]
+            self.usual_s = to_s(longest_ns[0]) or math.inf
+
+
+_InForce: TypeAlias = tuple[VelocityEvent, AngularVelocityEvent | None, tuple[float, float]]
+"""What is in force from a stamp on, and for how long that is as a rule, by part, seconds."""
+
+
+class _Pieces(NamedTuple):
+    """Rows of velocities in force, and when each begins, times out and ends."""
+
+    rows: slice
+    begins_ns: IntArray
+    stops_ns: IntArray
+    ends_ns: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,6 +261,7 @@ class _Joined:
     covariances: FloatArray  # (c, 6, 6), zero where unknown
     is_stated: BoolArray  # (c, 2)
     since_ns: IntArray  # (c, 2)
+    usual_s: FloatArray  # (c, 2) how long it was usual then that they are in force
 
     @classmethod
     def with_room_for(cls, capacity: int) -> _Joined:
@@ -206,6 +271,7 @@ class _Joined:
             np.zeros((capacity, 6, 6)),
             np.zeros((capacity, 2), dtype=np.bool_),
             np.full((capacity, 2), NEVER_NS, dtype=np.int64),
+            np.full((capacity, 2), np.inf),
         )
 
     @property
@@ -221,15 +287,27 @@ class _Joined:
             getattr(roomy, field.name)[: len(kept)] = kept
         return roomy
 
-    def write(
-        self, first: int, events: list[tuple[VelocityEvent, AngularVelocityEvent | None]]
+    def write_velocities(
+        self, first: int, velocities: VelocityBlock, usual_s: list[float]
     ) -> None:
+        """As :meth:`write`, of velocities of one sensor."""
+        rows, covariances = slice(first, first + len(velocities)), velocities.covariances
+        self.body_velocities[rows] = velocities.body_velocities
+        self.since_ns[rows] = velocities.stamps_ns[:, None]
+        self.usual_s[rows] = np.array(usual_s)[:, None]
+        if covariances is not None:
+            self.covariances[rows] = covariances
+            self.is_stated[rows, 0] = covariances[:, :3, :3].any(axis=(1, 2))
+            self.is_stated[rows, 1] = covariances[:, 3:, 3:].any(axis=(1, 2))
+
+    def write(self, first: int, events: list[_InForce]) -> None:
         """Fill in rows from ``first`` on, once: others may see them."""
         rows = slice(first, first + len(events))
-        self.body_velocities[rows] = [velocity.body_velocity for velocity, _ in events]
-        stamps_ns = np.array([velocity.stamp_ns for velocity, _ in events], dtype=np.int64)
+        self.body_velocities[rows] = [velocity.body_velocity for velocity, *_ in events]
+        stamps_ns = np.array([velocity.stamp_ns for velocity, *_ in events], dtype=np.int64)
         self.since_ns[rows] = stamps_ns[:, None]
-        for row, (velocity, angular) in enumerate(events, first):
+        self.usual_s[rows] = [usual_s for *_, usual_s in events]
+        for row, (velocity, angular, _) in enumerate(events, first):
             if (stated := velocity.covariance) is not None:
                 self.covariances[row] = stated
                 self.is_stated[row] = stated[:3, :3].any(), stated[3:, 3:].any()

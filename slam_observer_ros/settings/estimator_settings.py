@@ -208,6 +208,21 @@ class Settings(Immutable):
         minimum=1e-6,
         read_only=False,
     )
+    use_tag_orientation: bool = parameter(
+        False,
+        'Riccati gains: whether the orientation of a tag is used, not its position alone; then '
+        "one tag in view determines the robot's heading",
+        basic=True,
+    )
+    orientation_noise: float = parameter(
+        0.05,
+        "Standard deviation of a tag's orientation about each axis, where its message has no "
+        'covariance',
+        unit='rad',
+        minimum=1e-4,
+        maximum=3.0,
+        read_only=False,
+    )
     observation_correlation_time: float = parameter(
         0.0,
         'Scheduled and Riccati gains: correlation time of the error of an observed landmark, such '

@@ -73,6 +73,31 @@ class ObserverNodeSettings(InputSettings):
     path_length: int = parameter(
         2000, 'Most poses kept in path; the oldest go first', minimum=1, maximum=100_000
     )
+    position_warn: float = parameter(
+        0.5,
+        'Standard deviation of the position, in its worst direction, from which on /diagnostics '
+        'warns',
+        unit='m',
+        minimum=0.0,
+    )
+    position_error: float = parameter(
+        2.0,
+        'The same, from which on it is an error, and ~/is_localised is false',
+        unit='m',
+        minimum=0.0,
+    )
+    heading_warn: float = parameter(
+        0.2,
+        'Standard deviation of the heading from which on /diagnostics warns',
+        unit='rad',
+        minimum=0.0,
+    )
+    heading_error: float = parameter(
+        0.5,
+        'The same, from which on it is an error, and ~/is_localised is false',
+        unit='rad',
+        minimum=0.0,
+    )
     map_file: str = parameter(
         '',
         'Map to load at the start: one saved earlier, or surveyed landmarks; empty for none',
@@ -80,6 +105,17 @@ class ObserverNodeSettings(InputSettings):
     )
     map_path: str = parameter(
         '', 'File of ~/save_map, ~/load_map and autosave_map', read_only=False
+    )
+    pose_file: str = parameter(
+        '',
+        'File in which the pose is kept every two seconds and at the end, and from which the next '
+        'start takes it, as ~/.ros/observer_pose.yaml; empty for none',
+    )
+    pose_file_max_age: float = parameter(
+        600.0,
+        'Age of that file, by the clock of the system, up to which it is used',
+        unit='s',
+        minimum=0.0,
     )
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
 
@@ -97,6 +133,23 @@ class ObserverNodeSettings(InputSettings):
         plain.check_named('base_frame')
         plain.check_frames_differ()
         return plain
+
+
+@dataclass(frozen=True)
+class ManagedNodeSettings:
+    """What ``lifecycle_observer_node`` adds; both as Nav2's nodes have them."""
+
+    autostart_node: bool = parameter(
+        False, 'Whether the node configures and activates itself at its start'
+    )
+    bond_heartbeat_period: float = parameter(
+        0.0,
+        "Period of the bond's heartbeats to Nav2's lifecycle manager, which needs bondpy; 0 for "
+        'no bond',
+        unit='s',
+        minimum=0.0,
+        maximum=10.0,
+    )
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.matrices import limited
+from slam_observer_ros.geometry.matrices import limited, transpose
 from slam_observer_ros.observer.observer import Observer
 
 MAX_POSE_ERRORS = np.repeat([np.pi, 1e3], 3)
@@ -27,14 +27,14 @@ def of_landmarks(observer: Observer, covariances: FloatArray | None) -> FloatArr
 
 
 def of_pose(observer: Observer, covariance: FloatArray | None, A: FloatArray) -> FloatArray | None:
-    """Return the pose's covariance (6, 6) at Â = ``A`` (4, 4), given ``covariance`` of ε (6, 6).
+    """Return the pose's covariance (…, 6, 6) at Â = ``A`` (…, 4, 4), given that of ε (…, 6, 6).
 
     Of its rotation vector and its position along the world's axes, rad² and m².
     """
     if covariance is None:
         return None
     turn = _turn_to_world(observer, A)
-    world: FloatArray = turn @ covariance @ turn.T
+    world: FloatArray = turn @ covariance @ transpose(turn)
     return world
 
 
@@ -46,9 +46,9 @@ def of_pose_error(observer: Observer, world: FloatArray) -> FloatArray:
 
 
 def _turn_to_world(observer: Observer, A: FloatArray) -> FloatArray:
-    """Return the matrix (6, 6) from ε to rotation and shift of the pose along world axes."""
+    """Return the matrix (…, 6, 6) from ε to rotation and shift of the pose along world axes."""
     R = observer.reference_pose[:3, :3]
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = R
-    turn[3:, :3] = -R @ so3.hat(A[:3, 3])
+    turn = np.zeros((*A.shape[:-2], 6, 6))
+    turn[..., :3, :3] = turn[..., 3:, 3:] = R
+    turn[..., 3:, :3] = -R @ so3.hat(A[..., :3, 3])
     return turn

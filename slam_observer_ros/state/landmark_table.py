@@ -52,7 +52,9 @@ class LandmarkTable:
         # how often those without ids that were confirmed were in view, and were seen
         self._confirmed_in_view = 0
         self._confirmed_seen = 0
+        # The rows in the order of their ids, and these.
         self._order: IntArray = np.empty(0, dtype=np.int64)
+        self._sorted_ids: IntArray = self.ids
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -62,9 +64,10 @@ class LandmarkTable:
         """Return the row of each id (m,), −1 where it is unknown."""
         if not len(self.ids):
             return np.full(len(ids), -1)
-        position = self.ids.searchsorted(ids, sorter=self._order)
-        rows = self._order[np.minimum(position, len(self.ids) - 1)]
-        return np.where(self.ids[rows] == ids, rows, -1)
+        position = self._sorted_ids.searchsorted(ids)
+        rows = self._order.take(position, mode='clip')
+        is_known = self.ids.take(rows) == ids
+        return rows if np.count_nonzero(is_known) == len(ids) else np.where(is_known, rows, -1)
 
     def add(self, ids: IntArray, stamp_ns: int) -> None:
         """Append landmarks (m,) that are seen for the first time."""
@@ -75,7 +78,7 @@ class LandmarkTable:
             setattr(self, name, np.concatenate([column, room]))
         self.ids[first:] = ids
         self.take_for_new(np.arange(first, first + m), stamp_ns)
-        self._order = np.argsort(self.ids)
+        self._sort()
 
     def add_known(self, ids: IntArray, counts: IntArray) -> None:
         """Append landmarks (m,) that were seen ``counts`` (m,) times before this run."""
@@ -93,14 +96,17 @@ class LandmarkTable:
         """Give ``rows`` (m,) other ids (m,)."""
         self.ids[rows] = ids
         self.tentative[rows] &= is_automatic(ids)
-        self._order = np.argsort(self.ids)
+        self._sort()
 
     def accept(self, rows: IntArray, stamp_ns: int) -> None:
         """Count one more accepted observation of ``rows`` (m,)."""
         self.counts[rows] += 1
         self.rejections[rows] = 0
-        later = rows[self.last_seen_ns[rows] < stamp_ns]
-        self.seen_before_ns[later] = self.last_seen_ns[later]
+        later, last_ns = rows, self.last_seen_ns.take(rows)
+        is_later = last_ns < stamp_ns
+        if np.count_nonzero(is_later) < len(rows):
+            later, last_ns = rows[is_later], last_ns[is_later]
+        self.seen_before_ns[later] = last_ns
         self.last_seen_ns[later] = stamp_ns
 
     def unseen_s(self, rows: IntArray, stamp_ns: int) -> FloatArray:
@@ -109,9 +115,14 @@ class LandmarkTable:
         What is seen twice at one stamp is seen by two sensors: the second has not seen it for as
         long as the first one had not.
         """
-        last_ns = self.last_seen_ns[rows]
-        since_ns = np.where(last_ns == stamp_ns, self.seen_before_ns[rows], last_ns)
-        unseen_s: FloatArray = np.where(since_ns < 0, np.inf, to_s(stamp_ns - since_ns))
+        since_ns = self.last_seen_ns.take(rows)
+        is_seen_now = since_ns == stamp_ns
+        if np.count_nonzero(is_seen_now):
+            since_ns = np.where(is_seen_now, self.seen_before_ns.take(rows), since_ns)
+        unseen_s: FloatArray = to_s(stamp_ns - since_ns)
+        was_never_seen = since_ns < 0
+        if np.count_nonzero(was_never_seen):
+            unseen_s[was_never_seen] = np.inf
         return unseen_s
 
     def reject(self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray) -> None:
@@ -138,8 +149,8 @@ class LandmarkTable:
         That is ``max_rejections`` times, or once more than they were seen: what contradicts a
         landmark that was seen once or twice may itself be the outlier.
         """
-        rejections = self.rejections[rows]
-        if not rejections.any():  # as nearly always
+        rejections = self.rejections.take(rows, mode='wrap')  # −1 for a new one as well
+        if not np.count_nonzero(rejections):  # as nearly always
             return np.zeros(len(rows), dtype=np.bool_)
         needed = np.minimum(self.counts[rows] + 1, max_rejections)
         return np.asarray(rejections >= needed)
@@ -151,6 +162,10 @@ class LandmarkTable:
         self._confirmed_seen += int(np.sum(confirmed & seen))
         self.in_view[rows] += 1
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
+
+    def _sort(self) -> None:
+        self._order = np.argsort(self.ids)
+        self._sorted_ids = self.ids[self._order]
 
     @property
     def seen_share(self) -> float:
@@ -191,4 +206,4 @@ class LandmarkTable:
         """Delete rows; those behind move up."""
         for name in _COLUMNS:
             setattr(self, name, np.delete(getattr(self, name), rows, axis=0))
-        self._order = np.argsort(self.ids)
+        self._sort()

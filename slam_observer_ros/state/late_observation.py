@@ -43,7 +43,12 @@ def carried_forward(
     shared = len(points) * C @ Q @ transpose(C)
     rows = state.landmarks.rows_of(event.ids)
     own = (lag_s * state.landmark_velocity_stddev) ** 2 * np.eye(3)
-    return replace(moved, covariances=point_covariances(state, moved, rows) + shared + own)
+    moved = replace(moved, covariances=point_covariances(state, moved, rows) + shared + own)
+    if event.orientations is None:
+        return moved
+    R, turns = back[:3, :3], state.observation_noise.orientation_covariances(moved)
+    turns = turns + len(points) * R @ Q[:3, :3] @ R.T
+    return replace(moved, orientation_covariances=turns)
 
 
 def _landmark_velocities(state: State, event: ObservationEvent, A: FloatArray) -> FloatArray:

@@ -36,15 +36,20 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
     if not state.is_mapping:
         event, rows = mapped(state, event)
     is_known, covariances = rows >= 0, point_covariances(state, event, rows)
+    left_out = m - len(event.ids)
+    if np.count_nonzero(is_known) == len(rows):  # as nearly always
+        residuals = residuals_of(state, event, rows, covariances)
+        return MatchedObservation(event, rows, covariances, event, residuals, left_out)
     known = event.select(is_known)
     residuals = residuals_of(state, known, rows[is_known], covariances[is_known])
-    return MatchedObservation(event, rows, covariances, known, residuals, m - len(event.ids))
+    return MatchedObservation(event, rows, covariances, known, residuals, left_out)
 
 
 def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
     """Return the part of an observation that is of known landmarks, and their rows."""
     rows = state.landmarks.rows_of(event.ids)
-    return event.select(rows >= 0), rows[rows >= 0]
+    is_known = rows >= 0
+    return event.select(is_known), rows[is_known]
 
 
 def residuals_of(
@@ -82,8 +87,9 @@ def point_covariances(state: State, event: ObservationEvent, rows: IntArray) -> 
     heading is yet to be corrected.
     """
     measured, expected = event.lines_of_sight, _lines_of_sight(state, event, rows)
-    measured_m = np.maximum(np.linalg.norm(measured, axis=1), RESOLUTION_M)
-    shares = np.linalg.norm(expected, axis=1) / measured_m
+    expected_squared = np.einsum('ij,ij->i', expected, expected)
+    measured_squared = np.einsum('ij,ij->i', measured, measured)
+    shares = np.sqrt(expected_squared / np.maximum(measured_squared, RESOLUTION_M**2))
     return state.observation_noise.covariances(event, shares[:, None] * measured)
 
 
@@ -109,8 +115,10 @@ def _lines_of_sight(state: State, event: ObservationEvent, rows: IntArray) -> Fl
     if not len(landmarks):
         return event.lines_of_sight
     # A landmark that is new, in doubt, or may itself be an outlier is where it was measured.
-    is_confirmed = landmarks.counts[rows] >= settings.confirmations
+    is_confirmed = landmarks.counts.take(rows, mode='wrap') >= settings.confirmations
     in_doubt = landmarks.in_doubt(rows, settings.max_rejections)
     is_sure = (rows >= 0) & is_confirmed & ~in_doubt
-    points = np.where(is_sure[:, None], state.filter.expected_points(rows), event.points)
+    points = state.filter.expected_points(rows)
+    if np.count_nonzero(is_sure) < len(rows):
+        points = np.where(is_sure[:, None], points, event.points)
     return points if event.sensor is None else points - event.sensor

@@ -11,8 +11,8 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.filter import Filter
-from slam_observer_ros.sensor_models.integration import integrate
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.integration import integrate, integrate_until
+from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
@@ -33,7 +33,8 @@ class State:
         self.observer, self.axes = self.filter.observer, self.filter.axes
         self.landmarks = LandmarkTable()
         self.relinearisation: Relinearisation | None = None  # where the filter needs it
-        if filter_.joint is not None and not self.landmark_velocity_stddev:
+        takes_points = filter_.orientations is None and not self.landmark_velocity_stddev
+        if filter_.joint is not None and takes_points:
             self.relinearisation = Relinearisation(
                 self.observer, filter_.calibration, filter_.joint, settings
             )
@@ -88,6 +89,28 @@ class State:
         A = motion.path[-1]
         covariance = self.filter.pose_covariance(motion)
         return self.observer.reference_pose @ A, covariances.of_pose(self.observer, covariance, A)
+
+    def poses_until(
+        self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then.
+
+        Where the delay of velocities is not estimated.
+        """
+        passage = self.passage(velocities, start_ns, stamps_ns)
+        covariance, A = self.filter.pose_covariance(passage), passage.poses
+        return self.observer.reference_pose @ A, covariances.of_pose(self.observer, covariance, A)
+
+    def passage(self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray) -> Passage:
+        """Return how the robot moves from the state's stamp through ``stamps_ns`` (s,)."""
+        return integrate_until(
+            velocities,
+            self.filter.calibration,
+            self.motion_noise,
+            self.observer.A,
+            start_ns,
+            stamps_ns,
+        )
 
     def motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
         """Return how the robot moves from the state's stamp ``start_ns`` to ``end_ns``."""
@@ -167,6 +190,10 @@ class State:
         if self.landmark_velocity_stddev:
             raise ParameterError(
                 "smoothing takes landmarks to rest: 'landmark_velocity_stddev' must be 0"
+            )
+        if self.filter.orientations is not None:
+            raise ParameterError(
+                "smoothing takes tags for points: 'use_tag_orientation' must be false"
             )
         if self.relinearisation is None:
             raise ParameterError(

@@ -20,6 +20,10 @@ from slam_observer_ros.state.matching import (
     residuals_of,
 )
 from slam_observer_ros.state.state import State
+from slam_observer_ros.state.tag_orientations import (
+    correct_by_orientations,
+    take_over_orientations,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +39,8 @@ class Outcome:
 
 def step(state: State, matched: MatchedObservation) -> Outcome:
     """One step of the observer (28), from where the velocity has led it (27): the innovation."""
+    if matched.known.orientations is not None:
+        matched = correct_by_orientations(state, matched)  # φ_i = log(R_Â Z_i B̂_iᵀ)
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     _drop_history_if_full(state, matched)
     expected = None
@@ -45,6 +51,8 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     _count(state, matched, rejected)
     event, rows = _add_new(state, matched)  # y_i° = Â y_i
     moved_ids = _relinearise(state, event, rows)
+    if event.orientations is not None:
+        take_over_orientations(state, event, rows)  # B̂_i = R_Â Z_i
     _set_velocities(state, event, rows)  # (19)
     innovation = None if expected is None else expected.judge(weights)
     return Outcome(matched.known.ids, residuals.r, rejected, moved_ids, innovation)

@@ -363,6 +363,23 @@ class TestOutputs:
             'map.png', 'errors.png', 'residuals.png'
         }  # fmt: skip
 
+    @pytest.mark.parametrize('kind', ['svg', 'pdf'])
+    def test_figures_are_of_the_kind_that_is_asked_for(
+        self, slam_observer, simulated, tmp_path, kind
+    ):
+        slam_observer.succeed('replay', simulated, '--plot', tmp_path / 'a', '--plot-format', kind)
+        names = {path.name for path in (tmp_path / 'a').iterdir()}
+        assert names == {f'{name}.{kind}' for name in ('map', 'errors', 'residuals')}
+
+    def test_people_read_degrees_and_programs_radians(self, slam_observer, simulated):
+        figures = slam_observer.succeed('replay', simulated, '--json').json
+        (row,) = (
+            line for line in slam_observer.succeed('replay', simulated).output.splitlines()
+            if 'heading error' in line
+        )  # fmt: skip
+        printed = float(re.search(r'([\d.e-]+) °', row).group(1))
+        assert printed == pytest.approx(np.degrees(figures['heading_rmse_rad']), rel=1e-2)
+
     def test_map_states_what_the_gains_know_of_its_accuracy(
         self, slam_observer, simulated, tmp_path
     ):

@@ -6,7 +6,8 @@ from command_line import CommandLine
 import numpy as np
 import pytest
 
-from slam_observer_ros.runs.simulated_run import fit_slope, LYAPUNOV_FLOOR
+from slam_observer_ros.evaluation.decay import fit_decay
+from slam_observer_ros.runs.simulated_run import LYAPUNOV_FLOOR
 
 PAPER_SLOPE = -2.0 * (1.0 / 4.0) / np.log(10.0)
 
@@ -119,13 +120,17 @@ class TestSlope:
 
     def test_only_what_is_above_rounding_counts(self):
         level = np.maximum(10.0 ** (-0.5 * self.TIMES), 1e-20)
-        assert fit_slope(self.TIMES, level, 1e-19) == pytest.approx(-0.5)
+        decay = fit_decay(self.TIMES, level, 1e-19)
+        assert decay is not None
+        assert decay.slope_per_s == pytest.approx(-0.5)
 
     def test_transient_does_not_count(self):
         level = 10.0 ** (-0.5 * self.TIMES)
         level[:40] *= 1e9
-        assert fit_slope(self.TIMES, level, 0.0) == pytest.approx(-0.5)
+        decay = fit_decay(self.TIMES, level, 0.0)
+        assert decay is not None
+        assert decay.slope_per_s == pytest.approx(-0.5)
 
     def test_nothing_to_fit(self):
-        assert fit_slope(self.TIMES[:0], self.TIMES[:0], 0.0) is None
-        assert fit_slope(self.TIMES, np.zeros(100), 0.0) is None
+        assert fit_decay(self.TIMES[:0], self.TIMES[:0], 0.0) is None
+        assert fit_decay(self.TIMES, np.zeros(100), 0.0) is None

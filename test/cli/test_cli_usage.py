@@ -40,7 +40,7 @@ def test_version(slam_observer):
 
 def test_help_has_examples(slam_observer):
     output = slam_observer.succeed('--help').output
-    for command in ('simulate', 'convert', 'replay'):
+    for command in ('simulate', 'convert', 'map', 'replay'):
         assert f'slam-observer {command}' in output
         assert 'usage: ' in slam_observer.succeed(command, '--help').output
 
@@ -76,7 +76,7 @@ def test_a_former_name_of_a_parameter_is_refused_with_the_new_one(
         ('replay nothing.mcap --jsn', "'--json'?; see 'slam-observer replay --help'"),
         ('replay nothing.mcap --gain constant', "--gain constant; did you mean '--gains'?"),
         ('replay nothing.mcap --gains best', "--gains: invalid choice: 'best'"),
-        ('replay nothing.mcap --config nowhere', 'come with the package: observer, stereo_'),
+        ('replay nothing.mcap --config nowhere', 'come with the package: apriltags, observer'),
         (
             'replay nothing.mcap --config nowhere/a.yaml',
             "can't read parameter file nowhere/a.yaml",

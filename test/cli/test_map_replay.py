@@ -358,3 +358,15 @@ def test_after_a_jump_of_the_clock_only_what_is_of_one_run_is_reported(
         assert ended.json['ate_rmse_m'] < 0.05
         assert ended.json['dead_reckoning_ate_rmse_m'] < 0.2
         assert ended.json['anees'] < 5.0
+
+
+def test_a_table_becomes_a_map_file(slam_observer, tmp_path):
+    table, made = tmp_path / 'tags.csv', tmp_path / 'tags.yaml'
+    table.write_text('id,x,y\n7,1.5,-2\n8,9,1\n')
+    output = slam_observer.succeed('map', 'convert', table, made, '--sigma', '0.1').output
+    assert 'x 1.50 to 9.00 m' in output
+    assert read_map(made).ids.tolist() == [7, 8]
+    assert 'exists already' in slam_observer.fail('map', 'convert', table, made)
+    table.write_text('7,1\n')
+    error = slam_observer.fail('map', 'convert', table, made, '--force')
+    assert "there is no column 'y'" in error

@@ -54,7 +54,7 @@ def test_it_has_what_the_node_publishes(slam_observer, recording, tmp_path):
     slam_observer.succeed('replay', recording, '--mcap', written, '--tum', tmp_path / 'run.tum')
     found = messages_of(written)
     assert '/twist' not in found
-    odometry, path = found['/odometry'], found['/path']
+    odometry, path = found['/observer_node/odometry'], found['/path']
     assert len(odometry) == MESSAGE_COUNT
     assert {message.header.frame_id for message in odometry} == {'map'}
     assert {message.child_frame_id for message in odometry} == {'base_link'}
@@ -78,7 +78,7 @@ def test_landmarks_have_ellipsoids_and_residuals_are_in_standard_deviations(
     written = tmp_path / 'estimate.mcap'
     slam_observer.succeed('replay', recording, '--mcap', written)
     found = messages_of(written)
-    assert found['/map'][-1].width == 3
+    assert found['/landmark_map'][-1].width == 3
     names = [marker.ns for marker in found['/markers'][-1].markers]
     assert [names.count(name) for name in ('uncertainties', 'ids', 'landmarks')] == [3, 3, 1]
     for landmark_id in (3, 5, 9):
@@ -91,11 +91,13 @@ def test_the_truth_is_moved_to_the_estimate(slam_observer, recording, tmp_path):
     written = tmp_path / 'estimate.mcap'
     slam_observer.succeed('replay', recording, '--mcap', written)
     found = messages_of(written)
-    estimates = {seconds(m.header.stamp): m.pose.pose.position for m in found['/odometry']}
+    estimates = {
+        seconds(m.header.stamp): m.pose.pose.position for m in found['/observer_node/odometry']
+    }
     for truth in found['/aligned_truth/pose']:
         position = estimates[seconds(truth.header.stamp)]
         assert position.x == pytest.approx(truth.pose.position.x, abs=0.01)
-    assert found['/aligned_truth/map'][0].width == 3
+    assert found['/aligned_truth/landmark_map'][0].width == 3
 
 
 def test_with_inputs_it_replays_to_the_same_bits(slam_observer, recording, tmp_path):
@@ -104,7 +106,7 @@ def test_with_inputs_it_replays_to_the_same_bits(slam_observer, recording, tmp_p
     slam_observer.succeed('replay', written, '--mcap', again)
     first, second = bytes_of(written), bytes_of(again)
     assert len(first['/twist']) == MESSAGE_COUNT
-    for topic in ('/odometry', '/map', '/lyapunov', '/nis'):
+    for topic in ('/observer_node/odometry', '/landmark_map', '/lyapunov', '/nis'):
         assert first[topic] == second[topic]
 
 

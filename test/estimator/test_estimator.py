@@ -1215,7 +1215,9 @@ def test_after_a_jump_the_estimator_starts_again_at_once():
 def test_all_events_of_a_stamp_are_reported_once_and_also_after_a_jump_of_the_clock():
     reported = []
     settings = Settings(reorder_window=0.0, on_time_jump='hold')
-    estimator = Estimator(settings, on_stamp=lambda: reported.append(estimator.stamp_ns))
+    estimator = Estimator(
+        settings, on_stamps=lambda stamps_ns: reported.extend(stamps_ns.tolist())
+    )
     for step in range(3):
         stamp_ns = START_NS + step * 10**8
         estimator.add(VelocityEvent(stamp_ns, np.zeros(6)))

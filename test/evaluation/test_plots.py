@@ -17,13 +17,25 @@ import pytest
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.consistency import nees_over_time
+from slam_observer_ros.evaluation.decay import Decay, fit_decay
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.plots import map_plot, replay_plots, simulation_plots
-from slam_observer_ros.evaluation.plots.drawing import BLUE, GREEN, GREY, RED
+from slam_observer_ros.evaluation.plots.drawing import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PALE_BLUE,
+    PURPLE,
+    RED,
+)
+from slam_observer_ros.evaluation.run_record import Innovations
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.settings.estimator_settings import Settings
 
 LANDMARKS = np.array([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, -4.0, 0.0]])
 IDS = np.arange(4)
@@ -60,14 +72,27 @@ def rgb(colour: str) -> int:
 def test_lyapunov_function(tmp_path: Path) -> None:
     values = np.append(-0.2 * SECONDS[:-1], -np.inf)
     path = simulation_plots.plot_lyapunov(
-        tmp_path / 'lyapunov.png', SECONDS, values, slope_per_s=-0.2
+        tmp_path / 'lyapunov.png', SECONDS, values, Decay(-0.2, 0.0)
     )
-    assert {rgb(BLUE), rgb(GREY)} <= colours(path)
+    assert {rgb(PALE_BLUE), rgb(BLACK)} <= colours(path)
+
+
+def test_the_line_that_is_fitted_lies_on_the_lyapunov_function(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved: list[Figure] = []
+    monkeypatch.setattr(simulation_plots, 'save', lambda figure, _path: saved.append(figure))
+    values = 3.0 - 0.2 * SECONDS
+    decay = fit_decay(SECONDS, 10.0**values, 0.0)
+    simulation_plots.plot_lyapunov(tmp_path / 'a.png', SECONDS, values, decay)
+    level, line = (np.asarray(drawn.get_ydata()) for drawn in saved[0].axes[0].lines)
+    assert line == pytest.approx(level[: len(line)])
+    assert len(line) > 190
 
 
 def test_lyapunov_function_that_is_zero_throughout(tmp_path: Path) -> None:
     path = simulation_plots.plot_lyapunov(
-        tmp_path / 'zero.png', SECONDS, np.full(200, -np.inf), -0.2
+        tmp_path / 'zero.png', SECONDS, np.full(200, -np.inf), Decay(-0.2, 0.0)
     )
     assert path.stat().st_size > 0
 
@@ -99,6 +124,10 @@ def test_legend_of_a_configuration_covers_nothing(
     drawn = axes.get_tightbbox()
     assert drawn is not None
     assert not legend.get_window_extent().overlaps(drawn)
+    names = [text.get_text() for text in legend.get_texts()]
+    assert {'start', 'end', 'landmark estimates on their way'} <= set(names)
+    # As the picture in the first run's page: the scene is not lost in an empty figure.
+    assert drawn.height > 0.6 * figure.bbox.height
 
 
 def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -> None:
@@ -247,35 +276,27 @@ def test_errors(tmp_path: Path, estimate: Trajectory, truth: Trajectory) -> None
     errors = trajectory_errors(estimate, truth)
     path = replay_plots.plot_errors(tmp_path / 'errors.png', errors)
     assert rgb(RED) in colours(path)
-    assert rgb(GREEN) not in colours(path)
+    assert not {rgb(GREEN), rgb(PURPLE)} & colours(path)
     configuration = ConfigurationError([0, 10**9], [0.1, 0.2])
-    covariances = np.tile(0.01 * np.eye(6), (200, 1, 1))
-    path = replay_plots.plot_errors(tmp_path / 'bands.png', errors, covariances, configuration)
-    assert {rgb(RED), rgb(GREEN)} <= colours(path)
+    nees = nees_over_time(errors, np.tile(0.01 * np.eye(6), (200, 1, 1)), is_anchored=True)
+    path = replay_plots.plot_errors(tmp_path / 'all.png', errors, nees, configuration)
+    assert {rgb(RED), rgb(GREEN), rgb(PURPLE)} <= colours(path)
 
 
-@pytest.mark.parametrize('in_known_map', [False, True])
-def test_a_wide_band_does_not_hide_the_errors(
+@pytest.mark.parametrize('is_anchored', [False, True])
+def test_a_panel_says_which_errors_are_normalised(
     tmp_path: Path,
     saved: list[Figure],
     estimate: Trajectory,
     truth: Trajectory,
-    in_known_map: bool,
+    is_anchored: bool,
 ) -> None:
     errors = trajectory_errors(estimate, truth)
-    covariances = np.tile(100.0 * np.eye(6), (200, 1, 1))
-    name = tmp_path / 'a.png'
-    replay_plots.plot_errors(name, errors, covariances, in_known_map=in_known_map)
-    largest = np.abs(errors.errors).max(axis=0)
-    x, y, *_, heading = saved[0].axes
-    for axes, size in ((x, largest[3]), (y, largest[4]), (heading, np.degrees(largest[2]))):
-        low, high = axes.get_ylim()
-        assert low == -high
-        assert size < high < 3.0 * size
-    legend = x.get_legend()
-    assert legend is not None
-    frame = 'in the frame of the map' if in_known_map else 'relative to the first pose'
-    assert frame in legend.get_texts()[0].get_text()
+    nees = nees_over_time(errors, np.tile(np.eye(6), (200, 1, 1)), is_anchored)
+    replay_plots.plot_errors(tmp_path / 'a.png', errors, nees, is_anchored=is_anchored)
+    title = saved[0].axes[-1].get_title('left')
+    assert ('from the first pose on' in title) is is_anchored
+    assert ('after rigid alignment' in title) is not is_anchored
 
 
 def test_errors_are_not_joined_across_a_time_without_any(
@@ -295,30 +316,57 @@ def test_errors_are_not_joined_across_a_time_without_any(
     assert not drawn_in_the_middle(gap)
 
 
+def innovations(number: int, **changed: Any) -> Innovations:
+    """Residuals every 0.1 s, of one to three standard deviations."""
+    values = np.linspace(1.0, 3.0, number)
+    counts, none = np.arange(number, dtype=np.int64), np.empty(0)
+    given: dict[str, Any] = {
+        'stamps_ns': counts * 10**8, 'ids': counts, 'distances': values,
+        'residuals_m': 0.1 * values, 'weights': np.ones(number),
+        'update_stamps_ns': none.astype(np.int64), 'nis': none,
+        'degrees_of_freedom': none.astype(np.int64), 'lyapunov': none,
+    }  # fmt: skip
+    return Innovations(**given | changed)
+
+
 @pytest.mark.parametrize('dropped', [{}, {'not_finite': 3, 'duplicate': 40}])
 def test_residuals(tmp_path: Path, dropped: dict[str, int]) -> None:
-    residuals = np.random.default_rng(0).normal(size=(500, 3))
-    stamps_ns = np.arange(500) * 10**8
-    rejected = np.zeros(500, dtype=bool)
     drawn = tmp_path / 'residuals.png'
-    replay_plots.plot_residuals(drawn, stamps_ns, residuals, rejected, dropped, 1_000)
-    assert rgb(RED) not in colours(drawn)
+    replay_plots.plot_residuals(drawn, innovations(500), Settings(), dropped, 1_000)
+    assert rgb(ORANGE) not in colours(drawn)
     assert (rgb(BLUE) in colours(drawn)) is bool(dropped)
-    rejected[::50] = True
-    replay_plots.plot_residuals(drawn, stamps_ns, residuals, rejected, dropped, 1_000)
-    assert rgb(RED) in colours(drawn)
+    weights = np.where(np.arange(500) % 50, 1.0, 0.5)
+    replay_plots.plot_residuals(
+        drawn, innovations(500, weights=weights), Settings(), dropped, 1_000
+    )
+    assert rgb(ORANGE) in colours(drawn)
+
+
+@pytest.mark.parametrize('is_known', [False, True])
+def test_residuals_are_in_standard_deviations_where_the_gains_know_them(
+    tmp_path: Path, saved: list[Figure], is_known: bool
+) -> None:
+    changed = {} if is_known else {'distances': np.zeros(500)}
+    replay_plots.plot_residuals(
+        tmp_path / 'a.png', innovations(500, **changed), Settings(), {}, 500
+    )
+    (axes,) = saved[0].axes
+    legend = axes.get_legend()
+    assert legend is not None
+    names = [text.get_text() for text in legend.get_texts()]
+    assert axes.get_ylabel() == ('residual [σ]' if is_known else 'residual [m]')
+    assert ('gate' in names) is is_known
+    assert names[-1] == ('median 2.00 σ (0.200 m)' if is_known else 'median 0.200 m')
 
 
 @pytest.mark.parametrize('are_there', [False, True])
 def test_bars_of_dropped_events_are_thin(
     tmp_path: Path, saved: list[Figure], are_there: bool
 ) -> None:
-    number = 500 if are_there else 0
-    stamps_ns, rejected = np.arange(number) * 10**8, np.zeros(number, dtype=bool)
+    some = innovations(500 if are_there else 0)
     reasons = {f'reason_{i}': 10 + i for i in range(9)}
     for dropped in ({'no_transform': 31}, reasons):
-        name = tmp_path / 'a.png'
-        replay_plots.plot_residuals(name, stamps_ns, np.ones((number, 3)), rejected, dropped, 900)
+        replay_plots.plot_residuals(tmp_path / 'a.png', some, Settings(), dropped, 900)
         figure = saved[-1]
         figure.draw_without_rendering()
         assert len(figure.axes) == 1 + are_there
@@ -328,32 +376,61 @@ def test_bars_of_dropped_events_are_thin(
         assert heights_in == pytest.approx([0.15] * len(bars), abs=0.05)
 
 
-def test_legend_of_residuals_is_one_row_beside_the_title(
+def test_legend_of_residuals_is_one_row_below_the_title(
     tmp_path: Path, saved: list[Figure]
 ) -> None:
-    residuals, rejected = np.ones((500, 3)), np.arange(500) % 10 == 0
-    stamps_ns = np.arange(500) * 10**8
-    replay_plots.plot_residuals(tmp_path / 'a.png', stamps_ns, residuals, rejected, {}, 123_456)
+    weights = np.where(np.arange(500) % 10, 1.0, np.where(np.arange(500) % 20, 0.5, 0.0))
+    some = innovations(500, weights=weights)
+    replay_plots.plot_residuals(tmp_path / 'a.png', some, Settings(), {}, 123_456)
     (figure,) = saved
     figure.draw_without_rendering()
     (axes,) = figure.axes
     legend = axes.get_legend()
     assert legend is not None
-    crosses, median = legend.get_texts()
-    assert crosses.get_text() == '50 rejected by the gate'
-    assert crosses.get_window_extent().y0 == pytest.approx(median.get_window_extent().y0, abs=3.0)
+    texts = legend.get_texts()
+    assert [text.get_text() for text in texts[:2]] == ['25 down-weighted', '25 rejected']
+    heights = {round(text.get_window_extent().y0) for text in texts}
+    assert max(heights) - min(heights) <= 5
     title = next(child for child in axes.get_children() if 'none of' in str(child))
     assert not legend.get_window_extent().overlaps(title.get_window_extent())
+    assert legend.get_window_extent().x1 <= figure.bbox.x1
 
 
-def test_residuals_of_a_run_without_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    saved: list[Figure] = []
-    monkeypatch.setattr(replay_plots, 'save', lambda figure, _path: saved.append(figure))
-    empty = np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=bool)
-    replay_plots.plot_residuals(tmp_path / 'none.png', *empty, {}, 0)
+def test_residuals_of_a_run_without_any(tmp_path: Path, saved: list[Figure]) -> None:
+    replay_plots.plot_residuals(tmp_path / 'none.png', innovations(0), Settings(), {}, 0)
     (axes,) = saved[0].axes
     assert [text.get_text() for text in axes.texts] == ['no residuals']
     assert len(axes.get_xticks()) == len(axes.get_yticks()) == 0
+
+
+@pytest.mark.parametrize('suffix', ['png', 'svg', 'pdf'])
+def test_a_figure_is_of_the_kind_of_its_suffix_and_the_same_each_time(
+    tmp_path: Path, suffix: str, estimate: Trajectory
+) -> None:
+    start = {'png': b'\x89PNG', 'svg': b'<?xml', 'pdf': b'%PDF'}[suffix]
+    path = tmp_path / f'map.{suffix}'
+    first, second = (
+        map_plot.plot_map(path, estimate, IDS, LANDMARKS).read_bytes() for _ in range(2)
+    )
+    assert first.startswith(start)
+    assert first == second
+
+
+def test_ellipses_are_drawn_where_the_map_is_after_the_alignment(
+    tmp_path: Path, saved: list[Figure], estimate: Trajectory
+) -> None:
+    quarter = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    covariances = np.tile(np.diag([0.04, 0.01, 0.0]), (4, 1, 1))
+    map_plot.plot_map(
+        tmp_path / 'a.png', estimate, IDS, LANDMARKS, estimate.moved(quarter),
+        covariances=covariances,
+    )  # fmt: skip
+    line = next(line for line in saved[0].axes[0].lines if line.get_label() == '95 % ellipses')
+    first = np.asarray(line.get_xydata())[:37] - LANDMARKS[0, [1, 0]]
+    # Two to one, and turned with the map.
+    assert np.ptp(first, axis=0) == pytest.approx(
+        2.0 * np.sqrt(5.991) * np.array([0.1, 0.2]), 1e-2
+    )
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:

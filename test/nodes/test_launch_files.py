@@ -14,6 +14,13 @@ from unittest.mock import MagicMock
 from ament_index_python.packages import PackageNotFoundError
 import pytest
 
+from slam_observer_ros.nodes.launch_arguments import (
+    check_file,
+    check_optional_file,
+    check_packages,
+    numbers,
+)
+
 LAUNCH_FOLDER = Path(__file__).resolve().parents[2] / 'launch'
 MODULES = (
     'launch',
@@ -40,9 +47,9 @@ def entities(names, kind):
     return [at for at in range(len(source)) if source.startswith(f'{kind}(', at)]
 
 
-def check(names, written):
+def check(written):
     context = SimpleNamespace(launch_configurations={'params_file': str(written)})
-    names['check_params_file'](context)
+    check_file(context, 'params_file')
     return context.launch_configurations['params_file']
 
 
@@ -56,23 +63,32 @@ def in_folder(folder):
         os.chdir(before)
 
 
-def test_a_home_folder_in_params_file_is_expanded(load, tmp_path, monkeypatch):
+def test_a_home_folder_in_params_file_is_expanded(tmp_path, monkeypatch):
     monkeypatch.setenv('HOME', str(tmp_path))
     (tmp_path / 'my_robot.yaml').touch()
-    assert check(load('observer.launch.py'), '~/my_robot.yaml') == str(tmp_path / 'my_robot.yaml')
+    assert check('~/my_robot.yaml') == str(tmp_path / 'my_robot.yaml')
 
 
-def test_params_file_may_be_relative(load, tmp_path):
+def test_params_file_may_be_relative(tmp_path):
     (tmp_path / 'my_robot.yaml').touch()
     with in_folder(tmp_path):
-        path = check(load('observer.launch.py'), 'my_robot.yaml')
+        path = check('my_robot.yaml')
     assert path == str(tmp_path / 'my_robot.yaml')
 
 
 @pytest.mark.parametrize('name', ['my_robto.yaml', '', '~nobody-of-that-name/my_robot.yaml'])
-def test_a_params_file_that_there_is_not_ends_the_launch_with_the_reason(load, tmp_path, name):
+def test_a_params_file_that_there_is_not_ends_the_launch_with_the_reason(tmp_path, name):
     with in_folder(tmp_path), pytest.raises(RuntimeError, match=r"^params_file: no file '.*/"):
-        check(load('observer.launch.py'), name)
+        check(name)
+
+
+def test_a_file_that_may_be_left_out_is_checked_if_it_is_named(tmp_path):
+    context = SimpleNamespace(launch_configurations={'map': ''})
+    check_optional_file(context, 'map')
+    assert not context.launch_configurations['map']
+    context.launch_configurations['map'] = str(tmp_path / 'hall.yaml')
+    with pytest.raises(RuntimeError, match=r'^map: no file'):
+        check_optional_file(context, 'map')
 
 
 def test_params_file_is_checked_before_a_node_is_started(load):
@@ -104,3 +120,93 @@ def test_all_that_may_fail_in_the_demo_comes_before_a_node_is_started(load):
     may_fail = entities(names, 'OpaqueFunction') + entities(names, 'IncludeLaunchDescription')
     assert len(may_fail) == 2
     assert may_fail[0] < may_fail[1] < min(entities(names, 'Node'))
+
+
+@pytest.fixture
+def nodes(load):
+    """Return a function that gives what a launch file starts, by the names of executables."""
+
+    def start(name, **arguments):
+        names = load(name)
+        names['start'].__globals__['check_packages'] = MagicMock()
+        defaults = {key: value for key, (value, _) in names['ARGUMENTS'].items()}
+        context = SimpleNamespace(
+            launch_configurations=defaults | {'params_file': '/robot.yaml'} | arguments
+        )
+        names['start'](context)
+        calls = [call.kwargs for call in names['Node'].call_args_list]
+        return {call['executable']: call for call in calls}
+
+    return start
+
+
+def parameters(node):
+    return {
+        key: value
+        for entry in node['parameters']
+        if isinstance(entry, dict)
+        for key, value in entry.items()
+    }
+
+
+def test_alone_the_observer_activates_itself(nodes):
+    started = nodes('localization.launch.py', use_respawn='true', map_file='/hall.yaml')
+    (observer,) = started.values()
+    assert observer['respawn']
+    assert parameters(observer) == {
+        'use_sim_time': False,
+        'autostart_node': True,
+        'bond_heartbeat_period': 0.0,
+        'map_file': '/hall.yaml',
+    }
+
+
+def test_it_waits_for_transitions_where_it_must_not_start_by_itself(nodes):
+    started = nodes('localization.launch.py', autostart='false')
+    assert parameters(started['lifecycle_observer_node'])['autostart_node'] is False
+
+
+def test_beside_a_map_server_the_lifecycle_manager_starts_both(nodes):
+    started = nodes('localization.launch.py', map='/hall.yaml')
+    assert parameters(started['map_server'])['yaml_filename'] == '/hall.yaml'
+    assert parameters(started['lifecycle_observer_node'])['autostart_node'] is False
+    manager = parameters(started['lifecycle_manager'])
+    assert manager['autostart']
+    assert manager['node_names'] == ['map_server', started['lifecycle_observer_node']['name']]
+
+
+@pytest.mark.parametrize('has_bond', [True, False])
+def test_there_is_a_bond_where_bondpy_is_installed(nodes, monkeypatch, has_bond):
+    monkeypatch.setattr(
+        'importlib.util.find_spec', lambda _name: MagicMock() if has_bond else None
+    )
+    started = nodes('localization.launch.py', map='/hall.yaml')
+    period_s = parameters(started['lifecycle_observer_node'])['bond_heartbeat_period']
+    timeout_s = parameters(started['lifecycle_manager'])['bond_timeout']
+    assert (period_s > 0.0) == (timeout_s > 0.0) == has_bond
+
+
+def test_a_camera_is_mounted_where_its_pose_is_given(nodes):
+    started = nodes('apriltag.launch.py', tag_size='0.2')
+    assert set(started) == {'apriltag_node'}
+    assert parameters(started['apriltag_node'])['size'] == 0.2
+    started = nodes('apriltag.launch.py', camera_frame='eye', camera_pose='0.2 0 0.4 0 0.1 0')
+    assert started['static_transform_publisher']['arguments'][-1] == 'eye'
+
+
+def test_numbers_of_an_argument_are_counted():
+    assert numbers({'pose': '1 2,3'}, 'pose', 3) == [1.0, 2.0, 3.0]
+    for written in ('1 2', '1 2 x', ''):
+        with pytest.raises(RuntimeError, match='is not 3 numbers'):
+            numbers({'pose': written}, 'pose', 3)
+
+
+def test_a_missing_package_is_named_with_how_it_is_installed(monkeypatch, tmp_path):
+    index = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    index.mkdir(parents=True)
+    (index / 'rclpy').touch()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    monkeypatch.setenv('ROS_DISTRO', 'jazzy')
+    check_packages('rclpy')
+    with pytest.raises(RuntimeError, match='apt install ros-jazzy-no-such-package'):
+        check_packages('rclpy', 'no_such_package')

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from unittest.mock import MagicMock
 
+from absent_packages import program_without
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
-from node_processes import running
+from node_processes import NodeProcess, running
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from robots import own_topics, Robot, stamp_ns
 from std_srvs.srv import Trigger
 
+from slam_observer_ros.nodes.bond import LifecycleBond
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.simulation import Scenario
 
@@ -44,16 +48,16 @@ def x_of(odometry):
 
 
 def test_managed_node_estimates_only_while_it_is_active(ros, tmp_path):
-    odometry = ros.collect(Odometry, '/managed/odometry')
+    odometry = ros.collect(Odometry, '/managed/observer_node/odometry')
     manager = Manager(ros, '/managed/observer_node')
     arguments = ('-r', '__ns:=/managed')
     with running('lifecycle_observer_node', tmp_path / 'log', *arguments) as node:
         assert manager.state == State.PRIMARY_STATE_UNCONFIGURED
-        assert not ros.node.get_publishers_info_by_topic('/managed/odometry')
+        assert not ros.node.get_publishers_info_by_topic('/managed/observer_node/odometry')
         assert manager.change(Transition.TRANSITION_CONFIGURE)
         assert manager.state == State.PRIMARY_STATE_INACTIVE
         with Robot(ros, namespace='/managed', subscribers=False) as robot:
-            ros.wait_for_publisher('/managed/odometry')
+            ros.wait_for_publisher('/managed/observer_node/odometry')
             robot.run(RUN)
             assert not odometry, 'published while inactive'
 
@@ -79,13 +83,15 @@ def test_managed_node_estimates_only_while_it_is_active(ros, tmp_path):
             assert manager.change(Transition.TRANSITION_DEACTIVATE)
             assert manager.change(Transition.TRANSITION_CLEANUP)
             ros.spin_until(
-                lambda: not ros.node.get_publishers_info_by_topic('/managed/odometry'),
+                lambda: (
+                    not ros.node.get_publishers_info_by_topic('/managed/observer_node/odometry')
+                ),
                 'the end of the topics',
             )
             assert manager.change(Transition.TRANSITION_CONFIGURE)
             assert manager.change(Transition.TRANSITION_ACTIVATE)
             started_ns = time.time_ns()
-            ros.wait_for_publisher('/managed/odometry')
+            ros.wait_for_publisher('/managed/observer_node/odometry')
             ros.wait_for_subscriber(robot.twist, robot.landmarks)
             robot.run(RUN)
             ros.spin_until(lambda: stamp_ns(odometry[-1]) > started_ns, 'the estimate')
@@ -112,7 +118,8 @@ def test_simulated_time_that_is_set_while_configured_goes_on_after_the_cleanup(r
         ros.spin_until(listens, 'its reader of the clock')
         assert manager.change(Transition.TRANSITION_CLEANUP)
         ros.spin_until(
-            lambda: not ros.node.get_publishers_info_by_topic('/timed/odometry'), 'the cleanup'
+            lambda: not ros.node.get_publishers_info_by_topic('/timed/observer_node/odometry'),
+            'the cleanup',
         )
         ros.spin_for(0.5)
         assert listens()
@@ -148,7 +155,10 @@ def test_a_transition_that_the_state_does_not_allow_is_refused(ros, tmp_path):
 
 
 def test_two_robots_on_one_machine_do_not_hear_each_other(ros, tmp_path):
-    odometry = {name: ros.collect(Odometry, f'/{name}/odometry') for name in ('left', 'right')}
+    odometry = {
+        name: ros.collect(Odometry, f'/{name}/observer_node/odometry')
+        for name in ('left', 'right')
+    }
     transforms = {
         name: ros.collect(TFMessage, f'/{name}/tf') if TFMessage else [] for name in odometry
     }
@@ -169,3 +179,56 @@ def test_two_robots_on_one_machine_do_not_hear_each_other(ros, tmp_path):
         assert len({stamp_ns(message) for message in odometry['left']}) == len(odometry['left'])
         if TFMessage:
             ros.spin_until(lambda: transforms['left'], 'its /tf')
+
+
+def test_it_activates_itself_if_asked_to(ros, tmp_path):
+    odometry = ros.collect(Odometry, '/own_start/observer_node/odometry')
+    arguments = ('-r', '__ns:=/own_start')
+    with (
+        running('lifecycle_observer_node', tmp_path / 'log', *arguments, autostart_node=True),
+        Robot(ros, namespace='/own_start') as robot,
+    ):
+        assert Manager(ros, '/own_start/observer_node').state == State.PRIMARY_STATE_ACTIVE
+        robot.run(RUN)
+        ros.spin_until(lambda: odometry, 'an estimate')
+
+
+def test_an_own_start_that_fails_ends_the_process_with_the_reason(tmp_path):
+    parameters = {'autostart_node': True, 'map_file': '/no/such/map.yaml'}
+    node = NodeProcess('lifecycle_observer_node', tmp_path / 'log', **parameters)
+    assert node.wait() == 2
+    assert "not configured: can't read map /no/such/map.yaml" in node.output
+    assert 'Traceback' not in node.output
+
+
+def test_a_bond_needs_bondpy(tmp_path):
+    parameters = {'autostart_node': True, 'bond_heartbeat_period': 0.25}
+    program = program_without(
+        ['bondpy'], 'slam_observer_ros.nodes.lifecycle_observer_node', tmp_path
+    )
+    node = NodeProcess('', tmp_path / 'log', program=program, **parameters)
+    assert node.wait() == 2
+    assert "'bond_heartbeat_period' needs bondpy: apt install ros-" in node.output
+
+
+def test_the_bond_lasts_as_long_as_the_node_is_active(monkeypatch):
+    bond_class = MagicMock()
+    monkeypatch.setitem(sys.modules, 'bondpy', MagicMock())
+    monkeypatch.setitem(sys.modules, 'bondpy.bondpy', MagicMock(Bond=bond_class))
+    node = MagicMock()
+    node.get_name.return_value = 'observer_node'
+    bond = LifecycleBond(node, 0.25)
+    bond_class.assert_not_called()
+    bond.start()
+    bond_class.assert_called_once_with(topic='bond', id='observer_node', node=node)
+    bond_class.return_value.set_heartbeat_period.assert_called_once_with(0.25)
+    bond.end()
+    bond_class.return_value.shutdown.assert_called_once_with()
+
+
+def test_without_a_period_there_is_no_bond():
+    node = MagicMock()
+    bond = LifecycleBond(node, 0.0)
+    bond.start()
+    bond.end()
+    node.create_publisher.assert_not_called()

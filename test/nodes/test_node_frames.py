@@ -83,7 +83,7 @@ def true_landmarks():
 def test_sensors_on_tf_and_odometry_of_others_give_map_to_odom(ros, tmp_path):
     transforms = ros.collect(TFMessage, '/wheeled/tf')
     poses = ros.collect(PoseWithCovarianceStamped, '/wheeled/pose')
-    maps = ros.collect(PointCloud2, '/wheeled/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/wheeled/landmark_map', LATCHED_QOS)
     sender = TransformSender(ros, '/wheeled')
     drift = se3.from_rpy((5.0, -3.0, 0.0, 0.0, 0.0, 1.0))
 
@@ -133,7 +133,7 @@ def known_ids(maps):
 def test_sensor_pose_by_parameter_and_map_to_base_inverted(ros, tmp_path):
     transforms = ros.collect(TFMessage, '/flown/tf')
     poses = ros.collect(PoseWithCovarianceStamped, '/flown/pose')
-    maps = ros.collect(PointCloud2, '/flown/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/flown/landmark_map', LATCHED_QOS)
     parameters = {'sensor_pose': list(SENSOR), 'odom_frame': "''", 'invert_tf': True}
     arguments = own_topics('/flown')
     with (
@@ -166,7 +166,7 @@ class StillBody:
 
 def test_observations_wait_for_their_transform_and_are_dropped_without(ros, tmp_path):
     transforms = ros.collect(TFMessage, '/late/tf')
-    maps = ros.collect(PointCloud2, '/late/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/late/landmark_map', LATCHED_QOS)
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
     sender = TransformSender(ros, '/late')
     parameters = {'transform_timeout': 2.0, 'confirmations': 1}

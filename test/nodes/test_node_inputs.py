@@ -277,7 +277,7 @@ def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):
             log = tmp_path / namespace.strip('/')
             arguments = own_topics(namespace)
             stack.enter_context(running('observer_node', log, *arguments, **parameters))
-            received[namespace] = ros.collect(Odometry, f'{namespace}/odometry')
+            received[namespace] = ros.collect(Odometry, f'{namespace}/observer_node/odometry')
             publishers += [
                 (ros.node.create_publisher(message_class, f'{namespace}/{topic}', 100), make)
                 for topic, (message_class, make) in topics.items()
@@ -303,8 +303,8 @@ def test_each_source_of_velocity_leads_to_the_same_place(ros, tmp_path):
 def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
     if TFMessage is None:
         pytest.skip('tf2_msgs is not installed')
-    maps = ros.collect(PointCloud2, '/tags/map', LATCHED_QOS)
-    nameless_maps = ros.collect(PointCloud2, '/nameless/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/tags/landmark_map', LATCHED_QOS)
+    nameless_maps = ros.collect(PointCloud2, '/nameless/landmark_map', LATCHED_QOS)
     poses = ros.node.create_publisher(PoseArray, '/nameless/landmarks', 10)
     sender = TransformSender(ros, '/tags')
     tagged = {'landmarks_type': 'tf', 'tag_frame_prefix': 'dock', 'odom_frame': "''"}
@@ -338,7 +338,7 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
 
 
 def test_the_map_has_the_velocities_that_landmarks_came_with(ros, tmp_path):
-    maps = ros.collect(PointCloud2, '/moving/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/moving/landmark_map', LATCHED_QOS)
     points, speed = np.array([[2.0, 0, 0], [0, 3.0, 1.0]]), np.array([[0, 0.5, 0], [0, 0, 0]])
     with (
         running('observer_node', tmp_path / 'log', *own_topics('/moving'), odom_frame="''"),
@@ -453,7 +453,7 @@ def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
 
 def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_path):
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-    maps = ros.collect(PointCloud2, '/picky/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/picky/landmark_map', LATCHED_QOS)
     with (
         running(
             'observer_node', tmp_path / 'log', *own_topics('/picky'), landmarks_qos='reliable'
@@ -483,10 +483,14 @@ def test_a_second_publisher_of_velocities_or_of_the_odometry_is_named(ros, tmp_p
         velocities = ros.node.create_publisher(TwistStamped, '/rivals/twist', 10)
         node.wait_for_output(r"2 publishers \(/test_client, /test_client\) publish on '/rivals/tw")
         ros.node.destroy_publisher(velocities)
-        estimates = ros.node.create_publisher(Odometry, '/rivals/odometry', 10)
-        node.wait_for_output(r"/rivals/observer_node, /test_client\) publish on '/rivals/odom")
+        estimates = ros.node.create_publisher(Odometry, '/rivals/observer_node/odometry', 10)
+        node.wait_for_output(
+            r"/rivals/observer_node, /test_client\) publish on '/rivals/observer_node/odom"
+        )
         ros.spin_until(
-            lambda: any("publish on '/rivals/odom" in m.status[0].message for m in statuses),
+            lambda: any(
+                "publish on '/rivals/observer_node/odom" in m.status[0].message for m in statuses
+            ),
             'its diagnostics',
         )
         ros.node.destroy_publisher(estimates)

@@ -60,7 +60,7 @@ class Robot:
         self.ros = ros
         self.random = np.random.default_rng(0)
         self.points = self.random.uniform([-8, -8, 0], [8, 8, 3], (50, 3))
-        self.odometry = ros.collect(Odometry, '/odometry')
+        self.odometry = ros.collect(Odometry, '/observer_node/odometry')
         self.twist = ros.node.create_publisher(TwistStamped, '/twist', 100)
         self.landmarks = ros.node.create_publisher(PointCloud2, '/landmarks', 100)
         self.initialpose = ros.node.create_publisher(PoseWithCovarianceStamped, '/initialpose', 10)

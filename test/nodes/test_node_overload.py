@@ -102,7 +102,7 @@ def test_an_overloaded_node_drops_landmarks_and_its_output_stays_new(ros, tmp_pa
     def receive(message):
         ages_s.append((time.time_ns() - stamp_ns(message)) * 1e-9)
 
-    ros.node.create_subscription(Odometry, '/loaded/odometry', receive, 100)
+    ros.node.create_subscription(Odometry, '/loaded/observer_node/odometry', receive, 100)
     log = tmp_path / 'log'
     statuses = ros.collect(DiagnosticArray, '/diagnostics')
     with (

@@ -98,7 +98,7 @@ def test_paused_observer_holds_its_pose_and_counts_what_it_drops(ros, tmp_path):
 
 
 def test_a_pause_longer_than_stamps_may_jump_erases_nothing(ros, tmp_path):
-    maps = ros.collect(PointCloud2, '/breaking/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/breaking/landmark_map', LATCHED_QOS)
     with (
         running(
             'observer_node', tmp_path / 'log', '-r', '__ns:=/breaking', max_stamp_jump=0.5
@@ -171,7 +171,7 @@ def test_odometry_that_ends_on_tf_is_reported_by_log_and_diagnostics(ros, tmp_pa
 
 
 def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
-    maps = ros.collect(PointCloud2, '/forgetful/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/forgetful/landmark_map', LATCHED_QOS)
     forget = ros.node.create_publisher(Int64, '/forgetful/observer_node/forget_landmark', 10)
     arguments = ('-r', '__ns:=/forgetful')
     with (
@@ -193,7 +193,7 @@ def test_landmarks_are_forgotten_and_seen_again_on_request(ros, tmp_path):
 
 
 def test_forgotten_landmarks_stay_neither_in_the_latched_map_nor_drawn(ros, tmp_path):
-    maps = ros.collect(PointCloud2, '/retracted/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/retracted/landmark_map', LATCHED_QOS)
     markers = ros.collect(MarkerArray, '/retracted/markers')
     forget = ros.node.create_publisher(Int64, '/retracted/observer_node/forget_landmark', 10)
 
@@ -249,7 +249,7 @@ def test_diagnostics_report_rates_ages_drops_and_times(ros, tmp_path):
         assert float(values['processing time, mean [ms]']) > 0.0
         assert int(values['used: observation']) > 5
         assert values['calibration: velocity_delay'].endswith(' s')
-        assert values['calibration: angular_bias_z'].endswith(' rad/s')
+        assert values['calibration: angular_bias_z'].endswith(' °/s')
         now_ns = time.time_ns()
         twins = np.array([7, 7]), np.ones((2, 3))
         diagnostics.wait(
@@ -293,8 +293,9 @@ class Publishing:
             dropped=Counter(), is_paused=False, clock_problems=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
-        self.estimate_publisher = SimpleNamespace(problem='', rivals=str)
-        parts = self.estimator, self.feed, inputs, self.estimate_publisher
+        self.estimate_publisher = SimpleNamespace(problem='', rivals=str, odometry_age_s=None)
+        localisation = SimpleNamespace(status=lambda _hardware_id: DiagnosticStatus())
+        parts = self.estimator, self.feed, inputs, self.estimate_publisher, localisation
         self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')
 
     def publish(self, **new):

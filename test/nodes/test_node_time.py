@@ -66,7 +66,7 @@ def landmark_count(maps):
 def test_looped_recording_under_simulated_time(ros, clock, tmp_path):
     choices = ('reset', 'hold')
     poses = {c: ros.collect(PoseWithCovarianceStamped, f'/{c}/pose') for c in choices}
-    maps = {c: ros.collect(PointCloud2, f'/{c}/map', LATCHED_QOS) for c in choices}
+    maps = {c: ros.collect(PointCloud2, f'/{c}/landmark_map', LATCHED_QOS) for c in choices}
     with ExitStack() as stack:
         nodes = {}
         for choice in choices:
@@ -185,7 +185,7 @@ def test_unstamped_velocity_waits_for_the_clock_to_begin(ros, clock, tmp_path):
 
 
 def test_a_clock_that_steps_back_a_little_has_not_jumped(ros, tmp_path):
-    maps = ros.collect(PointCloud2, '/jittery/map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, '/jittery/landmark_map', LATCHED_QOS)
     own_clock = ros.node.create_publisher(Clock, '/jittery/clock', 100)
     arguments = ('-r', '__ns:=/jittery', '-r', '/clock:=/jittery/clock')
     parameters = {'use_sim_time': True, 'confirmations': 1}
@@ -365,7 +365,7 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
     with ExitStack() as stack:
         maps, robots = {}, {}
         for name in orders:
-            maps[name] = ros.collect(PointCloud2, f'{name}/map', LATCHED_QOS)
+            maps[name] = ros.collect(PointCloud2, f'{name}/landmark_map', LATCHED_QOS)
             arguments = ('-r', f'__ns:={name}')
             log = tmp_path / name.strip('/')
             stack.enter_context(running('observer_node', log, *arguments, **parameters))

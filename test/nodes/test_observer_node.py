@@ -80,8 +80,8 @@ def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
         late_fraction=0.3,
         max_lateness=0.1,
     )
-    odometry = ros.collect(Odometry, '/replayed/odometry')
-    maps = ros.collect(PointCloud2, '/replayed/map', LATCHED_QOS)
+    odometry = ros.collect(Odometry, '/replayed/observer_node/odometry')
+    maps = ros.collect(PointCloud2, '/replayed/landmark_map', LATCHED_QOS)
     # A wide window, since a busy machine may deliver one topic well before the other.
     parameters = {'reorder_window': 1.0, 'publish_rate': 200.0, 'queue_depth': 1000}
     parameters['landmarks_max_wait'] = 60.0
@@ -141,10 +141,10 @@ def test_incompatible_type_is_reported(ros, observer):
 
 
 OUTPUTS = {
-    '/odometry': ('nav_msgs/msg/Odometry', False),
+    '/observer_node/odometry': ('nav_msgs/msg/Odometry', False),
     '/pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', True),
     '/path': ('nav_msgs/msg/Path', False),
-    '/map': ('sensor_msgs/msg/PointCloud2', True),
+    '/landmark_map': ('sensor_msgs/msg/PointCloud2', True),
     '/landmark_estimates': ('sensor_msgs/msg/PointCloud', False),
     '/markers': ('visualization_msgs/msg/MarkerArray', False),
     '/lyapunov': ('std_msgs/msg/Float64', False),
@@ -163,7 +163,7 @@ def test_each_output_has_its_type_and_quality_of_service(ros, observer):
 
 
 def test_outputs_follow_the_parameters_and_carry_true_stamps(ros, tmp_path):
-    odometry = ros.collect(Odometry, '/fresh/odometry')
+    odometry = ros.collect(Odometry, '/fresh/observer_node/odometry')
     poses = ros.collect(PoseWithCovarianceStamped, '/fresh/pose')
     lyapunov = ros.collect(Float64, '/fresh/lyapunov')
     paths = ros.collect(Path, '/fresh/path')
@@ -180,7 +180,7 @@ def test_outputs_follow_the_parameters_and_carry_true_stamps(ros, tmp_path):
         running('observer_node', tmp_path / 'log', *arguments, **parameters),
         Robot(ros, cloud_class=PointCloud, namespace='/fresh', frame_id='robot') as robot,
     ):
-        topics = ('odometry', 'pose', 'lyapunov', 'path', 'markers')
+        topics = ('observer_node/odometry', 'pose', 'lyapunov', 'path', 'markers')
         ros.wait_for_publisher(*(f'/fresh/{topic}' for topic in topics))
         assert not odometry + poses + paths + lyapunov + markers, 'published before any input'
         events = robot.run(RUN)
@@ -241,7 +241,7 @@ def test_late_subscriber_gets_the_latched_map(ros, observer):
     with Robot(ros) as robot:
         robot.run(RUN)
         ros.spin_for(0.6)
-        maps = ros.collect(PointCloud2, 'map', LATCHED_QOS)
+        maps = ros.collect(PointCloud2, 'landmark_map', LATCHED_QOS)
         ros.spin_until(lambda: maps, 'the latched map')
     assert sorted(decode_point_cloud2(serialize_message(maps[-1])).event.ids) == [0, 1, 2, 3]
 
@@ -427,9 +427,14 @@ def test_parameters_that_are_not_given_to_ros_are_not_passed_over(ros, tmp_path,
 @pytest.mark.parametrize(
     ('source', 'output', 'topic', 'remaps'),
     [
-        ('twist', 'odometry', '/odometry', ['twist:=/odometry']),
-        ('twist', 'odometry', '/wheels', ['odometry:=/wheels', 'twist:=/wheels']),
-        ('landmarks', 'map', '/robot/map', ['__ns:=/robot', 'landmarks:=map']),
+        ('twist', '~/odometry', '/observer_node/odometry', ['twist:=~/odometry']),
+        ('twist', '~/odometry', '/wheels', ['~/odometry:=/wheels', 'twist:=/wheels']),
+        (
+            'landmarks',
+            'landmark_map',
+            '/robot/landmark_map',
+            ['__ns:=/robot', 'landmarks:=landmark_map'],
+        ),
     ],
 )
 def test_a_node_does_not_take_in_its_own_estimate(ros, tmp_path, source, output, topic, remaps):
@@ -437,7 +442,7 @@ def test_a_node_does_not_take_in_its_own_estimate(ros, tmp_path, source, output,
     node = NodeProcess('observer_node', tmp_path / 'log', *arguments)
     assert node.wait() == 2
     assert f"input '{source}' and the output '{output}' are both '{topic}'" in node.output
-    assert f'-r {output}:=observer/{output}' in node.output
+    assert f'-r {output}:=observer/{output.removeprefix("~/")}' in node.output
     assert 'Traceback' not in node.output
 
 
@@ -452,7 +457,7 @@ def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path
 
 
 def test_large_ids_are_warned_about(ros, observer):
-    maps = ros.collect(PointCloud2, 'map', LATCHED_QOS)
+    maps = ros.collect(PointCloud2, 'landmark_map', LATCHED_QOS)
     large_id = 2**32 - 2
     with Robot(ros) as robot:
         start_ns = time.time_ns()

@@ -18,11 +18,18 @@ from slam_observer_ros.simulation import Scenario
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 LAUNCH_FILES = sorted((CHECKOUT / 'launch').glob('*.launch.py'))
+OTHERS = {
+    'rviz2': ['rviz2'],
+    'nav2_map_server': ['map_server'],
+    'nav2_lifecycle_manager': ['lifecycle_manager'],
+    'apriltag_ros': ['apriltag_node'],
+    'tf2_ros': ['static_transform_publisher'],
+}
 PUBLISHED = {
     'path': 'rviz_default_plugins/Path',
     'pose': 'rviz_default_plugins/PoseWithCovariance',
     'markers': 'rviz_default_plugins/MarkerArray',
-    'map': 'rviz_default_plugins/PointCloud2',
+    'landmark_map': 'rviz_default_plugins/PointCloud2',
     'ground_truth/pose': 'rviz_default_plugins/Pose',
     'ground_truth/landmarks': 'rviz_default_plugins/PointCloud2',
 }
@@ -48,8 +55,8 @@ def test_launch_file_names_existing_executables_and_files(path):
         keywords = {
             keyword.arg: getattr(keyword.value, 'value', None) for keyword in call.keywords
         }
-        assert keywords['package'] in ('slam_observer_ros', 'rviz2')
-        assert keywords['package'] == 'rviz2' or keywords['executable'] in scripts
+        package, executable = keywords['package'], keywords['executable']
+        assert executable in (scripts if package == 'slam_observer_ros' else OTHERS[package])
     for call in _calls(tree, 'PathJoinSubstitution'):
         _share, *parts = call.args[0].elts
         assert CHECKOUT.joinpath(*(part.value for part in parts)).is_file()
@@ -58,7 +65,11 @@ def test_launch_file_names_existing_executables_and_files(path):
 def test_launch_arguments_that_are_used_are_declared():
     for path in LAUNCH_FILES:
         tree = ast.parse(path.read_text())
-        declared = {call.args[0].value for call in _calls(tree, 'DeclareLaunchArgument')}
+        declared = {
+            call.args[0].value
+            for call in _calls(tree, 'DeclareLaunchArgument')
+            if isinstance(call.args[0], ast.Constant)
+        }
         used = {call.args[0].value for call in _calls(tree, 'LaunchConfiguration')}
         assert used <= declared
 
@@ -83,6 +94,7 @@ def test_rviz_gives_the_pose_where_it_is_heard():
     ('name', 'tables'),
     [
         ('observer.yaml', (Settings, ObserverNodeSettings)),
+        ('apriltags.yaml', (Settings, ObserverNodeSettings)),
         ('simulator.yaml', (Scenario, SimulatorNodeSettings)),
     ],
 )

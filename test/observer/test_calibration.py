@@ -413,16 +413,21 @@ def test_what_did_not_come_of_velocities_says_nothing_of_their_delay():
 @pytest.mark.parametrize(
     ('deviation', 'expected'),
     [
-        (0.0123, '0.012 ± 0.012 rad/s'),
-        (0.000158, '0.01235 ± 0.00016 rad/s'),
-        (0.0, '0.012 ± 0.000 rad/s'),
-        (math.nan, '0.012 ± nan rad/s'),
-        (math.inf, '0.012 ± inf rad/s'),
-        (1e-30, '0.012345000 ± 0.000000000 rad/s'),
+        (0.0123, '0.012 ± 0.012 m/s'),
+        (0.000158, '0.01235 ± 0.00016 m/s'),
+        (0.0, '0.012 ± 0.000 m/s'),
+        (math.nan, '0.012 ± nan m/s'),
+        (math.inf, '0.012 ± inf m/s'),
+        (1e-30, '0.012345000 ± 0.000000000 m/s'),
     ],
 )
 def test_an_estimate_is_written_as_far_as_it_is_known(deviation, expected):
-    assert str(CalibrationEstimate('angular_bias_x', 0.012345, deviation, 'rad/s')) == expected
+    assert str(CalibrationEstimate('linear_bias_x', 0.012345, deviation, 'm/s')) == expected
+
+
+def test_angles_are_written_in_degrees():
+    bias = CalibrationEstimate('angular_bias_x', np.radians(0.5), np.radians(0.25), 'rad/s')
+    assert str(bias) == '0.500 ± 0.250 °/s'
 
 
 def test_a_calibration_that_nobody_can_mean_is_reported():

@@ -23,6 +23,7 @@ from slam_observer_ros.cli.replay.summary import as_json
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.nodes import localization_setup
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
 from slam_observer_ros.settings.parameter_table import table
@@ -100,14 +101,30 @@ def test_run_commands_name_existing_executables_and_parameters(page):
 @pages
 def test_launch_commands_name_existing_files_and_arguments(page):
     for file, *arguments in commands(page, ['ros2', 'launch', 'slam_observer_ros']):
-        tree = ast.parse((CHECKOUT / 'launch' / file).read_text())
-        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-        declared = {
-            call.args[0].value
-            for call in calls
-            if getattr(call.func, 'id', '') == 'DeclareLaunchArgument'
-        }
+        declared = launch_arguments(file)
         assert {argument.partition(':=')[0] for argument in arguments} <= declared
+
+
+def launch_arguments(file):
+    """Return the names of a launch file's arguments, with those of a file that it includes."""
+    tree = ast.parse((CHECKOUT / 'launch' / file).read_text())
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    names = {
+        call.args[0].value
+        for call in calls
+        if getattr(call.func, 'id', '') == 'DeclareLaunchArgument'
+        and isinstance(call.args[0], ast.Constant)
+    }
+    texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+    if 'localization.launch.py' in texts:
+        names |= launch_arguments('localization.launch.py')
+    imported = {getattr(node, 'module', '') for node in tree.body}
+    if localization_setup.__name__ in imported:
+        names |= set(localization_setup.ARGUMENTS)
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], 'id', '') == 'ARGUMENTS':
+            names |= {key.value for key in node.value.keys}
+    return names
 
 
 @pages
@@ -197,7 +214,7 @@ def test_foxglove_shows_topics_that_are_published(published):
     for panel in panels.values():
         shown |= {path['value'].split('.')[0] for path in panel.get('paths', ())}
         shown |= {panel[name] for name in ('topicToRender',) if name in panel}
-    names = {f'/{name.lstrip("/")}' for name in published}
+    names = {f'/{name.lstrip("/").replace("~", "observer_node")}' for name in published}
     assert shown <= names
     assert set(panels_of(layout['layout'])) == set(panels)
 

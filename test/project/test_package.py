@@ -70,8 +70,8 @@ def test_a_robot_needs_only_debian_packages_and_the_command_line_can_be_asked_fo
     for asked_for in ('', 'yes'):
         manifest.evaluate_conditions({'SLAM_OBSERVER_CLI': asked_for})
         needed[asked_for] = {d.name for d in manifest.exec_depends if d.evaluated_condition}
-    only_cli = {'python3-matplotlib', 'python3-rich', 'python3-rosbags-pip', 'mcap-ros2-support'}
-    assert needed['yes'] - needed[''] == {*only_cli, 'rviz2'}
+    debian = {'python3-argcomplete', 'python3-matplotlib', 'python3-rich', 'rviz2'}
+    assert needed['yes'] - needed[''] == {*debian, 'python3-rosbags-pip', 'mcap-ros2-support'}
     assert not [name for name in needed[''] if name.endswith('-pip')]
     setup = run_setup(str(CHECKOUT / 'setup.py'), stop_after='init')
     names = {re.split('[><=]', requirement)[0] for requirement in setup.extras_require['cli']}

@@ -476,8 +476,8 @@ class TestTopics:
         found = self.find(
             tmp_path,
             {
-                '/odometry': self.ODOMETRY,
-                '/map': self.CLOUD,
+                '/observer_node/odometry': self.ODOMETRY,
+                '/landmark_map': self.CLOUD,
                 '/landmark_estimates': self.CLOUD,
                 '/twist': self.TWIST,
                 '/landmarks': self.CLOUD,

@@ -14,7 +14,7 @@ import pytest
 from recordings import write_mcap
 
 from slam_observer_ros.common.version import VERSION
-from slam_observer_ros.report.ellipses import ellipses
+from slam_observer_ros.evaluation.ellipses import ellipses
 from slam_observer_ros.report.findings import growth_windows
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'

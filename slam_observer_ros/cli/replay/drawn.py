@@ -5,14 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.consistency import nees_over_time
 from slam_observer_ros.evaluation.gaps import fill_gaps
+from slam_observer_ros.evaluation.map_shape import shape_covariances
 from slam_observer_ros.evaluation.plots.map_plot import plot_map
 from slam_observer_ros.evaluation.plots.replay_plots import plot_errors, plot_residuals
 from slam_observer_ros.evaluation.trajectory import Trajectory
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.report.page import write_report
 from slam_observer_ros.report.reported_run import ReportedRun
 from slam_observer_ros.runs.recorder import RunRecorder
+from slam_observer_ros.runs.replay import Replay
+
+MAX_ELLIPSES = 300
+"""Landmarks of more would hide each other's, and their joint covariance costs the cube of them."""
 
 
 def write_report_of(
@@ -42,19 +52,18 @@ def write_report_of(
     )
 
 
-def draw_figures(outcome: ReplayOutcome, directory: Path) -> None:
-    """Draw the figures into a directory that is there."""
-    result = outcome.result
-    _draw_map(outcome, directory / 'map.png')
-    _draw_errors(outcome, directory / 'errors.png')
-    plot_residuals(
-        directory / 'residuals.png',
-        result.residual_stamps_ns,
-        result.residuals,
-        result.rejected,
-        outcome.dropped,
-        outcome.events,
-    )
+def draw_figures(outcome: ReplayOutcome, directory: Path, suffix: str) -> None:
+    """Draw the figures into a directory that is there, as files of one kind."""
+    _draw_map(outcome, directory / f'map.{suffix}')
+    _draw_errors(outcome, directory / f'errors.{suffix}')
+    if isinstance(outcome.recorder, RunRecorder):
+        plot_residuals(
+            directory / f'residuals.{suffix}',
+            outcome.recorder.innovations,
+            outcome.result.estimator.settings,
+            outcome.dropped,
+            outcome.events,
+        )
 
 
 def _draw_map(outcome: ReplayOutcome, path: Path) -> None:
@@ -70,8 +79,26 @@ def _draw_map(outcome: ReplayOutcome, path: Path) -> None:
         result.estimator.world_points if smoothed is None else smoothed.world_points,
         Trajectory(truth.stamps_ns, truth.poses) if has_errors else None,
         truth.landmarks,
+        covariances=None if smoothed is not None else _landmark_covariances(result),
         is_smoothed=smoothed is not None,
     )
+
+
+def _landmark_covariances(result: Replay) -> FloatArray | None:
+    """Return those of the landmarks (n, 3, 3) in a loaded map; otherwise of the map's shape."""
+    estimator, update = result.estimator, result.estimator.last_update
+    count = len(estimator.landmark_ids)
+    if result.in_known_map:
+        return estimator.landmark_covariances
+    if update is None or not 0 < count <= MAX_ELLIPSES:
+        return None
+    joint = estimator.configuration_covariance(np.arange(count))
+    if joint is None:
+        return None
+    seen = se3.transform(se3.inverse(update.pose), estimator.world_points)
+    R = update.pose[:3, :3]
+    covariances: FloatArray = R @ shape_covariances(seen, joint) @ R.T
+    return covariances
 
 
 def _draw_errors(outcome: ReplayOutcome, path: Path) -> None:
@@ -82,11 +109,14 @@ def _draw_errors(outcome: ReplayOutcome, path: Path) -> None:
     if outcome.smoothed is not None:
         plot_errors(path, errors, is_smoothed=True)
         return
-    covariances = result.pose_covariances
+    covariances, nees = result.pose_covariances, None
+    is_anchored = not result.in_known_map
+    if covariances is not None and (outcome.accuracy.anees is not None or not is_anchored):
+        nees = nees_over_time(errors, covariances[errors.covered], is_anchored)
     plot_errors(
         path,
         errors,
-        None if covariances is None else covariances[errors.covered],
+        nees,
         result.configuration if result.configuration.values_m else None,
-        in_known_map=result.in_known_map,
+        is_anchored=is_anchored,
     )

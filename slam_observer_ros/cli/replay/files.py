@@ -13,6 +13,7 @@ from slam_observer_ros.cli.outputs import (
     check_inputs_are_kept,
     check_outputs,
     check_plots,
+    figure_files,
     filled_directory,
 )
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
@@ -23,7 +24,7 @@ from slam_observer_ros.recording.opening import files_of
 
 logger = logging.getLogger(__name__)
 
-FIGURES = ('map.png', 'errors.png', 'residuals.png')
+FIGURES = ('map', 'errors', 'residuals')
 
 
 def check_files(args: argparse.Namespace) -> None:
@@ -36,7 +37,7 @@ def check_files(args: argparse.Namespace) -> None:
     check_inputs_are_kept(kept, read | loaded)
     check_inputs_are_kept({'--map': args.map}, read)
     check_outputs([args.tum, args.map, args.report, args.mcap], args.force)
-    check_plots(args.plot, FIGURES, args.force)
+    check_plots(args, FIGURES)
 
 
 def write_files(
@@ -47,7 +48,7 @@ def write_files(
         ('trajectory', args.tum, lambda path: write_tum(outcome.trajectory, path)),
         ('map', args.map, lambda path: _write_map(outcome, map_frame, path)),
         ('report', args.report, lambda path: _write_report(args, outcome, summary, path)),
-        ('figures', args.plot, lambda path: _draw_figures(outcome, path)),
+        ('figures', args.plot, lambda path: _draw_figures(args, outcome, path)),
     )
     written: dict[str, Path] = {} if args.mcap is None else {'recording': args.mcap}
     errors: list[str] = []
@@ -82,8 +83,8 @@ def _write_report(
     write_report_of(args.recording.name, outcome, summary, path)
 
 
-def _draw_figures(outcome: ReplayOutcome, directory: Path) -> None:
+def _draw_figures(args: argparse.Namespace, outcome: ReplayOutcome, directory: Path) -> None:
     from slam_observer_ros.cli.replay.drawn import draw_figures
 
-    with filled_directory(directory, FIGURES) as unfinished:
-        draw_figures(outcome, unfinished)
+    with filled_directory(directory, figure_files(args, FIGURES)) as unfinished:
+        draw_figures(outcome, unfinished, args.plot_format)

@@ -84,9 +84,10 @@ class ReplayOutcome:
     @property
     def localised_after_s(self) -> float | None:
         """Time until the pose in a loaded map was found, seconds; None without such a map."""
-        if not (self.result.in_known_map and len(self.result.trajectory)):
+        localised_ns = self.result.localised_ns
+        if localised_ns is None or not self.result.in_known_map:
             return None
-        return self.result.seconds_until(self.result.trajectory.stamps_ns[0])
+        return self.result.seconds_until(localised_ns[0])
 
     @property
     def unaligned_rmse_m(self) -> float | None:

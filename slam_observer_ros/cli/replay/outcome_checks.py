@@ -114,9 +114,9 @@ def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap
     """
     if result.estimator.is_localised:
         return
-    if not len(result.trajectory):
+    if result.localised_ns is None:
         raise UsageError(_never_found(args.load_map, result, known))
-    end_s = result.seconds_until(result.trajectory.stamps_ns[-1])
+    end_s = result.seconds_until(result.localised_ns[1])
     lost = f'the pose in the map {args.load_map} was lost after {end_s:.1f} s, and not found again'
     if args.map is not None or args.smooth:
         raise UsageError(f'{lost}; --map and --smooth need it at the end')

@@ -69,7 +69,7 @@ def _replay(
     """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
     with Recording(args.recording) as recording:
         selected, inputs, truth = select_inputs(args, recording, Asked(settings, inputs))
-        events = recording.events(selected, inputs, settings.velocity_timeout)
+        events = recording.blocks(selected, inputs, settings.velocity_timeout)
         if shows_progress:
             events = show_progress(events, 'replaying', recording.event_count(selected))
         recorder = _recorder(args)
@@ -94,7 +94,7 @@ def _replay(
 
 
 def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
-    if args.report is not None:
+    if args.report is not None or args.plot is not None:
         return RunRecorder()
     return NisTally() if args.json else None
 

@@ -91,5 +91,5 @@ def write_tuned(
 
 def _entry(name: str, value: object) -> str:
     plain = list(value) if isinstance(value, tuple) else value
-    text: str = yaml.safe_dump({name: plain}, default_flow_style=None, width=10_000)
-    return f'    {text.strip()}'
+    text: str = yaml.safe_dump(plain, default_flow_style=True, width=10_000)
+    return f'    {name}: {text.splitlines()[0]}'  # a scalar has an end of its own below it

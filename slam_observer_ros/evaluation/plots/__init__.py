@@ -1,1 +1,1 @@
-"""Figures, each a PNG file; an EvaluationError is raised if one can't be written."""
+"""Figures, as PNG, SVG or PDF; an EvaluationError is raised if one can't be written."""

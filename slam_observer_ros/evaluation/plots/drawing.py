@@ -15,7 +15,8 @@ import numpy as np
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 
-BLUE, RED, GREEN, GREY = '#0072B2', '#D55E00', '#009E73', '#7F7F7F'
+BLUE, RED, GREEN = '#0072B2', '#D55E00', '#009E73'
+ORANGE, PURPLE, BLACK = '#E69F00', '#CC79A7', '#1B1F24'
 PALE_BLUE = '#7FB8DA'
 
 # The dictionaries are Any: matplotlib's types list the settings of its own version only.
@@ -39,7 +40,14 @@ STYLE: Any = {
     'legend.frameon': False,
     'legend.fontsize': 9,
     'agg.path.chunksize': 20_000,
+    'pdf.fonttype': 42,  # publishers refuse matplotlib's default
+    'svg.fonttype': 'none',  # text that can be searched and edited
+    'svg.hashsalt': 'slam_observer_ros',  # the same figure is the same file
 }
+
+SUFFIXES = ('png', 'svg', 'pdf')
+
+_NO_DATES: Any = {'png': {}, 'svg': {'Date': None}, 'pdf': {'CreationDate': None}}
 
 # The true path is wide and pale, so that an estimate that lies on it hides nothing.
 TRUE_PATH: Any = {'color': PALE_BLUE, 'linestyle': '-', 'linewidth': 3.0, 'label': 'true path'}
@@ -54,7 +62,14 @@ TRUE_LANDMARKS: Any = {
     'color': BLUE, 'marker': '*', 'markersize': 10, 'linestyle': 'none', 'zorder': 4,
     'label': 'true landmarks',
 }  # fmt: skip
-TRACKS: Any = {'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2}  # they end in LANDMARKS
+TRACKS: Any = {
+    'color': GREEN, 'linestyle': '-.', 'linewidth': 1.2,
+    'label': 'landmark estimates on their way',
+}  # fmt: skip
+ELLIPSES: Any = {
+    'color': GREEN, 'linestyle': '-', 'linewidth': 0.9, 'zorder': 3.5,
+    'label': '95 % ellipses',
+}  # fmt: skip
 LANDMARKS: Any = {
     'color': GREEN, 'marker': 'o', 'markersize': 9, 'markerfacecolor': 'none',
     'markeredgewidth': 1.5, 'linestyle': 'none', 'zorder': 5, 'label': 'estimated landmarks',
@@ -88,9 +103,10 @@ def legend_below(figure: Figure, named: Axes, columns: int) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG file and return its path; raise an EvaluationError if that fails."""
+    """Write a file of one of SUFFIXES, return its path; raise an EvaluationError if that fails."""
+    suffix = path.suffix.removeprefix('.')
     try:
-        figure.savefig(path, format='png')
+        figure.savefig(path, format=suffix, metadata=_NO_DATES[suffix])
     except OSError as error:
         raise EvaluationError(f"can't write {path}: {error.strerror}") from error
     return path

@@ -11,8 +11,10 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.evaluation.ellipses import CHI_SQUARE_95, outlines
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.plots.drawing import (
+    ELLIPSES,
     END,
     is_flat,
     LANDMARKS,
@@ -35,6 +37,9 @@ from slam_observer_ros.geometry import se3
 _MAX_LABELS = 300
 """Of more landmarks than this few ids would find room, and it would take long to look for it."""
 
+_MAX_SPREAD = 0.25
+"""Part of the map's width that is added at each side for ellipses, at most."""
+
 _PANELS_IN = 6.3
 """Largest width and height of what is drawn, inches."""
 
@@ -54,6 +59,7 @@ def plot_map(
     truth: Trajectory | None = None,
     landmark_truth: LandmarkTruth | None = None,
     *,
+    covariances: FloatArray | None = None,
     is_smoothed: bool = False,
 ) -> Path:
     """Draw a replay's path and map over the truth, from above and, unless flat, from the side.
@@ -70,6 +76,8 @@ def plot_map(
         The final map, metres.
     truth, landmark_truth
         In one world; true landmarks are drawn only together with true poses.
+    covariances : (n, 3, 3), optional
+        Of the landmarks, along the axes of the estimate's world, m²; drawn as 95 % ellipses.
     is_smoothed
         What the title says of all this.
 
@@ -77,12 +85,17 @@ def plot_map(
     if truth is not None:
         alignment = trajectory_errors(estimate, truth).alignment
         estimate, world_points = estimate.moved(alignment), se3.transform(alignment, world_points)
+        if covariances is not None:
+            covariances = alignment[:3, :3] @ covariances @ alignment[:3, :3].T
         # Else paths that are long the same seem to end at different places.
         truth = truth.during(estimate)
     else:
         landmark_truth = None
     layers = _map_layers(estimate, ids, world_points, truth, landmark_truth)
-    figure, panels = _draw(layers, is_flat((estimate if truth is None else truth).positions))
+    spread = None if covariances is None or not len(ids) else (world_points, covariances)
+    figure, panels = _draw(
+        layers, is_flat((estimate if truth is None else truth).positions), spread
+    )
     title = 'Smoothed trajectory and map' if is_smoothed else 'Trajectory and map'
     if truth is not None:
         title += ' after rigid alignment'
@@ -94,11 +107,18 @@ def plot_map(
     return save(figure, path)
 
 
-def _draw(layers: list[_Layer], flat: bool) -> tuple[Figure, list[Axes]]:
-    """Return a figure of layers, and its panels: from above and, unless flat, from the side."""
+def _draw(
+    layers: list[_Layer], flat: bool, spread: tuple[FloatArray, FloatArray] | None
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of layers, and its panels: from above and, unless flat, from the side.
+
+    ``spread`` are points (n, 3) and their covariances (n, 3, 3), if known.
+    """
     drawn = np.concatenate([np.zeros((0, 3)), *(points for points, _ in layers)])
     drawn = drawn if len(drawn) else np.zeros((1, 3))
     low, high = np.nanmin(drawn, axis=0), np.nanmax(drawn, axis=0)
+    if spread is not None:
+        low, high = _with_spread(low, high, *spread)
     margin = 0.06 * float(np.max(high - low)) or 1.0
     low, high = low - margin, high + margin
 
@@ -107,11 +127,25 @@ def _draw(layers: list[_Layer], flat: bool) -> tuple[Figure, list[Axes]]:
     for axes, (across, up) in zip(panels, views, strict=True):
         for points, style in layers:
             axes.plot(points[:, across], points[:, up], **style)
+        if spread is not None:
+            axes.plot(*outlines(*spread, (across, up)).T, **ELLIPSES)
         axes.set(xlim=(low[across], high[across]), ylim=(low[up], high[up]), aspect='equal')
         axes.set(xlabel=f'{"xyz"[across]} [m]', ylabel=f'{"xyz"[up]} [m]')
     figure.align_ylabels(panels)
     legend_below(figure, panels[-1], columns=3)
     return figure, panels
+
+
+def _with_spread(
+    low: FloatArray, high: FloatArray, points: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return corners (3,) of a box that has the ellipses, too, unless they dwarf all else."""
+    half = np.sqrt(CHI_SQUARE_95 * np.diagonal(covariances, axis1=1, axis2=2))
+    most = _MAX_SPREAD * float(np.max(high - low))
+    return (
+        np.maximum(np.minimum(low, (points - half).min(axis=0)), low - most),
+        np.minimum(np.maximum(high, (points + half).max(axis=0)), high + most),
+    )
 
 
 def _side_view(spans_m: FloatArray) -> tuple[int, int]:

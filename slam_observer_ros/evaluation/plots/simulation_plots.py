@@ -11,15 +11,17 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.decay import Decay
 from slam_observer_ros.evaluation.plots.drawing import (
-    BLUE,
+    BLACK,
     END,
-    GREY,
     is_flat,
     LANDMARKS,
     legend_below,
+    PALE_BLUE,
     PATH,
     save,
+    START,
     STYLE,
     TRACKS,
     TRUE_END,
@@ -36,24 +38,25 @@ def plot_lyapunov(
     path: Path,
     times_s: FloatArray,
     log10_lyapunov: FloatArray,
-    slope_per_s: float | None = None,
+    decay: Decay | None = None,
 ) -> Path:
     """Draw the Lyapunov function (34) over times (k,), as the paper's Fig. 3.
 
-    Where ``log10_lyapunov`` (k,) is -inf nothing is drawn. The slope, decades per second, is that
-    fitted after the transient.
+    Where ``log10_lyapunov`` (k,) is -inf nothing is drawn. The ``decay`` is that fitted after the
+    transient.
     """
     finite = np.isfinite(log10_lyapunov)
     times_s, log10_lyapunov = times_s[finite], log10_lyapunov[finite]
     figure = Figure(figsize=(7.0, 4.2))
     axes = figure.add_subplot()
-    axes.plot(times_s, log10_lyapunov, color=BLUE, label=r'$\log_{10}\,\mathcal{L}$')
-    if slope_per_s is not None and len(times_s) > 0:
-        middle = int(np.argmin(np.abs(log10_lyapunov - log10_lyapunov.mean())))
-        line = log10_lyapunov[middle] + slope_per_s * (times_s - times_s[middle])
-        label = f'exponential, {slope_per_s:.3f} per second'.replace('-', '\N{MINUS SIGN}')
+    level: Any = {'color': PALE_BLUE, 'linewidth': 3.0}
+    axes.plot(times_s, log10_lyapunov, **level, label=r'$\log_{10}\,\mathcal{L}$')
+    if decay is not None and len(times_s) > 0:
+        line = decay.log10_at(times_s)
         shown = line >= log10_lyapunov.min()
-        axes.plot(times_s[shown], line[shown] + 1.0, color=GREY, linestyle='--', label=label)
+        label = f'fit after the transient, {decay.slope_per_s:.3f} per second'
+        fit: Any = {'color': BLACK, 'linestyle': '--', 'linewidth': 1.2}
+        axes.plot(times_s[shown], line[shown], **fit, label=label.replace('-', '\N{MINUS SIGN}'))
         axes.legend(loc='upper right')
     axes.set(
         title='Lyapunov function of the observer',
@@ -81,7 +84,7 @@ def plot_configuration(
     Parameters
     ----------
     path : Path
-        PNG file to write.
+        File to write, of one of the SUFFIXES.
     estimate, truth : Trajectory
         Poses at the same k stamps, k > 0.
     landmark_tracks : FloatArray
@@ -105,8 +108,9 @@ def plot_configuration(
     breaks = np.full((1, tracks.shape[1], 3), np.nan)
     joined = np.concatenate([tracks, breaks]).swapaxes(0, 1).reshape(-1, 3)
 
-    flat = is_flat(np.concatenate([truth.positions, true_landmarks]))
-    figure = Figure(figsize=(7.2, 6.2) if flat else (7.2, 5.2))
+    scene = np.concatenate([truth.positions, true_landmarks])
+    flat = is_flat(scene)
+    figure = Figure(figsize=(7.2, 6.2) if flat else (7.2, _space_height_in(np.ptp(scene, axis=0))))
     axes: Any = figure.add_subplot() if flat else _space_view(figure)
     for points, style in [
         (truth.positions, TRUE_PATH),
@@ -116,6 +120,7 @@ def plot_configuration(
         (estimate.positions[-1:], END),
         (joined, TRACKS),
         (tracks[-1], LANDMARKS),
+        (estimate.positions[:1], START),
     ]:
         axes.plot(*points.T[: 2 if flat else 3], **style)
     axes.set(title='Configuration after the rigid correction', xlabel='x [m]', ylabel='y [m]')
@@ -123,9 +128,15 @@ def plot_configuration(
         axes.set_aspect('equal')
     else:
         limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
-        axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.1)
-    legend_below(figure, axes, columns=5)
+        axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.35)
+    legend_below(figure, axes, columns=4)
     return save(figure, path)
+
+
+def _space_height_in(spans_m: FloatArray) -> float:
+    """Return the height of a figure of a scene in space, inches: a low scene needs little."""
+    share = float(spans_m[2] / max(spans_m[:2].max(), spans_m[2]))
+    return 4.4 + 2.6 * share
 
 
 def _space_view(figure: Figure) -> Any:

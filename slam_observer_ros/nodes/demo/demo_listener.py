@@ -35,7 +35,7 @@ DEEP_QOS = QoSProfile(depth=10_000)
 
 MEASURED = {'/twist': TwistStamped, '/landmarks': PointCloud2}
 ESTIMATED = {
-    '/odometry': Odometry,
+    '/observer_node/odometry': Odometry,
     '/pose': PoseWithCovarianceStamped,
     '/path': Path,
     '/landmark_estimates': PointCloud,
@@ -44,7 +44,7 @@ ESTIMATED = {
 }
 SHARED = {'/diagnostics': DiagnosticArray}
 TRUE = {'/ground_truth/pose': PoseStamped}
-LATCHED = {'/map': PointCloud2, '/ground_truth/landmarks': PointCloud2}
+LATCHED = {'/landmark_map': PointCloud2, '/ground_truth/landmarks': PointCloud2}
 
 
 class DemoListener(Node):  # type: ignore[misc]  # rclpy comes untyped

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from slam_observer_ros.common.digits import significant
 from slam_observer_ros.common.tables import table_of
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.evaluation.decay import Decay, fit_decay
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.plots.simulation_plots import plot_configuration, plot_lyapunov
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.nodes.demo.demo_listener import DemoListener
-from slam_observer_ros.runs.simulated_run import fit_slope
 
 CHECKED_S = 60.0  # simulated time at which the observer must have converged
 CONVERGED_LOG10 = -10.0  # log10 L below which it has
@@ -31,15 +32,15 @@ def report(listener: DemoListener, folder: Path, console: Console) -> bool:
         console.print('The observer has published no estimate.', style='red')
         return False
     times_s, lyapunov = times_s[is_known], lyapunov[is_known]
-    slope_per_s = fit_slope(times_s, lyapunov, FLOAT32_FLOOR)
-    _draw(listener, folder, times_s, lyapunov, slope_per_s)
+    decay = fit_decay(times_s, lyapunov, FLOAT32_FLOOR)
+    _draw(listener, folder, times_s, lyapunov, decay)
     checked_log10 = float(np.log10(lyapunov[times_s <= CHECKED_S][-1]))
     has_converged = checked_log10 < CONVERGED_LOG10
     rows = {
         'log10 L, first': f'{np.log10(lyapunov[0]):.2f}',
         f'log10 L at {min(CHECKED_S, times_s[-1]):.0f} s': f'{checked_log10:.2f}',
         'log10 L, last': f'{np.log10(lyapunov[-1]):.2f}',
-        'slope of log10 L': 'none' if slope_per_s is None else f'{slope_per_s:.4f} per second',
+        'slope of log10 L': 'none' if decay is None else f'{decay.slope_per_s:.4f} per second',
         **_accuracy(listener),
         'estimates heard': str(count),
         **{path.name: str(path) for path in sorted(folder.iterdir())},
@@ -55,9 +56,9 @@ def _draw(
     folder: Path,
     times_s: FloatArray,
     lyapunov: FloatArray,
-    slope_per_s: float | None,
+    decay: Decay | None,
 ) -> None:
-    plot_lyapunov(folder / 'lyapunov.png', times_s, np.log10(lyapunov), slope_per_s)
+    plot_lyapunov(folder / 'lyapunov.png', times_s, np.log10(lyapunov), decay)
     estimate, truth = listener.trajectories()
     plot_configuration(
         folder / 'configuration.png',
@@ -74,6 +75,6 @@ def _accuracy(listener: DemoListener) -> dict[str, str]:
     half = len(estimate) // 2
     second_half = Trajectory(estimate.stamps_ns[half:], estimate.poses[half:])
     return {
-        'ATE, whole run': f'{trajectory_errors(estimate, truth).ate_rmse_m:.4f} m',
-        'ATE, second half': f'{trajectory_errors(second_half, truth).ate_rmse_m:.1e} m',
+        'ATE, whole run': f'{significant(trajectory_errors(estimate, truth).ate_rmse_m)} m',
+        'ATE, second half': f'{significant(trajectory_errors(second_half, truth).ate_rmse_m)} m',
     }

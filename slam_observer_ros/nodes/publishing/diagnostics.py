@@ -16,6 +16,7 @@ from slam_observer_ros.events import is_automatic
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
+from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus
 
 SILENT_S = 2.0  # an input without messages for this long is a warning
 RECENT = 30  # statuses, of about a second each, over which rejected points are counted
@@ -39,6 +40,7 @@ class DiagnosticsPublisher:
         feed: EstimatorFeed,
         inputs: Sequence[InputTopic[Any]],
         estimate_publisher: EstimatePublisher,
+        localisation: LocalisationStatus,
         hardware_id: str,
     ) -> None:
         self._node = node
@@ -47,6 +49,7 @@ class DiagnosticsPublisher:
         self._feed = feed
         self._inputs = inputs
         self._estimate_publisher = estimate_publisher
+        self._localisation = localisation
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
         self._last_received = {source.topic: 0 for source in inputs}
@@ -55,7 +58,7 @@ class DiagnosticsPublisher:
         self._recent_counts: deque[Counter[str]] = deque(maxlen=RECENT)
 
     def publish(self) -> None:
-        """Publish one status; call it about once a second."""
+        """Publish the status of the estimate and of the localisation, about once a second."""
         dropped, new = self._progress()
         # What came while the node was paused or inactive was not to be used.
         unused = [self._unused_warning(source) for source in self._inputs] if dropped else []
@@ -74,7 +77,7 @@ class DiagnosticsPublisher:
             message='; '.join(warnings) or 'running',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
-        message = DiagnosticArray(status=[status])
+        message = DiagnosticArray(status=[status, self._localisation.status(self._hardware_id)])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 
@@ -92,6 +95,8 @@ class DiagnosticsPublisher:
             values[f'{source.topic} wait [s]'] = f'{source.backlog.wait_s:.3f}'
             if source.malformed:
                 values[f'{source.topic} malformed'] = str(source.malformed)
+        if (age_s := self._estimate_publisher.odometry_age_s) is not None:
+            values['odometry on /tf age [s]'] = f'{age_s:.3f}'
         return values
 
     def _estimator_values(self) -> dict[str, str]:

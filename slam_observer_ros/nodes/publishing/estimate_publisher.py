@@ -15,6 +15,7 @@ from visualization_msgs.msg import MarkerArray
 
 from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
@@ -27,7 +28,15 @@ from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
-TOPICS = ('odometry', 'pose', 'lyapunov', 'landmark_estimates', 'path', 'map', 'markers')
+TOPICS = (
+    '~/odometry',
+    'pose',
+    'lyapunov',
+    'landmark_estimates',
+    'path',
+    'landmark_map',
+    'markers',
+)
 """Topics of the estimate, before remapping."""
 
 EARLY = 0.5
@@ -61,12 +70,12 @@ class EstimatePublisher:
         self._slow_stamp_ns: int | None = None
         self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
         self._path_stamp_ns: int | None = None
-        self._odometry = node.create_publisher(Odometry, 'odometry', RELIABLE_QOS)
+        self._odometry = node.create_publisher(Odometry, '~/odometry', RELIABLE_QOS)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, 'pose', LATCHED_POSE_QOS)
         self._lyapunov = node.create_publisher(Float64, 'lyapunov', RELIABLE_QOS)
         self._estimates = node.create_publisher(PointCloud, 'landmark_estimates', RELIABLE_QOS)
         self._path_publisher = node.create_publisher(Path, 'path', RELIABLE_QOS)
-        self._map = node.create_publisher(PointCloud2, 'map', LATCHED_QOS)
+        self._map = node.create_publisher(PointCloud2, 'landmark_map', LATCHED_QOS)
         self._markers = node.create_publisher(MarkerArray, 'markers', RELIABLE_QOS)
         self._broadcaster: PoseBroadcaster | None = None
         if settings.publish_tf:
@@ -82,9 +91,18 @@ class EstimatePublisher:
             return ''
         return self._broadcaster.problem or self._broadcaster.rival
 
+    @property
+    def odometry_age_s(self) -> float | None:
+        """Age of the newest odometry on /tf, seconds; None if there is none."""
+        newest_ns = None if self._broadcaster is None else self._broadcaster.odometry_ns()
+        if newest_ns is None:
+            return None
+        now_ns: int = self._node.get_clock().now().nanoseconds
+        return to_s(now_ns - newest_ns)
+
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""
-        topic = self._node.resolve_topic_name('odometry')
+        topic = self._node.resolve_topic_name('~/odometry')
         text = rivals(topic, self._node.get_publishers_info_by_topic(topic))
         if text:
             self._log.warning(topic, text)

@@ -108,7 +108,7 @@ class PoseBroadcaster:
         """Publish the newest pose that can be."""
         if not self._waiting:
             return
-        newest_ns = self._odometry_ns()
+        newest_ns = self.odometry_ns()
         self.problem = ''
         self._find_parent(newest_ns)
         self._report_delay(newest_ns)
@@ -130,7 +130,7 @@ class PoseBroadcaster:
         self._correction = None
         self.problem = ''
 
-    def _odometry_ns(self) -> int | None:
+    def odometry_ns(self) -> int | None:
         """Return the newest stamp of the odometry on /tf; None if it has none."""
         settings = self._settings
         if not settings.odom_frame:

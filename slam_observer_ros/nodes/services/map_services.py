@@ -63,7 +63,7 @@ class MapServices:
         if self._autosave:
             self._check_autosave(settings.map_path)
         if settings.map_file:
-            node.get_logger().info(self._load(_absolute(settings.map_file)))
+            node.get_logger().info(self._load(absolute(settings.map_file)))
         elif estimator.settings.localization_mode != 'off':
             node.get_logger().warning("no 'map_file': mapping until a map comes by ~/load_map")
         self._warn_of_another(settings.map_path)
@@ -131,11 +131,11 @@ class MapServices:
     def _check_autosave(map_path: str) -> None:
         if not map_path:
             raise ParameterError("'autosave_map' needs a file in 'map_path'")
-        check_writable(_absolute(map_path))
+        check_writable(absolute(map_path))
 
     def _warn_of_another(self, map_path: str) -> None:
         """Warn that the map of the end will replace one that is not loaded."""
-        path = _absolute(map_path)
+        path = absolute(map_path)
         if self._autosave and self._is_another(path):
             self._node.get_logger().warning(
                 f"'autosave_map' will replace {path}, which is not loaded (map_file); what it "
@@ -170,7 +170,7 @@ class MapServices:
         path: str = self._node.get_parameter('map_path').value
         if not path:
             raise ParameterError("no file is named: set the parameter 'map_path'")
-        return _absolute(path)
+        return absolute(path)
 
     def _save(self, path: Path) -> str:
         estimator = self._estimator
@@ -228,7 +228,8 @@ def _backup(path: Path) -> Path:
     return path.with_name(f'{path.name}~')
 
 
-def _absolute(path: str) -> Path:
+def absolute(path: str) -> Path:
+    """Return a path with ~ expanded; ParameterError where there is no such user."""
     try:
         return Path(path).expanduser().absolute()
     except RuntimeError as error:  # of a user that there is none of

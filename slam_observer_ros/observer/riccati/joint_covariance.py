@@ -10,11 +10,14 @@ S. Bonnabel, *The invariant extended Kalman filter as a stable observer*, 2017).
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import block_diagonal, kalman_update, transpose
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
@@ -24,10 +27,19 @@ class JointCovariance:
 
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         self._axes, self._p = axes, axes.p
-        self.P = calibration.initial_covariance()  # (p + c + k n, p + c + k n) of x
+        self.P = calibration.initial_covariance()
         self.first = len(self.P)  # p + c, the first column of the landmarks
         self._stride = axes.point  # columns of each landmark
         self._first_columns = self.first + np.arange(axes.point)
+
+    @property
+    def P(self) -> FloatArray:  # noqa: N802 (the field's name for it)
+        """(p + c + k n, p + c + k n) covariance of x, as a view."""
+        return self._matrix.values
+
+    @P.setter
+    def P(self, covariance: FloatArray) -> None:  # noqa: N802
+        self._matrix = SymmetricMatrix(covariance)
 
     @property
     def pose(self) -> FloatArray:
@@ -67,17 +79,17 @@ class JointCovariance:
 
     def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
         """Let x become x + J (F c̃ + w), w the noise of a motion, with J's rows of landmarks."""
-        P, c = self.P, slice(self._p, self.first)
-        J = np.zeros((len(P), self._p))  # how a motion of the robot alone changes x
-        J[: self._p] = np.eye(self._p)
-        J[self.first :] = J_landmarks
-        # P + J (…) Jᵀ, by halves that keep it symmetric.
-        growth = 0.5 * motion.noise @ J.T
-        if self._p < self.first:
-            F = motion.sensitivity
-            growth += F @ (P[c] + 0.5 * P[c, c] @ (J @ F).T)
-        half = J @ growth
-        P += half + half.T
+        P, p, c = self.P, self._p, slice(self._p, self.first)
+        JT = np.zeros((p, len(P)))  # how a motion of the robot alone changes x, transposed
+        JT[:, :p] = np.eye(p)
+        JT[:, self.first :] = J_landmarks.T
+        # P + J (F P_c + F P_c,c Fᵀ Jᵀ / 2 + noise Jᵀ / 2) + its transpose.
+        if p == self.first:
+            self._matrix.add_symmetric_product(JT, (0.5 * motion.noise).dot(JT))
+            return
+        F = motion.sensitivity
+        noise = motion.noise + F.dot(P[c, c]).dot(F.T)
+        self._matrix.add_symmetric_product(JT, F.dot(P[c]) + (0.5 * noise).dot(JT))
         P[c, c] += motion.drift
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
@@ -90,8 +102,8 @@ class JointCovariance:
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return H P (m k, …) and H P Hᵀ (m k, m k) of H x = C_i ε − ξ_i, C_i (m, k, p)."""
         C, columns = C.reshape(-1, self._p), self._columns(rows)
-        HP = C @ self.P[: self._p] - self.P[columns]  # rows of P cost less to pick than columns
-        return HP, HP[:, : self._p] @ C.T - HP[:, columns]
+        HP = C.dot(self.P[: self._p]) - self._matrix.rows(columns)
+        return HP, HP[:, : self._p].dot(C.T) - HP.take(columns, axis=1)
 
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
@@ -102,9 +114,21 @@ class JointCovariance:
         """Return the same of all together, (p, m k) and (m k, m k)."""
         return self._output(C.reshape(-1, self._p), self._columns(rows))
 
-    def update(self, HP: FloatArray, S: FloatArray) -> FloatArray:
-        """Update P by what :meth:`project` projected; return the gain K = P Hᵀ S⁻¹."""
-        return kalman_update(self.P, HP, S)
+    def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
+        """Update P by what :meth:`project` projected; return K r, K = P Hᵀ S⁻¹ the gain."""
+        if not len(r):
+            return np.zeros(len(self.P))
+        L, is_indefinite = dpotrf(S, lower=1)
+        if is_indefinite:  # by rounding, where all but nothing was known
+            moved: FloatArray = kalman_update(self.P, HP, S).dot(r)
+            return moved
+        # P − Wᵀ W and Wᵀ z, W = L⁻¹ H P, z = L⁻¹ r, L Lᵀ = S.
+        right = np.empty((len(r), len(self.P) + 1))
+        right[:, :-1], right[:, -1] = HP, r
+        W = dtrsm(1.0, L, right.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        self._matrix.subtract_square(W[:, :-1])
+        Kr: FloatArray = W[:, -1].dot(W[:, :-1])
+        return Kr
 
     # Landmarks
 
@@ -166,11 +190,8 @@ class JointCovariance:
 
     def _make_room(self, m: int) -> IntArray:
         """Append rows and columns for m landmarks; return which landmarks they are."""
-        before, stride = len(self.P), self._stride
-        P = np.zeros((before + m * stride,) * 2)
-        P[:before, :before] = self.P
-        self.P = P
-        first_row = (before - self.first) // stride
+        first_row = (len(self.P) - self.first) // self._stride
+        self._matrix.append_zeros(m * self._stride)
         return np.arange(first_row, first_row + m)
 
     def _columns(self, rows: IntArray) -> IntArray:

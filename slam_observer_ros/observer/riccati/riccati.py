@@ -23,7 +23,7 @@ from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
 from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
 from slam_observer_ros.observer.robust import observation_weights
-from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -60,8 +60,7 @@ class RiccatiFilter(Filter):
         R = R / (weights[passed] / repeated)[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
         HP, HPH = self.joint.project(self.joint.output_matrix(used), used.rows)
-        K = self.joint.update(HP, with_blocks(HPH, R))
-        self._move(-K @ r.ravel())
+        self._move(-self.joint.update(HP, with_blocks(HPH, R), r.ravel()))
         return weights
 
     def distances(self, residuals: Residuals) -> FloatArray:
@@ -129,13 +128,12 @@ class RiccatiFilter(Filter):
         """(c,) variances of what is estimated of the calibration."""
         return self.joint.calibration_variances
 
-    def pose_covariance(self, motion: Motion | None = None) -> FloatArray:
-        """Return the covariance (6, 6) of ε, zero on axes that are not estimated."""
+    def pose_covariance(self, motion: Motion | Passage | None = None) -> FloatArray:
+        """Return the covariance (…, 6, 6) of ε, zero on axes that are not estimated."""
         if motion is None:
             return self.axes.full_pose_covariance(self.joint.pose)
-        P = self.joint.P[: self.joint.first, : self.joint.first].copy()
-        motion.predict(P)
-        return self.axes.full_pose_covariance(P[: self.axes.p, : self.axes.p])
+        P = self.joint.P[: self.joint.first, : self.joint.first]
+        return self.axes.full_pose_covariance(motion.pose_covariance(P))
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
         """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""

@@ -59,7 +59,12 @@ class _Step:
 class ScheduledFilter(Filter):
     """Gains from the covariance of a small core and how each landmark depends on it."""
 
-    ignores = (*OF_CONSTANT_GAINS, 'landmark_velocity_stddev')
+    ignores = (
+        *OF_CONSTANT_GAINS,
+        'landmark_velocity_stddev',
+        'use_tag_orientation',
+        'orientation_noise',
+    )
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)

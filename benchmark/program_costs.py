@@ -1,0 +1,110 @@
+"""What whole programs cost: replay, start-up, and the memory that a landmark takes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import resource
+from statistics import median
+import subprocess
+import sys
+import tempfile
+
+from cost_tables import Table, Tables
+from estimators import EKF
+from step_costs import drive, ESTIMATORS, make, settings_for
+import worlds
+
+TURNS = 5
+LONGEST_S = 300.0
+FEW, MANY, SEEN = 10, 1000, 10  # landmarks, for the memory of one
+COMMAND = [sys.executable, '-m', 'slam_observer_ros.cli.main']
+
+READ = """\
+import sys
+from pathlib import Path
+from rosbags.highlevel import AnyReader
+with AnyReader([Path(sys.argv[1])]) as reader:
+    for connection, _, raw in reader.messages():
+        reader.deserialize(raw, connection.msgtype)
+"""
+"""What it takes to read a recording."""
+
+
+def measure_replay() -> Tables:
+    """Return the CPU time of ``replay --json`` over that of reading the same recording."""
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / 'robot1.mcap'
+        data = worlds.data_folder() / 'mrclam' / 'MRCLAM_Dataset6'
+        run([*COMMAND, 'convert', 'mrclam', '--robot', '1', str(data), str(recording)])
+        read_s, replay_s = take_turns(
+            [sys.executable, '-c', READ, str(recording)],
+            [*COMMAND, 'replay', str(recording), '--json'],
+        )
+    rows: dict[str, list[float | None]] = {'MRCLAM 6, robot 1': [replay_s / read_s, read_s]}
+    return {'replay': Table(columns=['replay --json over read', 'read, s'], rows=rows)}
+
+
+def measure_start() -> Tables:
+    """Return the CPU time of ``slam-observer --help`` over that of importing numpy."""
+    numpy_s, help_s = take_turns([sys.executable, '-c', 'import numpy'], [*COMMAND, '--help'])
+    rows: dict[str, list[float | None]] = {'slam-observer --help': [help_s / numpy_s]}
+    return {'start': Table(columns=['over import numpy'], rows=rows)}
+
+
+def measure_memory() -> Tables:
+    """Return how much memory a landmark takes at most while the robot drives past the others."""
+    grown_kb = {name: (peak_kb(name, MANY) - peak_kb(name, FEW)) / MANY for name in ESTIMATORS}
+    rows: dict[str, list[float | None]] = {
+        name: [value_kb, value_kb / grown_kb[EKF]] for name, value_kb in grown_kb.items()
+    }
+    return {'memory': Table(columns=['kB', f'over the {EKF}'], rows=rows)}
+
+
+def take_turns(first: list[str], second: list[str]) -> tuple[float, float]:
+    """Return the median CPU times of two programs that are run in turns, seconds."""
+    runs = [(cpu_s(first), cpu_s(second)) for _ in range(TURNS)]
+    return median(run[0] for run in runs), median(run[1] for run in runs)
+
+
+def cpu_s(command: list[str]) -> float:
+    """Run a program to its end; return the CPU time of it and its children, seconds."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    run(command)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def peak_kb(name: str, known: int) -> float:
+    """Return the most memory that a process has with an estimator of so many landmarks."""
+    return float(run([sys.executable, __file__, name, str(known)]))
+
+
+def run(command: list[str]) -> str:
+    """Run a program of this checkout, which must succeed in time; return its output."""
+    path = os.pathsep.join([str(worlds.CHECKOUT), os.environ.get('PYTHONPATH', '')])
+    done = subprocess.run(
+        command,
+        check=True,
+        timeout=LONGEST_S,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        cwd=worlds.CHECKOUT,
+        env={**os.environ, 'PYTHONPATH': path},
+    )
+    return done.stdout
+
+
+def _print_peak(name: str, known: int) -> None:
+    estimator = make(name, settings_for(known))
+    start, steps = drive(known, SEEN)
+    for step in (start, *steps):
+        for event in step:
+            estimator.add(event)
+    peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    sys.stdout.write(str(peak_kb))
+
+
+if __name__ == '__main__':
+    _print_peak(sys.argv[1], int(sys.argv[2]))

@@ -1,0 +1,72 @@
+"""``slam-observer config``: parameter files of the package, whole ones, and their schema."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+import json
+import sys
+
+from slam_observer_ros.cli.completion import completed_by
+from slam_observer_ros.cli.options import config_files, find_config, shipped_names
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.settings.dump import parameter_file_text
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+from slam_observer_ros.settings.parameter_file import names_of_others, read_parameter_file
+from slam_observer_ros.settings.parameter_table import Parameter, table, Value
+from slam_observer_ros.settings.schema import parameter_schema
+
+ROWS = (*table(ObserverNodeSettings), *table(Settings))
+"""All parameters of ``observer_node``."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        'Without a name, list the parameter files that come with the package; with one, print it.'
+    )
+    name = parser.add_argument(
+        'name', nargs='?', metavar='NAME', help='a parameter file, or the name of one of those'
+    )
+    completed_by(name, config_files)
+    printed = parser.add_mutually_exclusive_group()
+    printed.add_argument(
+        '--dump',
+        action='store_true',
+        help='print all parameters of observer_node, at the values of NAME or their defaults, and '
+        'what each is',
+    )
+    printed.add_argument(
+        '--schema',
+        action='store_true',
+        help='print a JSON schema of parameter files, with which editors complete and check them',
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Print what was asked for."""
+    sys.stdout.write(_text(args))
+
+
+def _text(args: argparse.Namespace) -> str:
+    if args.schema:
+        if args.name is not None:
+            raise UsageError('--schema is the same for all parameter files; leave NAME out')
+        return json.dumps(parameter_schema(ROWS), indent=2, ensure_ascii=False) + '\n'
+    if args.dump:
+        return parameter_file_text(ROWS, _values(args.name))
+    if args.name is None:
+        return ''.join(f'{name}\n' for name in shipped_names())
+    return find_config(args.name).read_text(encoding='utf-8')
+
+
+def _values(name: str | None) -> Mapping[str, Value]:
+    """Return the values of a parameter file, checked; none without a name."""
+    if name is None:
+        return {}
+    rows: dict[str, Parameter] = {row.name: row for row in ROWS}
+    written = read_parameter_file(find_config(name))
+    others = names_of_others(written, rows)
+    return {key: rows[key].check(value) for key, value in written.items() if key not in others}

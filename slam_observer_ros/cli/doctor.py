@@ -1,0 +1,115 @@
+"""``slam-observer doctor``: what is installed, and what a node makes of the topics alive."""
+
+from __future__ import annotations
+
+import argparse
+from importlib import metadata
+from importlib.util import find_spec
+import json
+import os
+import platform
+import subprocess
+import sys
+from typing import Any
+
+from slam_observer_ros.cli.console import print_json, print_table
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.version import VERSION
+
+LISTENER = 'slam_observer_ros.nodes.live_inputs'
+"""The program that hears topics; it is one of its own, as only ``nodes/`` knows ROS."""
+
+PATIENCE_S = 20.0
+"""Time for that to start and to end, beyond the time of listening."""
+
+MESSAGE_PACKAGES = {
+    'tf2_msgs': 'poses of sensors on /tf',
+    'vision_msgs': 'Detection3DArray',
+    'apriltag_msgs': 'AprilTagDetectionArray',
+}
+
+OPTIONAL_PACKAGES = {
+    'rosbags': 'recordings',
+    'mcap': 'damaged recordings',
+    'matplotlib': 'figures',
+    'rich': 'tables in the terminal',
+    'argcomplete': 'completion in the shell',
+    'rerun-sdk': 'replay --rerun',
+}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        'Say which Python, ROS and packages are found, and which topics with velocities or '
+        'landmarks are alive. Topics are heard for some seconds, in the ROS domain of this shell.'
+    )
+    parser.add_argument(
+        '--seconds', type=float, default=3.0, metavar='S', help='how long to listen (default 3)'
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Look, listen and print."""
+    if not 0.0 < args.seconds <= 3600.0:
+        raise UsageError(f'--seconds takes seconds above 0, up to 3600, not {args.seconds:g}')
+    installed = _installed()
+    has_ros = find_spec('rclpy') is not None
+    topics = _topics(args.seconds) if has_ros else []
+    if args.json:
+        print_json({'installed': installed, 'topics': topics})
+        return
+    print_table('Installed', installed)
+    if not has_ros:
+        return
+    rows = {topic['topic']: topic['text'] for topic in topics}
+    print_table(
+        f'Topics heard for {args.seconds:g} s',
+        rows or {'none': 'with velocities or landmarks; is ROS_DOMAIN_ID that of the robot?'},
+    )
+
+
+def _installed() -> dict[str, str]:
+    found = {
+        'slam_observer_ros': VERSION,
+        'Python': f'{platform.python_version()} ({sys.executable})',
+        'ROS': _ros(),
+    }
+    for package, use in MESSAGE_PACKAGES.items():
+        found[package] = _presence(find_spec(package) is not None, use)
+    for package, use in OPTIONAL_PACKAGES.items():
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = _presence(False, use)
+    return found
+
+
+def _presence(is_there: bool, use: str) -> str:
+    return 'installed' if is_there else f'not installed; it is for {use}'
+
+
+def _ros() -> str:
+    if find_spec('rclpy') is None:
+        return 'not found: recordings and simulations only; source a ROS 2 for the nodes'
+    name = os.environ.get('ROS_DISTRO', 'wheels from PyPI')
+    middleware = os.environ.get('RMW_IMPLEMENTATION', 'the default middleware')
+    return f'{name}, {middleware}, domain {os.environ.get("ROS_DOMAIN_ID", "0")}'
+
+
+def _topics(seconds: float) -> list[dict[str, Any]]:
+    """Return what is heard; a UsageError says why nothing could be."""
+    command = [sys.executable, '-m', LISTENER, f'{seconds:g}']
+    try:
+        ended = subprocess.run(
+            command, capture_output=True, text=True, timeout=seconds + PATIENCE_S, check=True
+        )
+    except subprocess.CalledProcessError as error:
+        reason = (error.stderr.strip().splitlines() or ['no reason given'])[-1]
+        raise UsageError(f'topics could not be heard: {reason}') from error
+    except subprocess.TimeoutExpired as error:
+        raise UsageError('topics could not be heard: ROS did not start') from error
+    heard: list[dict[str, Any]] = json.loads(ended.stdout)
+    return heard

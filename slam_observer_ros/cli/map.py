@@ -1,0 +1,58 @@
+"""``slam-observer map``: maps of other programs."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from slam_observer_ros.cli.console import print_table
+from slam_observer_ros.cli.outputs import add_force_option, check_outputs
+from slam_observer_ros.known_map.map_file import write_map
+from slam_observer_ros.known_map.map_import import import_map
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = 'Make map files for map_file and --load-map.'
+    actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
+    convert = actions.add_parser(
+        'convert',
+        help='make one of a CSV table, of TagSLAM or of a bundle of AprilTags',
+        description='CSV: id, x, y and, if known, z and sigma, with or without these names in '
+        "the first line; TagSLAM: the YAML file of bodies, or its output; apriltag_ros's "
+        'tag_bundles: positions in the frame of the bundle.',
+    )
+    convert.add_argument('file', type=Path, metavar='FILE', help='.csv, .txt or .yaml')
+    convert.add_argument('output', type=Path, metavar='OUT.yaml', help='map file to make')
+    convert.add_argument('--frame', default='map', help='frame of the positions (default map)')
+    convert.add_argument(
+        '--sigma',
+        type=_deviation,
+        default=0.02,
+        metavar='M',
+        help='standard deviation of coordinates that have none, metres (default 0.02)',
+    )
+    add_force_option(convert)
+    convert.set_defaults(run=_run)
+
+
+def _deviation(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text} is no standard deviation')
+    return value
+
+
+def _run(args: argparse.Namespace) -> None:
+    check_outputs([args.output], args.force)
+    landmark_map = import_map(args.file, args.frame, args.sigma)
+    write_map(args.output, landmark_map, None)
+    low, high = landmark_map.world_points.min(axis=0), landmark_map.world_points.max(axis=0)
+    spans = ', '.join(
+        f'{axis} {lo:.2f} to {hi:.2f} m' for axis, lo, hi in zip('xyz', low, high, strict=True)
+    )
+    print_table(str(args.output), {'landmarks': str(len(landmark_map.ids)), 'spans': spans})

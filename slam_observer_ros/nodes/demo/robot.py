@@ -1,0 +1,204 @@
+"""``make robot``: a simulated robot with a camera is localised among tags, as for Nav2.
+
+It drives about a hall with AprilTags on its walls: lost at first, its localisation restarted in
+the middle. Over DDS, the observer is started as ``localization.launch.py`` does it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, ExitStack
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from rich.console import Console
+from rich.progress import Progress
+
+from slam_observer_ros.common.errors import SlamObserverError
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_file import write_map
+from slam_observer_ros.nodes.demo import hall
+from slam_observer_ros.nodes.demo.hall_robot import HallRobot, ODOMETRY_HZ
+from slam_observer_ros.nodes.demo.robot_report import report, Restart
+from slam_observer_ros.nodes.localization_setup import command_line, EXECUTABLE
+from slam_observer_ros.nodes.stop_signal import StopSignal
+from slam_observer_ros.settings.estimator_settings import Settings
+
+PARAMS_FILE = 'config/tags_on_tf.yaml'
+LAUNCH_ARGUMENTS = {'map_file': 'hall.yaml', 'twist': 'odom', 'use_sim_time': 'true'}
+"""Arguments of the launch file, beside ``params_file``."""
+
+RATE_HZ = 20.0
+"""Rate of map → odom that is asked for, in simulated time."""
+
+SURVEY_SIGMA_M = 0.01
+START_LIMIT_S = 60.0
+DISCOVERY_S = 1.0
+STOP_LIMIT_S = 10.0
+END_S = 1.0
+
+
+class RobotError(SlamObserverError):
+    """The run can't be made."""
+
+
+class Observer:
+    """The process of the observer, which can be ended and started again."""
+
+    def __init__(self, folder: Path, real_time_factor: float) -> None:
+        self._log = folder / f'{EXECUTABLE}.log'
+        arguments = LAUNCH_ARGUMENTS | {'map_file': str(folder / LAUNCH_ARGUMENTS['map_file'])}
+        # The rate is one of wall time, in which the simulation is faster.
+        rate = ('-p', f'publish_rate:={RATE_HZ * real_time_factor}')
+        self._command = [
+            *(sys.executable, '-m', f'slam_observer_ros.nodes.{EXECUTABLE}'),
+            *command_line(PARAMS_FILE, arguments),
+            *rate,
+        ]
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it, with its output in a file."""
+        with self._log.open('wb') as output:
+            self._process = subprocess.Popen(
+                self._command, stdout=output, stderr=subprocess.STDOUT
+            )
+
+    @property
+    def hears_robot(self) -> bool:
+        """Whether it has subscribed to odometry and tags; RobotError if it has ended."""
+        if self._process is None or self._process.poll() is not None:
+            raise RobotError(f'the observer has ended; see {self._log}')
+        text = self._log.read_text(encoding='utf-8', errors='replace')
+        return "Odometry on '/odom'" in text and "TFMessage on '/tf'" in text
+
+    def end(self) -> None:
+        """End it, whatever it does."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Make the run; return 0 if the robot was localised as well as it should be."""
+    options = _parser().parse_args(args)
+    console = Console(highlight=False)
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    try:
+        with tempfile.TemporaryDirectory(prefix='slam_observer_robot_') as name:
+            robot, restart = _run(options, Path(name), console)
+        return 0 if report(robot, restart, RATE_HZ, console) else 1
+    except SlamObserverError as error:
+        console.print(f'robot: {error}', style='red', markup=False)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='robot', description=(__doc__ or '').splitlines()[0])
+    parser.add_argument(
+        '--duration', type=float, default=300.0, help='simulated seconds (default 300)'
+    )
+    parser.add_argument(
+        '--real-time-factor',
+        type=float,
+        default=2.0,
+        help='simulated seconds a second (default 2)',
+    )
+    parser.add_argument('--seed', type=int, default=0, help='of what is random (default 0)')
+    return parser
+
+
+def _run(options: argparse.Namespace, folder: Path, console: Console) -> tuple[HallRobot, Restart]:
+    """Drive, restarting the observer half-way."""
+    stop = StopSignal()
+    stop.begin()
+    write_map(folder / LAUNCH_ARGUMENTS['map_file'], _surveyed(options.seed), Settings())
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    with ExitStack() as cleanup:
+        cleanup.callback(rclpy.try_shutdown)
+        robot = HallRobot(options.seed)
+        cleanup.callback(robot.destroy_node)
+        cleanup.enter_context(_listening(robot))
+        observer = Observer(folder, options.real_time_factor)
+        cleanup.callback(observer.end)
+        observer.start()
+        _wait_until_heard(robot, observer)
+        restart = Restart(options.duration / 2.0)
+        progress = cleanup.enter_context(Progress(console=console, transient=True))
+        task = progress.add_task('driving', total=options.duration)
+        due_s = time.monotonic()
+        for _ in range(round(options.duration * ODOMETRY_HZ)):
+            if stop.is_set:
+                raise RobotError('interrupted')
+            robot.step()
+            progress.update(task, completed=robot.time_s)
+            due_s += 1.0 / (ODOMETRY_HZ * options.real_time_factor)
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            if restart.ended_s is None and robot.time_s >= restart.planned_s:
+                _restart(robot, observer, restart)
+                due_s = time.monotonic()
+            if restart.localised_s is None and restart.ended_s and robot.is_localised:
+                restart.localised_s = robot.time_s
+        time.sleep(END_S)
+    return robot, restart
+
+
+def _surveyed(seed: int) -> LandmarkMap:
+    """Return the tags as somebody has measured them with a tape."""
+    points = hall.tag_poses()[:, :3, 3]
+    off = np.random.default_rng(seed + 1).normal(0.0, SURVEY_SIGMA_M, points.shape)
+    count = len(points)
+    covariances = np.tile(SURVEY_SIGMA_M**2 * np.eye(3), (count, 1, 1))
+    return LandmarkMap(np.arange(count), points + off, covariances, np.zeros(count, np.int64))
+
+
+def _wait_until_heard(robot: HallRobot, observer: Observer) -> None:
+    limit_s = time.monotonic() + START_LIMIT_S
+    while not (observer.hears_robot and robot.is_heard):
+        if time.monotonic() > limit_s:
+            raise RobotError(f'the observer does not start within {START_LIMIT_S:g} s')
+        time.sleep(0.05)
+    time.sleep(DISCOVERY_S)
+
+
+@contextmanager
+def _listening(robot: HallRobot) -> Iterator[None]:
+    """Handle messages in a thread of their own, or they would wait for the robot's next step."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(robot)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        executor.shutdown()
+        thread.join(STOP_LIMIT_S)
+
+
+def _restart(robot: HallRobot, observer: Observer, restart: Restart) -> None:
+    """End the observer and start it again; the robot's time stands still meanwhile."""
+    restart.ended_s = robot.time_s
+    observer.end()
+    time.sleep(DISCOVERY_S)
+    robot.forget_correction()
+    observer.start()
+    _wait_until_heard(robot, observer)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

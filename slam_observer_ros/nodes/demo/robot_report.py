@@ -1,0 +1,97 @@
+"""How well the simulated robot was localised, as Nav2 would have seen it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+
+from slam_observer_ros.common.tables import table_of
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.nodes.demo.hall_robot import error_of, Estimated, HallRobot, Seen
+
+ENOUGH_TAGS = 2  # from which position and heading in the plane follow
+MAX_ERROR_M, MAX_ERROR_RAD = 0.15, 0.08  # of the RMS; with the noise of the hall it is a third
+MAX_BACK_S = 1.0
+MIN_RATE = 0.8  # of what is asked for, on a machine with other work
+
+
+@dataclass
+class Restart:
+    """Simulated times of the observer's end and return, seconds; None until then."""
+
+    planned_s: float
+    ended_s: float | None = None
+    localised_s: float | None = None
+
+    def back_after_s(self, seen: list[Seen]) -> float | None:
+        """Return how long after enough tags were in view map → odom was there; None if never."""
+        ended_s, localised_s = self.ended_s, self.localised_s
+        if ended_s is None or localised_s is None:
+            return None
+        times = (s.time_s for s in seen if s.time_s > ended_s and s.tags >= ENOUGH_TAGS)
+        return max(0.0, localised_s - next(times, localised_s))
+
+
+def report(robot: HallRobot, restart: Restart, rate_hz: float, console: Console) -> bool:
+    """Print what came of the run; return whether it is as it should be."""
+    located = [(each.truth, each.by_tf) for each in robot.seen if each.by_tf is not None]
+    if not located or not robot.estimated:
+        console.print('robot: it was never localised', style='red')
+        return False
+    errors = np.array([error_of(*poses) for poses in located])
+    position_m, heading_rad = _rms(errors[:, :2]), _rms(errors[:, 2:])
+    sigma_m, sigma_rad, anees = _consistency(robot.estimated)
+    first_tags_s = next(each.time_s for each in robot.seen if each.tags >= ENOUGH_TAGS)
+    back_s = restart.back_after_s(robot.seen)
+    reached_hz = _rate_hz(robot.corrections_s)
+    console.print(
+        table_of(
+            f'{robot.time_s:g} s in a hall with {max(e.tags for e in robot.seen)} tags in view '
+            'at most',
+            {
+                'lost until': f'{robot.corrections_s[0] - first_tags_s:.2f} s after the first '
+                f'{ENOUGH_TAGS} tags in view',
+                'map → odom': f'{reached_hz:.1f} a second, of {rate_hz:g} asked for',
+                'position error by /tf': f'{position_m:.3f} m RMS, '
+                f'{np.linalg.norm(errors[:, :2], axis=1).max():.3f} m at most; σ {sigma_m:.3f} m',
+                'heading error by /tf': f'{heading_rad:.4f} rad RMS, '
+                f'{np.abs(errors[:, 2]).max():.4f} rad at most; σ {sigma_rad:.4f} rad',
+                'ANEES of amcl_pose': f'{anees:.2f} (1 is consistent)',
+                f'restarted at {restart.planned_s:g} s': 'not localised again'
+                if back_s is None
+                else f'localised again {back_s:.2f} s after the next {ENOUGH_TAGS} tags',
+            },
+        )
+    )
+    is_good = (
+        position_m < MAX_ERROR_M
+        and heading_rad < MAX_ERROR_RAD
+        and reached_hz > MIN_RATE * rate_hz
+        and back_s is not None
+        and back_s <= MAX_BACK_S
+    )
+    console.print('The robot was localised.' if is_good else 'That is not as it should be.')
+    return is_good
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def _consistency(estimated: list[Estimated]) -> tuple[float, float, float]:
+    """Return mean σ of position and heading, and the ANEES in the plane."""
+    planar = np.ix_([0, 1, 5], [0, 1, 5])
+    covariances = np.array([each.covariance[planar] for each in estimated])
+    errors = np.array([error_of(each.truth, each.pose) for each in estimated])
+    nees = np.einsum('ni,ni->n', errors, np.linalg.solve(covariances, errors[:, :, None])[..., 0])
+    variances = np.trace(covariances[:, :2, :2], axis1=1, axis2=2)
+    sigma_rad = np.sqrt(covariances[:, 2, 2]).mean()
+    return float(np.sqrt(variances).mean()), float(sigma_rad), float(nees.mean() / 3.0)
+
+
+def _rate_hz(times_s: list[float]) -> float:
+    """Return the median rate over whole seconds in which any came: not those of a restart."""
+    counts = np.bincount(np.array(times_s).astype(int))
+    return float(np.median(counts[counts > 0]))

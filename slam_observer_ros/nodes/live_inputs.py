@@ -1,0 +1,158 @@
+"""What the topics that are alive carry, and what a node would make of them, as JSON.
+
+The program of ``slam-observer doctor``: ``python -m slam_observer_ros.nodes.live_inputs SECONDS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+import json
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from slam_observer_ros.common.errors import MessageError, ParameterError
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.messages.detections import decode_apriltags
+from slam_observer_ros.messages.message_types import (
+    APRILTAGS,
+    CLOUD_DECODERS,
+    DETECTION_DECODERS,
+    IMU,
+    TRANSFORMS,
+    VELOCITY_DECODERS,
+)
+from slam_observer_ros.messages.poses_and_velocities import decode_imu
+from slam_observer_ros.nodes.message_classes import message_class
+
+DISCOVERY_S = 1.0
+"""Time after which publishers have been found."""
+
+ROLES: dict[str, tuple[str, str]] = {
+    **dict.fromkeys(VELOCITY_DECODERS, ('twist', '')),
+    IMU: ('imu', 'use_imu:=true'),
+    **dict.fromkeys(CLOUD_DECODERS, ('landmarks', '')),
+    **{
+        name: ('landmarks', f'landmarks_type:={name.rpartition("/")[2]}')
+        for name in (*DETECTION_DECODERS, APRILTAGS)
+    },
+    TRANSFORMS: ('/tf', ''),
+}
+"""Types of messages: the node's topic for them, and what has to be set."""
+
+_DECODERS: dict[str, Callable[[bytes, int], Any]] = {
+    **VELOCITY_DECODERS,
+    IMU: decode_imu,
+    **CLOUD_DECODERS,
+    **DETECTION_DECODERS,
+    APRILTAGS: decode_apriltags,
+}
+
+
+@dataclass
+class HeardTopic:
+    """A topic that a node could use, and what was heard on it."""
+
+    name: str
+    type_name: str
+    problem: str = ''
+    messages: int = 0
+    last: bytes = b''
+
+    def take(self, raw: bytes) -> None:
+        """Take in a message."""
+        self.messages += 1
+        self.last = raw
+
+    def text(self, seconds: float) -> str:
+        """Say what comes at which rate, and how the node gets it."""
+        role, setting = ROLES[self.type_name]
+        remapping = '' if self.name == f'/{role.lstrip("/")}' else f'-r {role}:={self.name}'
+        needed = ' '.join(part for part in (remapping, setting and f'-p {setting}') if part)
+        rate = f'{self.messages / seconds:.1f} Hz' if self.messages else 'no message'
+        found = [self.type_name, rate, self.problem or self._content()]
+        found.append(f'as {role}' + (f' with {needed}' if needed else ''))
+        return ', '.join(part for part in found if part)
+
+    def _content(self) -> str:
+        decode = _DECODERS.get(self.type_name)
+        if not self.messages or decode is None:
+            return ''
+        try:
+            measurement = decode(self.last, time.time_ns())
+        except MessageError as error:
+            return f"can't be used: {error}"
+        frame = f"in '{measurement.frame_id}'" if measurement.frame_id else 'without a frame'
+        event = getattr(measurement, 'event', None)
+        if not isinstance(event, ObservationEvent):
+            return frame
+        named = int(np.count_nonzero(event.ids != UNKNOWN_ID))
+        return f'{len(event.ids)} points, {named} with an id, {frame}'
+
+
+def main() -> int:
+    """Listen for the seconds that are given, and print what was heard."""
+    seconds = float(sys.argv[1])
+    rclpy.init(args=['--ros-args', '--log-level', 'fatal'])
+    node = rclpy.create_node('slam_observer_doctor', enable_rosout=False)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        _spin(executor, DISCOVERY_S)
+        topics = list(_usable_topics(node))
+        for topic in topics:
+            _subscribe(node, topic)
+        _spin(executor, seconds)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    heard = [
+        {
+            'topic': topic.name,
+            'type': topic.type_name,
+            'role': ROLES[topic.type_name][0],
+            'rate_hz': topic.messages / seconds,
+            'text': topic.text(seconds),
+        }
+        for topic in topics
+    ]
+    sys.stdout.write(json.dumps(heard) + '\n')
+    return 0
+
+
+def _spin(executor: SingleThreadedExecutor, seconds: float) -> None:
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        executor.spin_once(timeout_sec=left_s)
+
+
+def _usable_topics(node: Node) -> Iterator[HeardTopic]:
+    """Yield the topics that somebody publishes with a type that the node reads."""
+    for name, types in sorted(node.get_topic_names_and_types()):
+        for type_name in types:
+            if type_name in ROLES and node.count_publishers(name):
+                yield HeardTopic(name, type_name)
+
+
+def _subscribe(node: Node, topic: HeardTopic) -> None:
+    qos = QoSProfile(
+        depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT
+    )
+    try:
+        kind = message_class(topic.type_name)
+    except ParameterError as error:
+        topic.problem = str(error)
+        return
+    node.create_subscription(kind, topic.name, topic.take, qos, raw=True)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

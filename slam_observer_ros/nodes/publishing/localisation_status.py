@@ -1,0 +1,137 @@
+"""Whether the robot knows where it is: for /diagnostics, and for behaviour trees."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+import numpy as np
+from rclpy.node import Node
+from std_msgs.msg import Bool
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import Update
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+RECENT = 300  # observations over which innovations are compared with the noise that is stated
+MIN_DEGREES = 100  # of freedom, that it takes to say so; the factor is then known to 7 %
+TOO_SMALL = 2.0  # times as large as stated: neither chance nor a sensor's usual correlation
+
+
+class NoiseFit:
+    """Compares the innovations of late with the noise that is stated."""
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[float, int]] = deque(maxlen=RECENT)
+
+    def add(self, update: Update) -> None:
+        """Count an observation, if the gains know what was to be expected of it."""
+        innovation = update.innovation
+        if innovation is not None and innovation.nis is not None:
+            self._recent.append((innovation.nis, innovation.degrees_of_freedom))
+
+    @property
+    def factor(self) -> float | None:
+        """How many times as large as stated innovations are; None while that is not known."""
+        degrees = sum(each for _, each in self._recent)
+        if degrees < MIN_DEGREES:
+            return None
+        return float(np.sqrt(sum(nis for nis, _ in self._recent) / degrees))
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the noise that is stated; empty if nothing is."""
+        factor = self.factor
+        if factor is None or factor <= TOO_SMALL:
+            return ''
+        return f'the stated noise is too small by a factor of {factor:.1f}'
+
+    def __str__(self) -> str:
+        factor = self.factor
+        if factor is None:
+            return 'not known yet'
+        hint = f' (the stated noise is too large by {1.0 / factor:.1f})' if factor < 0.5 else ''
+        return f'{factor:.2f}{hint}'
+
+
+class LocalisationStatus:
+    """Judges the standard deviations of position and heading; publishes ``~/is_localised``."""
+
+    def __init__(
+        self, node: Node, settings: ObserverNodeSettings, estimator: Estimator, noise: NoiseFit
+    ) -> None:
+        self._node = node
+        self._settings = settings
+        self._estimator = estimator
+        self._noise = noise
+        self._is_localised: bool | None = None
+        self._publisher = node.create_publisher(Bool, '~/is_localised', LATCHED_QOS)
+
+    def publish(self) -> None:
+        """Publish whether the robot is localised, if that has changed."""
+        level, _ = self._judge(self._deviations())
+        is_localised = level != DiagnosticStatus.ERROR and self._estimator.stamp_ns is not None
+        if is_localised != self._is_localised:
+            self._is_localised = is_localised
+            self._publisher.publish(Bool(data=is_localised))
+
+    def status(self, hardware_id: str) -> DiagnosticStatus:
+        """Return the status for /diagnostics."""
+        deviations = self._deviations()
+        level, message = self._judge(deviations)
+        if self._noise.problem:
+            level = max(level, DiagnosticStatus.WARN)
+            message = f'{message}; {self._noise.problem}'
+        known = ('unknown', 'unknown') if deviations is None else [f'{d:.3f}' for d in deviations]
+        values = {
+            'position, standard deviation [m]': known[0],
+            'heading, standard deviation [rad]': known[1],
+            'innovations / stated noise': str(self._noise),
+        }
+        return DiagnosticStatus(
+            level=level,
+            name=f'{self._node.get_fully_qualified_name().lstrip("/")}: localisation',
+            hardware_id=hardware_id,
+            message=message,
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+
+    def _deviations(self) -> tuple[float, float] | None:
+        """Return standard deviations of position, m, and heading, rad; None if not known."""
+        if self._estimator.stamp_ns is None:
+            return None
+        covariance = self._estimator.pose_covariance
+        return None if covariance is None else deviations(covariance)
+
+    def _judge(self, deviations: tuple[float, float] | None) -> tuple[bytes, str]:
+        """Return level and message."""
+        settings, estimator = self._settings, self._estimator
+        if estimator.stamp_ns is None:
+            return DiagnosticStatus.WARN, 'no estimate yet'
+        if not estimator.is_localised:
+            return DiagnosticStatus.ERROR, 'the pose in the loaded map is not known'
+        if deviations is None:
+            return DiagnosticStatus.OK, 'localised; the gains know no standard deviation'
+        position_m, heading_rad = deviations
+        worst, reasons = DiagnosticStatus.OK, []
+        for name, value, unit, warn, error in (
+            ('position', position_m, 'm', settings.position_warn, settings.position_error),
+            ('heading', heading_rad, 'rad', settings.heading_warn, settings.heading_error),
+        ):
+            if value > min(warn, error):
+                worst = max(
+                    worst, DiagnosticStatus.ERROR if value > error else DiagnosticStatus.WARN
+                )
+                reasons.append(f'{name} uncertain: σ = {value:.2f} {unit}')
+        return worst, '; '.join(reasons) or 'localised'
+
+
+def deviations(covariance: FloatArray) -> tuple[float, float]:
+    """Return standard deviations of position, in its worst direction, m, and of heading, rad.
+
+    ``covariance`` (6, 6) is that of rotation vector and position along the map's axes.
+    """
+    position_m2 = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+    return float(np.sqrt(max(position_m2, 0.0))), float(np.sqrt(max(covariance[2, 2], 0.0)))

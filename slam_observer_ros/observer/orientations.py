@@ -1,0 +1,80 @@
+"""Orientations of those landmarks that have one, as tags do, and what is seen of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry import so3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenOrientations:
+    """How the tags of m landmarks are turned that were seen at one instant, body frame."""
+
+    rows: IntArray  # (m,) which landmarks
+    Z: FloatArray  # (m, 3, 3) from the tag's own axes
+    flipped: FloatArray  # (m, 3, 3) the other orientation that looks nearly the same
+    covariances: FloatArray  # (m, 3, 3) of rotation vectors along the body's axes, rad²
+    dt_s: FloatArray  # (m,) seconds since each was seen before, in this run; else infinite
+
+    def select(self, mask: BoolArray) -> SeenOrientations:
+        """Return the part of it that ``mask`` (m,) picks."""
+        return SeenOrientations(
+            self.rows[mask],
+            self.Z[mask],
+            self.flipped[mask],
+            self.covariances[mask],
+            self.dt_s[mask],
+        )
+
+
+class LandmarkOrientations:
+    """B̂_i of n landmarks in the frame of P°, all zero for those that have none (yet)."""
+
+    def __init__(self) -> None:
+        self.B: FloatArray = np.empty((0, 3, 3))
+        # (n,) how often each was seen and accepted, and rejections in a row up to now
+        self.counts: IntArray = np.empty(0, dtype=np.int64)
+        self.rejections: IntArray = np.empty(0, dtype=np.int64)
+
+    @property
+    def are_known(self) -> BoolArray:
+        """(n,) which landmarks have an orientation."""
+        return np.asarray(self.B.any(axis=(1, 2)))
+
+    def add(self, m: int) -> None:
+        """Append landmarks without orientation."""
+        self.B = np.concatenate([self.B, np.zeros((m, 3, 3))])
+        self.counts = np.append(self.counts, np.zeros(m, dtype=np.int64))
+        self.rejections = np.append(self.rejections, np.zeros(m, dtype=np.int64))
+
+    def put(self, rows: IntArray, B: FloatArray) -> None:
+        """Let landmarks have orientations (m, 3, 3), seen once."""
+        self.B[rows], self.counts[rows], self.rejections[rows] = B, 1, 0
+
+    def clear(self, rows: IntArray) -> None:
+        """Let landmarks have no orientation."""
+        self.B[rows] = 0.0
+
+    def remove(self, rows: IntArray) -> None:
+        """Delete landmarks; those behind move up."""
+        self.B = np.delete(self.B, rows, axis=0)
+        self.counts = np.delete(self.counts, rows)
+        self.rejections = np.delete(self.rejections, rows)
+
+    def turn(self, omega: FloatArray) -> None:
+        """Turn all of them, B̂_i ← exp(ω_i) B̂_i, by rotation vectors (n, 3)."""
+        self.B = so3.exp(omega) @ self.B
+
+    def count(self, rows: IntArray, accepted: BoolArray) -> None:
+        """Count which orientations (m,) were accepted; all others were rejected."""
+        self.counts[rows] += accepted
+        self.rejections[rows] = np.where(accepted, 0, self.rejections[rows] + 1)
+
+    def in_doubt(self, rows: IntArray, max_rejections: int) -> BoolArray:
+        """Return which of the rows (m,) are rejected so often that the first one was wrong."""
+        needed = np.minimum(self.counts[rows] + 1, max_rejections)
+        return np.asarray(self.rejections[rows] >= needed)

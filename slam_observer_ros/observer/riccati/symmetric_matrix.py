@@ -1,0 +1,74 @@
+"""A symmetric matrix that grows with the map, and is changed in place by products of few rows.
+
+BLAS changes one triangle, at half the cost of a product of whole matrices and without a temporary
+one; then the other is its mirror image, to the bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.blas import dsyr2k, dsyrk
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+
+GROWTH = 1.125
+"""How many times as large the storage becomes once it is full."""
+
+_BLOCK = 128
+_LOWER = np.tril(np.ones((_BLOCK, _BLOCK), dtype=np.bool_), -1)
+
+
+class SymmetricMatrix:
+    """Values (N, N), and room for some more rows and columns, which is zero."""
+
+    def __init__(self, values: FloatArray) -> None:
+        self._storage: FloatArray = np.array(values, order='C')
+        self._size = len(values)
+
+    @property
+    def values(self) -> FloatArray:
+        """(N, N) the matrix, as a view that may be written to, symmetrically."""
+        return self._storage[: self._size, : self._size]
+
+    def rows(self, numbers: IntArray) -> FloatArray:
+        """Return some of its rows (q, N); as the matrix is symmetric, its columns transposed."""
+        # Of the storage, which is contiguous: of a view NumPy would copy all first.
+        return self._storage.take(numbers, axis=0)[:, : self._size]
+
+    def append_zeros(self, count: int) -> None:
+        """Append rows and columns."""
+        size = self._size + count
+        if size > len(self._storage):
+            roomy = np.zeros((max(size, int(GROWTH * self._size)),) * 2)
+            roomy[: self._size, : self._size] = self.values
+            self._storage = roomy
+        self._size = size
+
+    def subtract_square(self, W: FloatArray) -> None:
+        """Subtract Wᵀ W for W (q, N)."""
+        wide = self._widened(W).T
+        dsyrk(-1.0, wide, beta=1.0, c=self._storage.T, lower=1, overwrite_c=1)
+        self._mirror()
+
+    def add_symmetric_product(self, A: FloatArray, B: FloatArray) -> None:
+        """Add Aᵀ B + Bᵀ A for A and B (q, N)."""
+        A, B = self._widened(A).T, self._widened(B).T
+        dsyr2k(1.0, A, B, beta=1.0, c=self._storage.T, lower=1, overwrite_c=1)
+        self._mirror()
+
+    def _widened(self, rows: FloatArray) -> FloatArray:
+        """Return rows (q, N) with zeros for the room that is left."""
+        if len(self._storage) == self._size:
+            return np.ascontiguousarray(rows)
+        wide = np.zeros((len(rows), len(self._storage)))
+        wide[:, : self._size] = rows
+        return wide
+
+    def _mirror(self) -> None:
+        """Copy the upper triangle, the one that BLAS takes for a lower one, to the lower one."""
+        M, size = self._storage, self._size
+        for begin in range(0, size, _BLOCK):
+            end = min(begin + _BLOCK, size)
+            M[end:size, begin:end] = M[begin:end, end:size].T
+            block = M[begin:end, begin:end]
+            np.copyto(block, block.T, where=_LOWER[: end - begin, : end - begin])

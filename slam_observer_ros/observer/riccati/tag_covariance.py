@@ -1,0 +1,90 @@
+"""The joint covariance where landmarks may have orientations, as tags do.
+
+The errors are x = (ε, c̃, (ξ_1, ω_1) … ), with B̂_i = exp(ω_i) B_i of the tag's orientation in the
+reference frame. No motion changes ω_i, and what is seen of it, R_Â Z_i B̂_iᵀ = exp(φ_i), says
+φ_i = ε_Ω − ω_i, whatever the map is: the group is :mod:`slam_observer_ros.geometry.tag_group`.
+A landmark that has no orientation has columns of which nothing is ever used.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.matrices import block_diagonal
+from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
+from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.motion import Motion
+
+
+class TagCovariance(JointCovariance):
+    """P with columns for orientations, too."""
+
+    def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
+        super().__init__(axes, calibration)
+        self._stride = axes.point + axes.turn
+
+    def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """Return ξ_i (n, 3) of x; velocities are not estimated."""
+        parts = x[self.first :].reshape(-1, self._stride)
+        return self._axes.full_points(parts[:, : self._axes.point]), None
+
+    def turns(self, x: FloatArray) -> FloatArray:
+        """Return ω_i (n, 3) of x, rad."""
+        parts = x[self.first :].reshape(-1, self._stride)
+        return self._axes.full_turns(parts[:, self._axes.point :])
+
+    def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
+        """Let the robot move; no tag turns."""
+        self._propagate(motion, self._all_turning(points))
+
+    def gauge(self, n: int) -> FloatArray:
+        """Return G (…, p): a motion of everything turns the tags with it."""
+        G, q = super().gauge(n), self._axes.turn
+        G[self._turn_columns(np.arange(n)), :q] = np.tile(np.eye(q), (n, 1))
+        return G
+
+    def add_turns(self, rows: IntArray, covariances: FloatArray) -> None:
+        """Take over orientations (m,) seen for the first time: ω_i = ε_Ω + noise (m, q, q)."""
+        columns, q = self._turn_columns(rows), self._axes.turn
+        of_pose = np.tile(self.P[:q], (len(rows), 1))
+        self.P[columns], self.P[:, columns] = of_pose, of_pose.T
+        own = np.tile(of_pose[:, :q], len(rows)) + block_diagonal(covariances)
+        self.P[np.ix_(columns, columns)] = 0.5 * (own + own.T)
+
+    def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
+        """Take over orientations (m,) whose errors (m, q, q) are independent of all else."""
+        columns = self._turn_columns(rows)
+        self.P[columns] = self.P[:, columns] = 0.0
+        self.P[np.ix_(columns, columns)] = block_diagonal(covariances)
+
+    def project_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω − ω_i."""
+        columns, q = self._turn_columns(rows), self._axes.turn
+        HP = np.tile(self.P[:q], (len(rows), 1)) - self.P[columns]
+        return HP, np.tile(HP[:, :q], len(rows)) - HP[:, columns]
+
+    def project_own_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same of ω_i alone."""
+        columns = self._turn_columns(rows)
+        return self.P[columns], self.P[np.ix_(columns, columns)]
+
+    def _turn_columns(self, rows: IntArray) -> IntArray:
+        first = self.first + self._axes.point + np.arange(self._axes.turn)
+        return (first + self._stride * rows[:, None]).ravel()
+
+    def _all_turning(self, points: FloatArray) -> FloatArray:
+        blocks = self._turning(points)
+        none = np.zeros((len(points), self._axes.turn, self._p))
+        return np.concatenate([blocks, none], axis=1).reshape(-1, self._p)
+
+
+class ExactTagMapCovariance(ExactMapCovariance, TagCovariance):
+    """P of (ε, c̃) alone, in a map whose orientations are exact as well: φ_i = ε_Ω."""
+
+    def project_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω."""
+        q = self._axes.turn
+        HP = np.tile(self.P[:q], (len(rows), 1))
+        return HP, np.tile(HP[:, :q], len(rows))

@@ -1,0 +1,129 @@
+"""The Riccati filter for landmarks that may have orientations, as tags do.
+
+Points correct it as ever. Then the orientations seen do, by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the
+coordinates of :mod:`.tag_covariance` that is H x with a constant H, too. Both noises are taken to
+be independent, so one after the other is the same as both at once. Covariances (m, 3, 3) are those
+of rotation vectors, rad².
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry import so3
+from slam_observer_ros.geometry.matrices import transpose, with_blocks
+from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
+from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.tag_covariance import ExactTagMapCovariance, TagCovariance
+from slam_observer_ros.observer.robust import distances, observation_weights
+from slam_observer_ros.sensor_models.observation_noise import repetition_factors
+from slam_observer_ros.settings.estimator_settings import Settings
+
+FLIP_EVIDENCE = 9.0
+"""By how much less, as −2 ln of likelihood, what is seen must cost than its flipped twin."""
+
+FLIP_DISTANCE = 3.0
+"""Standard deviations of the sensor's noise within which a flip does no harm."""
+
+
+class RiccatiTagFilter(RiccatiFilter):
+    """Gains from the full covariance of pose, calibration, landmarks and their orientations."""
+
+    orientations: LandmarkOrientations
+    joint: TagCovariance
+
+    def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
+        super().__init__(settings, reference_pose)
+        self.joint = TagCovariance(self.axes, self.calibration)
+        self.orientations = LandmarkOrientations()
+
+    def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
+        """Move the state by what is seen of known orientations.
+
+        Return the weight (m,) of each, and which of them are left out as they, and their flipped
+        twins, are both likely.
+        """
+        phi, R = self._turns(seen.rows, seen.Z), self._noise(seen.covariances)
+        _, predicted = self.joint.project_turns(seen.rows)
+        # Which of the two that look alike it is; a gate; then Huber's weights.
+        are_flipped, are_unclear = self._judge_flips(seen, phi, predicted, R)
+        kept = ~(are_flipped | are_unclear)
+        entries = np.flatnonzero(np.repeat(kept, phi.shape[1]))
+        weights = np.zeros(len(phi))
+        weights[kept] = observation_weights(
+            phi[kept], predicted[np.ix_(entries, entries)], R[kept], self._settings
+        )
+        # K = P Hᵀ S⁻¹, X̂ ← exp(−K φ) · X̂
+        used = weights > 0.0
+        if used.any():
+            repeated = repetition_factors(
+                seen.dt_s[used], self._settings.observation_correlation_time
+            )
+            HP, HPH = self.joint.project_turns(seen.rows[used])
+            S = with_blocks(HPH, R[used] / (weights[used] / repeated)[:, None, None])
+            self._move(-self.joint.update(HP, S, phi[used].ravel()))
+        return weights, are_unclear
+
+    def add_orientations(self, seen: SeenOrientations) -> None:
+        """Take over orientations as they are seen, for those of which nothing is known."""
+        self.orientations.put(seen.rows, self.observer.A[:3, :3] @ seen.Z)
+        self.joint.add_turns(seen.rows, self._noise(seen.covariances))
+
+    def _turns(self, rows: IntArray, Z: FloatArray) -> FloatArray:
+        """Return φ_i (m, q), rad, of orientations ``Z`` (m, 3, 3) seen, body frame."""
+        R_hat = self.observer.A[:3, :3]
+        return self.axes.turns(so3.log(R_hat @ Z @ transpose(self.orientations.B[rows])))
+
+    def _noise(self, covariances: FloatArray) -> FloatArray:
+        """Return covariances of the body frame (m, q, q) along the reference frame's axes."""
+        return self.axes.turn_covariances(self.observer.turned(covariances))
+
+    def _judge_flips(
+        self, seen: SeenOrientations, phi: FloatArray, predicted: FloatArray, R: FloatArray
+    ) -> tuple[BoolArray, BoolArray]:
+        """Return which (m,) are less likely than their twins, and which hardly likelier.
+
+        Those that are as good as their twins are neither.
+        """
+        twins = self._turns(seen.rows, seen.flipped)
+        evidence = distances(twins, predicted, R) ** 2 - distances(phi, predicted, R) ** 2
+        R_hat = self.observer.A[:3, :3]
+        apart = self.axes.turns(so3.log(R_hat @ seen.Z @ transpose(R_hat @ seen.flipped)))
+        differ = distances(apart, np.zeros_like(predicted), R) > FLIP_DISTANCE
+        are_flipped = differ & (evidence < 0.0)
+        return are_flipped, differ & ~are_flipped & (evidence < FLIP_EVIDENCE)
+
+    # Landmarks
+
+    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks seen for the first time, as yet without orientation."""
+        super().add(points, covariances)
+        self.orientations.add(len(points))
+
+    def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks of a map, as yet without orientation."""
+        super().add_known(y_ref, covariances)
+        self.orientations.add(len(y_ref))
+
+    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+        """Take landmarks for new ones, without orientation."""
+        super().relocate(rows, points, covariances)
+        self.orientations.clear(rows)
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget the landmarks at ``rows``."""
+        super().remove(rows)
+        self.orientations.remove(rows)
+
+    def fix_landmarks(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+        """Take all landmarks for exact, and their orientations."""
+        joint = ExactTagMapCovariance(self.axes, self.joint, covariances)
+        super().fix_landmarks(y_ref, covariances)
+        self.joint = joint
+
+    def _move(self, x: FloatArray) -> None:
+        """Move the state by exp(x), and the orientations: B̂_i ← exp(ω_i) B̂_i."""
+        super()._move(x)
+        if len(x) > self.joint.first:  # else they are exact
+            self.orientations.turn(self.joint.turns(x))

@@ -1,0 +1,80 @@
+"""How the orientations of tags that are seen are used: before their positions, or as new ones.
+
+Before, as a position is linear in the heading's error only if that is small: a tag's orientation
+corrects it directly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.observer.orientations import SeenOrientations
+from slam_observer_ros.state.matching import MatchedObservation, residuals_of
+from slam_observer_ros.state.state import State
+
+_NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
+
+
+def correct_by_orientations(state: State, matched: MatchedObservation) -> MatchedObservation:
+    """Correct a state by known orientations; return the observation with its residuals since.
+
+    Of points that are too far off to be used orientations are not, either. An orientation that is
+    rejected leaves its landmark a point, as seen this time.
+    """
+    tags, event, rows = state.filter.orientations, matched.known, matched.residuals.rows
+    if tags is None or event.orientations is None or not len(rows):
+        return matched
+    gate = state.settings.rejection_threshold
+    are_near = state.filter.distances(matched.residuals) <= gate
+    seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
+    if not len(seen.rows):
+        return matched
+    weights, are_unclear = state.filter.correct_by_orientations(seen)
+    judged = ~are_unclear
+    tags.count(seen.rows[judged], weights[judged] > 0.0)
+    state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
+    covariances = matched.covariances[matched.rows >= 0]
+    return replace(matched, residuals=residuals_of(state, event, rows, covariances))
+
+
+def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray) -> None:
+    """Take over orientations of landmarks ``rows`` (m,) of which none is known, or a wrong one.
+
+    One is wrong that was rejected more often than it was seen, or ``max_rejections`` times, all
+    in a row.
+    """
+    tags, Z = state.filter.orientations, event.orientations
+    if tags is None or Z is None or state.is_fixed:
+        return
+    in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
+    is_used = state.landmarks.rejections[rows] == 0
+    seen = _seen(state, event, rows, Z, is_used & (in_doubt | ~tags.are_known[rows]))
+    if len(seen.rows):
+        state.filter.add_orientations(seen)
+
+
+def flipped(Z: FloatArray, lines_of_sight: FloatArray) -> FloatArray:
+    """Return the other orientations (m, 3, 3) in which tags look nearly the same.
+
+    Mirrored in depth, a plane's image is the same but for perspective; so they are hard to
+    distinguish for tags that are small or nearly frontal. A tag is in its x-y plane.
+    """
+    squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)[:, None, None]
+    outer = lines_of_sight[:, :, None] * lines_of_sight[:, None, :]
+    mirror = np.eye(3) - 2.0 * outer / np.maximum(squared, np.finfo(np.float64).tiny)
+    twins: FloatArray = mirror @ Z @ _NORMAL_TURNED
+    return twins
+
+
+def _seen(
+    state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray, are_wanted: BoolArray
+) -> SeenOrientations:
+    """Return those of the orientations in an observation that are wanted (m,) and known."""
+    noise = state.observation_noise.orientation_covariances(event)
+    dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
+    seen = SeenOrientations(rows, Z, flipped(Z, event.lines_of_sight), noise, dt_s)
+    return seen.select(are_wanted & Z.any(axis=(1, 2)))

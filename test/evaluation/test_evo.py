@@ -1,0 +1,65 @@
+"""evo reads what a replay writes, and finds the same error; it is run as the program it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+import zipfile
+
+from command_line import CommandLine
+import pytest
+
+SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
+SAME_STAMPS = ('--sync_method', 'interpolation', '--t_max_diff', '0.25')
+"""As a replay compares: with the truth in between its samples, half a second apart at most."""
+
+
+@pytest.fixture(name='run_evo')
+def fixture_run_evo(tmp_path, monkeypatch):
+    """Return what runs a program of evo in an empty folder, and returns what it prints."""
+    monkeypatch.setenv('HOME', str(tmp_path / 'home'))  # where evo keeps settings
+    (tmp_path / 'home').mkdir()
+
+    def run(program, *arguments):
+        command = Path(sys.executable).with_name(program)
+        if not command.exists():
+            pytest.skip('evo is not installed: it needs Python 3.11')
+        words = [str(command), *map(str, arguments)]
+        return subprocess.run(
+            words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=100
+        ).stdout
+
+    return run
+
+
+@pytest.fixture(name='figures')
+def fixture_figures(capsys, tmp_path):
+    arguments = ('--tum', tmp_path / 'run.tum', '--mcap', tmp_path / 'run.mcap', '--json')
+    return CommandLine(capsys).succeed('replay', SAMPLE, *arguments).json
+
+
+def rmse_m(run_evo, tmp_path, *arguments):
+    results = tmp_path / 'results.zip'
+    results.unlink(missing_ok=True)
+    run_evo('evo_ape', *arguments, '--align', *SAME_STAMPS, '--save_results', results)
+    with zipfile.ZipFile(results) as opened:
+        return json.loads(opened.read('stats.json'))['rmse']
+
+
+def test_evo_finds_the_same_error_in_a_tum_file(run_evo, figures, tmp_path):
+    run_evo('evo_traj', 'mcap', SAMPLE, '/ground_truth/pose', '--save_as_tum')
+    found = rmse_m(run_evo, tmp_path, 'tum', 'ground_truth_pose.tum', 'run.tum')
+    assert found == pytest.approx(figures['ate_rmse_m'], abs=1e-9)
+
+
+def test_evo_finds_the_same_error_in_a_recording(run_evo, figures, tmp_path):
+    topics = ('/aligned_truth/pose', '/pose')
+    found = rmse_m(run_evo, tmp_path, 'mcap', 'run.mcap', *topics)
+    assert found == pytest.approx(figures['ate_rmse_m'], abs=1e-9)
+
+
+@pytest.mark.parametrize('topic', ['/pose', '/observer_node/odometry', '/aligned_truth/pose'])
+def test_evo_reads_the_topics_of_a_recording(run_evo, figures, topic):
+    assert 'poses' in run_evo('evo_traj', 'mcap', 'run.mcap', topic)

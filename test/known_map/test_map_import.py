@@ -1,0 +1,114 @@
+"""Maps of other programs become maps of this one, or are refused with the reason."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from slam_observer_ros.common.errors import MapError
+from slam_observer_ros.known_map.map_file import read_map, write_map
+from slam_observer_ros.known_map.map_import import import_map
+
+TAGSLAM = """
+bodies:
+ - lab:
+     is_static: true
+     pose:
+       position: {x: 1.0, y: 0.0, z: 0.0}
+       rotation: {x: 0.0, y: 0.0, z: 1.5707963267948966}
+     tags:
+     - id: 3
+       size: 0.2
+       pose:
+         position: {x: 2.0, y: 0, z: 0.5}
+         rotation: {x: 0.0, y: 0.0, z: 0.0}
+     - {id: 4, size: 0.2}
+ - rig:
+     is_static: false
+     tags:
+     - {id: 9, size: 0.1, pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
+"""
+BUNDLE = """
+standalone_tags: []
+tag_bundles:
+  [ { name: 'door', layout: [
+        {id: 10, size: 0.05, x: 0.5, y: -0.5, z: 0.0, qw: 1.0, qx: 0.0, qy: 0.0, qz: 0.0},
+        {id: 11, size: 0.05, x: 1.5, y: 0.5 } ] } ]
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Return a function that imports a text as a file of a name."""
+
+    def read(text, name):
+        path = tmp_path / name
+        path.write_text(text)
+        return import_map(path, 'map', 0.02)
+
+    return read
+
+
+def test_a_table_with_names(load):
+    found = load('# tags of the hall\nID, x ,y,sigma,z\n7,1.5,-2,0.1,0.3\n8,9,1,,\n', 'tags.csv')
+    assert found.ids.tolist() == [7, 8]
+    assert_allclose(found.world_points, [[1.5, -2.0, 0.3], [9.0, 1.0, 0.0]])
+    assert_allclose(found.covariances[:, 0, 0], [0.01, 0.0004])
+    assert found.frame_id == 'map'
+
+
+def test_a_table_without_names(load):
+    found = load('7,1.5,-2\n8,9,1,0.5,0.1\n', 'tags.csv')
+    assert_allclose(found.world_points, [[1.5, -2.0, 0.0], [9.0, 1.0, 0.5]])
+    assert_allclose(found.covariances[1], 0.01 * np.eye(3))
+
+
+@pytest.mark.parametrize('text', [TAGSLAM, TAGSLAM.replace('bodies:', '')])
+def test_tags_of_tagslam_that_stand_still(load, text):
+    found = load(text, 'tagslam.yaml')
+    assert found.ids.tolist() == [3]
+    assert_allclose(found.world_points, [[1.0, 2.0, 0.5]], atol=1e-9)
+
+
+def test_a_bundle_of_apriltags(load):
+    found = load(BUNDLE, 'tags.yaml')
+    assert found.ids.tolist() == [10, 11]
+    assert_allclose(found.world_points, [[0.5, -0.5, 0.0], [1.5, 0.5, 0.0]])
+
+
+def test_what_was_imported_can_be_saved_and_loaded(load, tmp_path):
+    write_map(tmp_path / 'map.yaml', load('7,1,2,3\n', 'tags.csv'), None)
+    found = read_map(tmp_path / 'map.yaml')
+    assert found.ids.tolist() == [7]
+    assert 'settings' not in (tmp_path / 'map.yaml').read_text()
+
+
+@pytest.mark.parametrize(
+    ('text', 'name', 'reason'),
+    [
+        ('', 'tags.csv', 'there are no landmarks in it'),
+        ('id,y\n7,1\n', 'tags.csv', "there is no column 'x'; it needs id, x and y"),
+        ('7,1,two\n', 'tags.csv', 'landmark 1: could not convert string to float'),
+        ('7,1,2\n7,1,2\n', 'tags.csv', 'landmark 7 is there more than once'),
+        ('-7,1,2\n', 'tags.csv', 'the id -7 is not one from 0 to'),
+        ('7,1,nan\n', 'tags.csv', 'not finite'),
+        ('7,1,2,3,-0.1\n', 'tags.csv', 'sigma is negative'),
+        ('format: other\n', 'tags.yaml', "neither 'bodies', as TagSLAM, nor 'tag_bundles'"),
+        (TAGSLAM.replace('rotation', 'turn'), 'tags.yaml', "'rotation' is missing"),
+        (TAGSLAM.replace('x: 2.0', 'x: two'), 'tags.yaml', 'could not convert string'),
+        (TAGSLAM.replace('id: 3', 'id: three'), 'tags.yaml', "the id 'three' is not one"),
+        ('bodies: [1, 2]\n', 'tags.yaml', 'tags.yaml: '),
+        ('bodies: {a: [}\n', 'tags.yaml', 'is not valid'),
+        ('tag_bundles: 3\n', 'tags.yaml', 'tags.yaml: '),
+        ('\x00', 'tags.csv', 'tags.csv'),
+    ],
+)
+def test_what_can_not_be_read_is_refused_with_the_reason(load, text, name, reason):
+    with pytest.raises(MapError, match=reason):
+        load(text, name)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(MapError, match=r"can't read .*none\.csv"):
+        import_map(tmp_path / 'none.csv', 'map', 0.02)

@@ -1,0 +1,40 @@
+"""``slam-observer doctor`` hears what nodes publish, and says how observer_node gets it."""
+
+from __future__ import annotations
+
+from command_line import CommandLine
+from node_processes import running
+import pytest
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture(name='slam_observer')
+def fixture_slam_observer(capsys):
+    return CommandLine(capsys)
+
+
+def test_topics_that_are_alive_are_named_with_what_a_node_needs_to_hear_them(
+    ros, slam_observer, tmp_path
+):
+    parameters = {'stamped': True, 'landmarks_type': 'PointCloud2', 'duration': 600.0}
+    arguments = ('-r', '__ns:=/a')
+    with running('simulator_node', tmp_path / 'log', *arguments, **parameters):
+        found = slam_observer.succeed('doctor', '--seconds', 3, '--json').json
+    topics = {topic['topic']: topic for topic in found['topics']}
+    twist, landmarks = topics['/a/twist'], topics['/a/landmarks']
+    assert (twist['role'], landmarks['role']) == ('twist', 'landmarks')
+    assert twist['rate_hz'] > 1.0
+    assert '-r twist:=/a/twist' in twist['text']
+    assert '4 points, 4 with an id' in landmarks['text']
+    assert found['installed']['tf2_msgs'] == 'installed'
+
+
+def test_it_says_that_nothing_is_heard(slam_observer):
+    output = slam_observer.succeed('doctor', '--seconds', 0.2).output
+    assert 'ROS_DOMAIN_ID' in output
+    assert 'Python' in output
+
+
+def test_seconds_that_are_none_are_refused(slam_observer):
+    assert '--seconds' in slam_observer.fail('doctor', '--seconds', 0)

@@ -1,0 +1,76 @@
+"""A simulated robot among tags, localised over DDS by the node as the launch file sets it up."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from slam_observer_ros.nodes.demo import hall, robot
+from slam_observer_ros.nodes.demo.robot_report import Restart
+from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.ros
+@pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built')
+def test_the_robot_is_localised_before_and_after_a_restart(monkeypatch, capsys):
+    monkeypatch.chdir(CHECKOUT)
+    exit_code = robot.main(['--duration', '24', '--real-time-factor', '2'])
+    output = capsys.readouterr().out
+    assert exit_code == 0, output
+    assert 'The robot was localised.' in output
+
+
+def test_the_page_on_nav2_has_the_command_that_is_run():
+    page = (CHECKOUT / 'docs' / 'nav2.md').read_text()
+    words = [f'params_file:={robot.PARAMS_FILE}']
+    words += [f'{name}:={value}' for name, value in robot.LAUNCH_ARGUMENTS.items()]
+    assert f'ros2 launch slam_observer_ros localization.launch.py {" ".join(words)}' in page
+
+
+def test_what_the_camera_sees_is_in_front_of_it_and_faces_it():
+    random = np.random.default_rng(0)
+    tags = hall.tag_poses()
+    seen = [hall.sightings(hall.true_pose(t), tags, random) for t in np.arange(0.0, hall.LAP_S)]
+    assert {len(each) for each in seen} == {0, 1, 2, 3}
+    for each in seen:
+        for pose in each.values():
+            assert 0.0 < pose[2, 3] < hall.MAX_RANGE_M
+            assert pose[:3, 2] @ pose[:3, 3] < 0.0
+
+
+def test_a_sighting_is_where_the_tag_is_within_its_noise():
+    random = np.random.default_rng(0)
+    tags = hall.tag_poses()
+    for time_s in np.arange(0.0, hall.LAP_S):
+        pose = hall.true_pose(time_s)
+        for tag_id, seen in hall.sightings(pose, tags, random).items():
+            in_map = pose @ hall.CAMERA @ seen
+            assert_allclose(in_map[:3, 3], tags[tag_id][:3, 3], atol=0.8)
+
+
+def test_wheels_drift_from_the_truth():
+    odometry = hall.WheelOdometry(np.random.default_rng(0))
+    steps = [hall.true_pose(step / 50.0) for step in range(50 * int(hall.LAP_S))]
+    for before, after in pairwise(steps):
+        odometry.advance(before, after, 0.02)
+    moved = np.linalg.inv(steps[0]) @ steps[-1]
+    assert 0.2 < np.linalg.norm(odometry.pose[:2, 3] - moved[:2, 3]) < 5.0
+
+
+def test_the_time_to_be_localised_again_counts_from_the_tags():
+    sight = [hall_seen(10.5, 1), hall_seen(11.0, 2), hall_seen(12.0, 2)]
+    assert Restart(10.0, ended_s=10.0, localised_s=11.4).back_after_s(sight) == pytest.approx(0.4)
+    assert Restart(10.0, ended_s=10.0, localised_s=10.2).back_after_s(sight) == 0.0
+    assert Restart(10.0, ended_s=10.0).back_after_s(sight) is None
+
+
+def hall_seen(time_s, tags):
+    from slam_observer_ros.nodes.demo.hall_robot import Seen
+
+    return Seen(time_s, np.eye(4), None, tags)
