@@ -1,7 +1,7 @@
 """Which noise figures explain less than what is seen.
 
-With true poses each axis of the motion is judged by itself; without, motion and points are told
-apart by the time since landmarks were last used.
+With true poses each axis of the motion is judged by itself; without, the time since landmarks were
+last used shows whether motion or points are at fault.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _gaps(innovations: Innovations) -> Iterator[str]:
 
 
 def _ratio(innovations: Innovations, is_chosen: BoolArray) -> float:
-    """Return how large innovations are for what is stated; 1 where they are too few to tell."""
+    """Return how large innovations are for what is stated; 1 where they are too few."""
     known = is_chosen & (innovations.degrees_of_freedom > 0)
     total = int(innovations.degrees_of_freedom[known].sum())
     if total < MIN_DEGREES:
