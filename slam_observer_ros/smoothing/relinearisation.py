@@ -108,7 +108,7 @@ class Relinearisation:
         """Note a motion of the robot."""
         if not self.is_active:
             return
-        if self._observer.u.any():
+        if self._observer.have_moved and self._observer.u.any():
             # How far they went depends on how the robot was turned, which no smoother here knows.
             self.reset('a landmark came with a velocity')
         else:

@@ -53,6 +53,7 @@ def _reported_run(title: str, outcome: ReplayOutcome, summary: Mapping[str, str]
         settings=estimator.settings,
         start_ns=outcome.result.start_ns,
         trajectory=outcome.result.trajectory,
+        dead_reckoning=outcome.result.dead_reckoning,
         in_known_map=outcome.result.in_known_map,
         truth=outcome.truth,
         errors=outcome.accuracy.pose_errors,

@@ -26,6 +26,8 @@ from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -44,6 +46,19 @@ def replayed(
     return outcome, _frame_of_outputs(asked.inputs, landmark_map)
 
 
+def select_inputs(
+    args: argparse.Namespace, recording: Recording, asked: Asked
+) -> tuple[SelectedTopics, InputSettings, Truth]:
+    """Return the topics to be read, the settings with the frames of these, and the truth."""
+    if recording.warning:
+        logger.warning('%s', recording.warning)
+    selected = recording.find_topics(topic_names(args), asked.inputs)
+    inputs = with_base_frame(asked.inputs, recording, selected)
+    check_frames(inputs)
+    truth = recording.truth(selected, inputs.base_frame)
+    return selected, inputs, truth.flattened() if asked.settings.two_d_mode else truth
+
+
 def _replay(
     args: argparse.Namespace,
     settings: Settings,
@@ -53,13 +68,7 @@ def _replay(
 ) -> ReplayOutcome:
     """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
     with Recording(args.recording) as recording:
-        if recording.warning:
-            logger.warning('%s', recording.warning)
-        selected = recording.find_topics(topic_names(args), inputs)
-        inputs = with_base_frame(inputs, recording, selected)
-        check_frames(inputs)
-        truth = recording.truth(selected, inputs.base_frame)
-        truth = truth.flattened() if settings.two_d_mode else truth
+        selected, inputs, truth = select_inputs(args, recording, Asked(settings, inputs))
         events = recording.blocks(selected, inputs, settings.velocity_timeout)
         if shows_progress:
             events = show_progress(events, 'replaying', recording.event_count(selected))

@@ -10,7 +10,7 @@ S. Bonnabel, *The invariant extended Kalman filter as a stable observer*, 2017).
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
+from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
@@ -128,12 +128,18 @@ class JointCovariance:
 
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
-        columns = self._columns(rows).reshape(len(rows), self._axes.point)
-        return self._output(C, columns)
+        P, columns = self.P, self._columns(rows).reshape(len(rows), self._axes.point)
+        to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
+        PC = self.pose @ transpose(C) - transpose(to_pose)
+        return PC, C @ PC - to_pose @ transpose(C) + own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the same of all together, (p, m k) and (m k, m k)."""
-        return self._output(C.reshape(-1, self._p), self._columns(rows))
+        C, columns = C.reshape(-1, self._p), self._columns(rows)
+        seen = self._matrix.rows(columns)
+        to_pose = seen[:, : self._p]
+        PC = self.pose.dot(C.T) - to_pose.T
+        return PC, C.dot(PC) - to_pose.dot(C.T) + seen.take(columns, axis=1)
 
     def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
         """Return −K r of residuals r (m, k) of noise R (m, k, k), K = P Hᵀ S⁻¹, and update P."""
@@ -141,7 +147,10 @@ class JointCovariance:
         return -self.update(HP, with_blocks(HPH, R), r.ravel())
 
     def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
-        """Update P by what :meth:`project` projected; return K r, K = P Hᵀ S⁻¹ the gain."""
+        """Update P by what :meth:`project` projected, which is used up; return K r.
+
+        K = P Hᵀ S⁻¹ is the gain.
+        """
         if not len(r):
             return np.zeros(len(self.P))
         L, is_indefinite = dpotrf(S, lower=1)
@@ -149,11 +158,10 @@ class JointCovariance:
             moved: FloatArray = kalman_update(self.P, HP, S).dot(r)
             return moved
         # P − Wᵀ W and Wᵀ z, W = L⁻¹ H P, z = L⁻¹ r, L Lᵀ = S.
-        right = np.empty((len(r), len(self.P) + 1))
-        right[:, :-1], right[:, -1] = HP, r
-        W = dtrsm(1.0, L, right.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
-        self._matrix.subtract_square(W[:, :-1])
-        Kr: FloatArray = W[:, -1].dot(W[:, :-1])
+        z = dtrsv(L, r, lower=1)
+        W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        self._matrix.subtract_square(W)
+        Kr: FloatArray = z.dot(W)
         return Kr
 
     # Landmarks
@@ -199,12 +207,6 @@ class JointCovariance:
         P[: self._p] = P[:, : self._p] = 0.0
         P[: self._p, : self._p] = covariance
         self.set_of_positions(P, points)
-
-    def _output(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-        P = self.P
-        to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
-        PC = self.pose @ transpose(C) - transpose(to_pose)
-        return PC, C @ PC - to_pose @ transpose(C) + own
 
     def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
         # ξ_i = C_i ε + noise of these covariances

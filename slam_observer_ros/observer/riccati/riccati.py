@@ -63,10 +63,11 @@ class RiccatiFilter(Filter):
         r, R = residuals.on(self.axes)
         # A gate, then Huber's weights; errors that last make R larger, too.
         weights = observation_weights(r, self.predicted(residuals)[1], R, self._settings)
-        passed = weights > 0.0
-        used, r, R = residuals.select(passed), r[passed], R[passed]
+        passed, used = weights > 0.0, residuals
+        if np.count_nonzero(passed) < len(r):
+            used, r, R = residuals.select(passed), r[passed], R[passed]
         repeated = repetition_factors(used.dt_s, self._settings.observation_correlation_time)
-        R = R / (weights[passed] / repeated)[:, None, None]
+        R = R * (repeated / weights[passed])[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
         self._move(self.joint.correct(self.joint.output_matrix(used), used.rows, R, r))
         return weights
