@@ -48,7 +48,7 @@ def main() -> None:
     logging.basicConfig(format='benchmark: %(message)s', level=logging.INFO)
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
     threadpool_limits(1)  # as the nodes do
-    figures = performance_page.read_figures()
+    measured: performance_page.Figures = {}
     for name in args.parts or PARTS:
         if name in NEED_DATA and not worlds.data_folder().is_dir():
             logging.warning('%s is left out: no recordings in %s', name, worlds.data_folder())
@@ -57,8 +57,9 @@ def main() -> None:
         part = Part(measured=this_machine(), tables=PARTS[name]())
         logging.info('%s took %.0f s', name, time.monotonic() - start_s)
         sys.stdout.write(performance_page.part_text(part))
-        figures[name] = part
+        measured[name] = part
     if args.write_docs:
+        figures = performance_page.read_figures() | measured
         performance_page.FIGURES.write_text(json.dumps(figures, indent=1) + '\n')
         performance_page.write(figures)
 

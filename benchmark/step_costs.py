@@ -12,7 +12,7 @@ import time
 
 from cost_tables import ratios, Table, Tables
 from estimators import EKF, ISAM2, ISAM2_DEFAULT, observer, ONLINE, OnlineEstimator
-from gtsam_baselines import accurate_isam2
+from gtsam_baselines import accurate_isam2, qr_isam2
 import numpy as np
 from odometry import Event
 
@@ -34,6 +34,8 @@ SPACING_M = 2.0
 POINT_NOISE_M = 0.05
 STEPS = 60
 LONGEST_S = 3.0  # of CPU for one cell, beyond which no further step is begun
+
+ISAM2_QR = 'iSAM2, its defaults with QR'
 
 ESTIMATORS = ('constant', 'scheduled', 'riccati', EKF, ISAM2_DEFAULT, ISAM2)
 
@@ -89,9 +91,13 @@ def settings_for(known: int) -> Settings:
 
 def make(name: str, settings: Settings) -> OnlineEstimator:
     """Return an estimator by the name of its row."""
-    if name in DESIGNS:
-        return observer(name)(settings)
-    return accurate_isam2(settings) if name == ISAM2 else ONLINE[name](settings)
+    makers = {
+        **ONLINE,
+        **{design: observer(design) for design in DESIGNS},
+        ISAM2: accurate_isam2,
+        ISAM2_QR: qr_isam2,
+    }
+    return makers[name](settings)
 
 
 def drive(known: int, seen: int) -> tuple[list[Event], list[list[Event]]]:
