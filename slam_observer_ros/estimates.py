@@ -40,12 +40,17 @@ class NormalisedInnovation:
 
     ``nis`` is the normalised innovation squared of those that were used, together: χ² of so many
     ``degrees_of_freedom`` where all noise is as stated; None where no joint covariance is known.
+    ``log_densities`` are natural logarithms of what the filter expected, of each residual given
+    those used before it, in 1/m^k; −∞ of those that were not used. ``shares`` are below 1 for
+    observations whose error has not changed since the last one.
     """
 
     distances: FloatArray  # (m,) Mahalanobis distance of each; zero if no noise is known
     weights: FloatArray  # (m,) Huber's, 0 for a rejected one
     nis: float | None
     degrees_of_freedom: int
+    log_densities: FloatArray  # (m,)
+    shares: FloatArray  # (m,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +59,7 @@ class Update:
 
     Residuals are those before the correction, along the world's axes; the rejected ones were too
     far off to be used. ``lyapunov`` is L (34) of them all; k_i is ``gain_k`` whatever the gains.
+    Those of ``moved_ids`` are taken to be somewhere else from now on.
     ``innovation`` is None unless the estimator was asked for it.
     """
 
@@ -63,6 +69,7 @@ class Update:
     residuals: FloatArray  # (m, 3) r_i, metres
     rejected: BoolArray  # (m,)
     lyapunov: float
+    moved_ids: IntArray
     innovation: NormalisedInnovation | None = None
 
 

@@ -76,7 +76,7 @@ class Hypotheses:
 
     def count(self, name: str) -> int:
         """Return one of the :attr:`counts`, without adding up all of them."""
-        return self._earlier_counts[name] + self.best.counts[name]
+        return self._earlier_counts.get(name, 0) + self.best.counts.get(name, 0)
 
     def __len__(self) -> int:
         """Return how many hypotheses there are."""
@@ -159,10 +159,10 @@ class Hypotheses:
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        is_unknown = event.ids == UNKNOWN_ID
-        self._some_have_ids = self._some_have_ids or not is_unknown.all()
+        unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
+        self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         matches = [match(hypothesis.state, event) for hypothesis in self._all]
-        if len(self._all) == 1 and not is_unknown.any():
+        if len(self._all) == 1 and not unknown:
             if not self.best.filter.has_joint_covariance:
                 return self._observe_alone(event, matches[0])
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])

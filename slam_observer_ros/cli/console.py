@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 import json
 import logging
@@ -50,6 +50,18 @@ def kept_warnings() -> Iterator[list[str]]:
         yield keeper.warnings
     finally:
         package_logger.removeHandler(keeper)
+
+
+@contextmanager
+def muted_warnings() -> Iterator[None]:
+    """Show none of the package's warnings meanwhile."""
+    package_logger = logging.getLogger('slam_observer_ros')
+    level = package_logger.level
+    package_logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        package_logger.setLevel(level)
 
 
 def show_message(kind: str, text: str) -> None:
@@ -108,6 +120,26 @@ def show_runs(runs: Iterable[_Item], description: str, total: int) -> Iterator[_
         speed_estimate_period=_FOREVER_S,
     ) as progress:
         yield from progress.track(runs, total, description=description)
+
+
+@contextmanager
+def shown_steps(description: str) -> Iterator[Callable[[], None]]:
+    """Give a function to be called at each step of what has no known end, to show their number."""
+    with leaving_at_once():
+        from rich.console import Console
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True, highlight=False)
+    columns = (
+        SpinnerColumn(),
+        TextColumn('{task.description}, step {task.completed}'),
+        TimeElapsedColumn(),
+    )
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+        task = progress.add_task(description, total=None)
+        yield lambda: progress.advance(task)
 
 
 def print_json(result: Mapping[str, object]) -> None:

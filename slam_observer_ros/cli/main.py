@@ -37,6 +37,7 @@ COMMANDS = {
     'convert': ('convert', 'make a recording of a public data set'),
     'map': ('map', 'make a map file of a map of another program'),
     'replay': ('replay.command', 'run a recording through the observer'),
+    'tune': ('tune.command', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),
     'doctor': ('doctor', 'say what is installed, and what a node would hear'),
     'batch': ('batch.command', 'run many recordings with many settings'),

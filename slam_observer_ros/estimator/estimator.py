@@ -575,6 +575,7 @@ class Estimator:
             se3.rotate(observer.reference_pose, outcome.residuals),
             outcome.rejected,
             lyapunov(self.settings.gain_k, outcome.residuals),
+            outcome.moved_ids,
             outcome.innovation,
         )
 

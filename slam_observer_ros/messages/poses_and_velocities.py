@@ -21,6 +21,7 @@ from slam_observer_ros.messages.measurement import Measurement
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
 QUATERNION_NORM_TOLERANCE = 0.1
+"""How far the norm of a quaternion that is a rotation may be from 1."""
 
 
 @dataclass(frozen=True, slots=True)

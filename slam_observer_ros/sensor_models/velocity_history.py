@@ -121,7 +121,7 @@ class VelocityHistory:
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
         held = self._held(self._pieces(start_ns, end_ns))
-        return held.with_gaps_apart() if held.gap_s.any() else held
+        return held.with_gaps_apart() if np.count_nonzero(held.gap_s) else held
 
     def held_until(
         self, start_ns: int, stamps_ns: IntArray

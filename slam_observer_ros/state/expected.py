@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import NormalisedInnovation
-from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, solve
+from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.sensor_models.observation_noise import repetition_factors
+
+_LOG_ROOT_2_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,21 +24,36 @@ class Expected:
     r: FloatArray
     distances: FloatArray  # (m,) Mahalanobis distance of each
     S: FloatArray | None  # (m k, m k) joint covariance, m²; None if unknown
+    shares: FloatArray  # (m,) of an observation with new errors, that each is worth
 
     @classmethod
-    def of(cls, filter_: Filter, residuals: Residuals) -> Expected:
-        """Ask the filter, before it corrects itself."""
+    def of(cls, filter_: Filter, residuals: Residuals, error_time_s: float) -> Expected:
+        """Ask the filter, before it corrects itself; errors last for ``error_time_s``."""
         r, _ = residuals.on(filter_.axes)
+        repeated = repetition_factors(residuals.dt_s, error_time_s)
         S = filter_.innovation_covariance(residuals) if len(r) else None
         if S is not None:
-            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), S)
-        return cls(r, filter_.distances(residuals) if len(r) else np.empty(0), None)
+            return cls(r, mahalanobis(r, diagonal_blocks(S, r.shape[1])), S, 1.0 / repeated)
+        distances = filter_.distances(residuals) if len(r) else np.empty(0)
+        return cls(r, distances, None, 1.0 / repeated)
 
     def judge(self, weights: FloatArray) -> NormalisedInnovation:
         """Return how far off the residuals are, given the weights (m,) of the correction."""
-        used = np.flatnonzero(np.repeat(weights > 0.0, self.r.shape[1]))
-        nis = None
-        if self.S is not None and len(used):
-            r = self.r.ravel()[used]
-            nis = float(r @ solve(self.S[np.ix_(used, used)], r))
-        return NormalisedInnovation(self.distances, weights, nis, 0 if nis is None else len(used))
+        (m, k), used = self.r.shape, weights > 0.0
+        nis, log_densities = None, np.full(m, -np.inf)
+        if self.S is not None and used.any():
+            rows = np.flatnonzero(np.repeat(used, k))
+            L = np.linalg.cholesky(self.S[np.ix_(rows, rows)])
+            # One after the other, each as those before it have it: the product is that of all.
+            white = np.linalg.solve(L, self.r.ravel()[rows])
+            nis = float(white @ white)
+            each = 0.5 * white**2 + np.log(np.diagonal(L)) + _LOG_ROOT_2_PI
+            log_densities[used] = -each.reshape(-1, k).sum(axis=1)
+        return NormalisedInnovation(
+            self.distances,
+            weights,
+            nis,
+            0 if nis is None else k * int(np.count_nonzero(used)),
+            log_densities,
+            self.shares,
+        )

@@ -26,6 +26,8 @@ from slam_observer_ros.cli.replay.timing_checks import warn_of_timing
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import replay
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -44,6 +46,19 @@ def replayed(
     return outcome, _frame_of_outputs(asked.inputs, landmark_map)
 
 
+def select_inputs(
+    args: argparse.Namespace, recording: Recording, asked: Asked
+) -> tuple[SelectedTopics, InputSettings, Truth]:
+    """Return the topics to be read, the settings with the frames of these, and the truth."""
+    if recording.warning:
+        logger.warning('%s', recording.warning)
+    selected = recording.find_topics(topic_names(args), asked.inputs)
+    inputs = with_base_frame(asked.inputs, recording, selected)
+    check_frames(inputs)
+    truth = recording.truth(selected, inputs.base_frame)
+    return selected, inputs, truth.flattened() if asked.settings.two_d_mode else truth
+
+
 def _replay(
     args: argparse.Namespace,
     settings: Settings,
@@ -53,20 +68,13 @@ def _replay(
 ) -> ReplayOutcome:
     """Replay a recording; warn of what may be wrong with it, or with what is asked of it."""
     with Recording(args.recording) as recording:
-        if recording.warning:
-            logger.warning('%s', recording.warning)
-        selected = recording.find_topics(topic_names(args), inputs)
-        inputs = with_base_frame(inputs, recording, selected)
-        check_frames(inputs)
-        truth = recording.truth(selected, inputs.base_frame)
-        truth = truth.flattened() if settings.two_d_mode else truth
+        selected, inputs, truth = select_inputs(args, recording, Asked(settings, inputs))
         events = recording.blocks(selected, inputs, settings.velocity_timeout)
         if shows_progress:
             events = show_progress(events, 'replaying', recording.event_count(selected))
         recorder = _recorder(args)
         map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
-        is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
-        needs_poses = is_drawn or len(truth.stamps_ns) > 0
+        needs_poses = args.tum is not None or _is_shown(args) or len(truth.stamps_ns) > 0
         with estimate_writer(args, recording, selected, inputs, map_frame) as writer:
             recorders = [noter for noter in (recorder, writer) if noter is not None]
             result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
@@ -85,9 +93,14 @@ def _replay(
 
 
 def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
-    if args.report is not None or args.plot is not None:
+    if _is_shown(args):
         return RunRecorder()
     return NisTally() if args.json else None
+
+
+def _is_shown(args: argparse.Namespace) -> bool:
+    """Return whether anything is asked for that shows the whole run."""
+    return any(output is not None for output in (args.report, args.plot, args.rerun))
 
 
 def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:

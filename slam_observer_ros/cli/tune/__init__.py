@@ -1,0 +1,1 @@
+"""``slam-observer tune``: noise figures by maximum likelihood of the innovations."""

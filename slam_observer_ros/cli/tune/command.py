@@ -1,0 +1,160 @@
+"""``slam-observer tune``: the noise that makes the innovations of a recording most likely."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+import math
+from pathlib import Path
+
+from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
+from slam_observer_ros.cli.options import add_settings_options, read_assignments, read_config
+from slam_observer_ros.cli.outputs import add_force_option, check_outputs
+from slam_observer_ros.cli.replay.asked import Asked, read_asked
+from slam_observer_ros.cli.replay.input_options import add_input_options
+from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
+from slam_observer_ros.cli.tune.noise_kinds import kinds_of, NoiseKind, scaled
+from slam_observer_ros.cli.tune.search import Found, most_likely, remembered, without_effect
+from slam_observer_ros.cli.tune.tuned_file import certainty, rounded, verdict_lines, write_tuned
+from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
+from slam_observer_ros.common.errors import IncompleteError, UsageError
+from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.input_settings import InputSettings
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        'Find the noise figures, and nothing else, that make what was seen most likely; no truth '
+        'is needed. What is found must hold on what was held out: other recordings, or the last '
+        'third of each. If it does not, no file is written, and the exit code is 4.'
+    )
+    parser.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING')
+    parser.add_argument(
+        '--hold-out',
+        action='append',
+        default=[],
+        type=Path,
+        metavar='RECORDING',
+        help='hold this one out, and train on all of the others; may be given several times',
+    )
+    outputs = parser.add_argument_group('outputs')
+    outputs.add_argument(
+        '--out', type=Path, metavar='FILE', help='parameter file to write if it is an improvement'
+    )
+    outputs.add_argument('--json', action='store_true', help='print one JSON object')
+    add_force_option(parser)
+    add_input_options(parser)
+    add_settings_options(parser, InputSettings)
+    parser.set_defaults(run=run, smooth=False, load_map=None)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Tune on some recordings, and judge on what was held out."""
+    asked = read_asked(args)
+    if not DESIGNS[asked.settings.gains].has_joint_covariance:
+        raise UsageError(f'tune needs riccati gains, not {asked.settings.gains}')
+    check_outputs([args.out], args.force)
+    share = 0.0 if args.hold_out else HELD_OUT_SHARE
+    trained_on = [read_material(args, path, asked, share) for path in args.recordings]
+    kinds, found = _search(trained_on, asked.settings)
+    tuned = _rounded(scaled(asked.settings, kinds, found.log_factors.tolist()), kinds)
+    verdict = _verdict(args, asked, trained_on, tuned)
+    _print(args, asked.settings, tuned, kinds, found, verdict)
+    if verdict.objection:
+        raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
+    if args.out is not None:
+        given = read_config(args) | read_assignments(args)
+        texts = [(kind, text) for kind, text in zip(kinds, _certainties(found), strict=True)]
+        held_out = [str(path) for path in args.hold_out] or ['the last third of each']
+        trained = [f'{one.path.name} (SHA-256 {one.sha256})' for one in trained_on]
+        write_tuned(args.out, given, tuned, texts, trained, held_out, verdict)
+
+
+def _search(trained_on: Sequence[Material], settings: Settings) -> tuple[list[NoiseKind], Found]:
+    """Return the kinds of noise that have an effect, and their most likely factors."""
+    # What the settings that are tried give reason to warn of is nobody's concern.
+    with muted_warnings(), shown_steps('tuning') as advance:
+
+        def log_likelihood(kinds: list[NoiseKind], log_factors: Sequence[float]) -> float:
+            advance()
+            tried = scaled(settings, kinds, log_factors)
+            likelihoods = [material.likelihood(tried) for material in trained_on]
+            return sum(one.mean * count for one, count in zip(likelihoods, counts, strict=True))
+
+        counts = [material.likelihood(settings).count for material in trained_on]
+        if not all(counts):
+            raise UsageError('nothing is seen twice in what is trained on')
+        kinds = kinds_of(settings)
+        idle = without_effect(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
+        kinds = [kind for number, kind in enumerate(kinds) if number not in idle]
+        if not kinds:
+            raise UsageError('no noise figure has an effect: messages state all covariances')
+        return kinds, most_likely(remembered(lambda x: log_likelihood(kinds, x)), len(kinds))
+
+
+def _rounded(settings: Settings, kinds: Sequence[NoiseKind]) -> Settings:
+    """Return settings as they are written to a file."""
+    values = {name: rounded(getattr(settings, name)) for kind in kinds for name in kind.parameters}
+    return Settings(**asdict(settings) | values)
+
+
+def _verdict(
+    args: argparse.Namespace, asked: Asked, trained_on: Sequence[Material], tuned: Settings
+) -> Verdict:
+    """Compare the settings on what was held out, one recording after the other."""
+    before: list[Judged] = []
+    after: list[Judged] = []
+    for number in range(len(args.hold_out) or len(trained_on)):
+        material = (
+            read_material(args, args.hold_out[number], asked, 1.0)
+            if args.hold_out
+            else trained_on[number]
+        )
+        before.append(material.judged(asked.settings))
+        after.append(material.judged(tuned))
+    if not all(len(judged.likelihood.stamps_ns) for judged in (*before, *after)):
+        raise UsageError('nothing is seen twice in what is held out')
+    return judge(before, after)
+
+
+def _certainties(found: Found) -> list[str]:
+    pairs = zip(found.log_factors.tolist(), found.deviations.tolist(), strict=True)
+    return [certainty(*pair) for pair in pairs]
+
+
+def _print(
+    args: argparse.Namespace,
+    before: Settings,
+    tuned: Settings,
+    kinds: Sequence[NoiseKind],
+    found: Found,
+    verdict: Verdict,
+) -> None:
+    """Print what was found, and how it does on what was held out."""
+    names = [name for kind in kinds for name in kind.parameters]
+    if args.json:
+        deviations = found.deviations.tolist()
+        figures = {
+            'before': {name: getattr(before, name) for name in names},
+            'tuned': {name: getattr(tuned, name) for name in names},
+            'log_factors': dict(
+                zip([kind.name for kind in kinds], found.log_factors.tolist(), strict=True)
+            ),
+            'log_factor_deviations': {
+                kind.name: deviation if math.isfinite(deviation) else None
+                for kind, deviation in zip(kinds, deviations, strict=True)
+            },
+            'held_out': asdict(verdict),
+        }
+        print_json(figures)
+        return
+    rows = {}
+    for kind, text in zip(kinds, _certainties(found), strict=True):
+        for name in kind.parameters:
+            rows[name] = f'{getattr(before, name)} → {getattr(tuned, name)}'
+        rows[kind.name] = text
+    held_out = {f'held out: {name}': text for name, text in verdict_lines(verdict).items()}
+    print_table('noise', rows | held_out)

@@ -1,0 +1,88 @@
+"""The recordings of a tuning: what is trained on, and what is held out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from slam_observer_ros.cli.replay.asked import Asked
+from slam_observer_ros.cli.replay.identity import sha256_of
+from slam_observer_ros.cli.replay.run import select_inputs
+from slam_observer_ros.cli.tune.verdict import Judged
+from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import Event, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.runs.likelihood import Likelihood, LikelihoodRecorder
+from slam_observer_ros.runs.replay import replay
+from slam_observer_ros.settings.estimator_settings import Settings
+
+HELD_OUT_SHARE = 1.0 / 3.0
+"""Part of a recording, at its end, that is held out where no other recording is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """A recording's events; those from ``split_ns`` on are held out, of what is trained on."""
+
+    path: Path
+    sha256: str
+    events: Sequence[Event]
+    truth: Truth
+    reach_m: float
+    split_ns: int
+
+    def likelihood(self, settings: Settings) -> Likelihood:
+        """Return that of the part to train on."""
+        recorder = self._recorder(settings)
+        estimator = Estimator(settings, on_update=recorder.note_update, judges_innovations=True)
+        for event in self.events:
+            if event.stamp_ns < self.split_ns:
+                estimator.add(event)
+        estimator.flush()
+        return recorder.likelihood
+
+    def judged(self, settings: Settings) -> Judged:
+        """Return how settings do on the part that is held out, after all that was before it."""
+        recorder, is_held_out = self._recorder(settings), self.truth.stamps_ns >= self.split_ns
+        stamps_ns, poses = self.truth.stamps_ns[is_held_out], self.truth.poses[is_held_out]
+        truth = replace(self.truth, stamps_ns=stamps_ns, poses=poses)
+        result = replay(self.events, settings, truth, recorders=[recorder])
+        likelihood = recorder.likelihood
+        return Judged(
+            likelihood.select(likelihood.stamps_ns >= self.split_ns),
+            result.configuration.rmse_m,
+            result.configuration.anees,
+        )
+
+    def _recorder(self, settings: Settings) -> LikelihoodRecorder:
+        return LikelihoodRecorder(axes_of(settings.two_d_mode).point, self.reach_m)
+
+
+def read_material(
+    args: argparse.Namespace, path: Path, asked: Asked, held_out_share: float
+) -> Material:
+    """Read a recording, of which the last part is to be held out."""
+    with Recording(path) as recording:
+        selected, inputs, truth = select_inputs(args, recording, asked)
+        events = list(recording.events(selected, inputs, asked.settings.velocity_timeout))
+    seen = [event for event in events if isinstance(event, ObservationEvent) and len(event.ids)]
+    if not seen:
+        raise UsageError(f'{path}: no landmark is seen')
+    ids = np.concatenate([event.ids for event in seen])
+    if 2 * np.count_nonzero(ids == UNKNOWN_ID) > len(ids):
+        raise UsageError(
+            f'{path}: tune needs landmarks with ids: without, what is taken for which depends on '
+            'the noise itself'
+        )
+    stamps_ns = [event.stamp_ns for event in events]
+    first_ns, last_ns = min(stamps_ns), max(stamps_ns)
+    split_ns = last_ns + 1 - round(held_out_share * (last_ns + 1 - first_ns))
+    reach_m = max(float(np.linalg.norm(event.points, axis=1).max()) for event in seen)
+    return Material(path, sha256_of(path), events, truth, reach_m, split_ns)

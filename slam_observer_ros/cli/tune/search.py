@@ -1,0 +1,109 @@
+"""The most likely factors, and how sure they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from scipy import optimize
+
+from slam_observer_ros.common.types import FloatArray
+
+LARGEST = math.log(32.0)
+"""Logarithm of the factor by which a figure changes at most."""
+
+FIRST_STEP = math.log(2.0)
+CURVATURE_STEP = 0.2
+"""Steps of the search at first, and by which the curvature is measured, as logarithms."""
+
+EVALUATIONS = 15
+"""How often the likelihood is computed at most in the search, for each factor."""
+
+TOLERANCE = 0.03
+"""How near the factors come to the most likely ones, as a share."""
+
+NO_EFFECT = 1e-6
+"""Change of the log likelihood below which a factor has none."""
+
+Objective = Callable[[FloatArray], float]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Logarithms (n,) of the most likely factors.
+
+    ``deviations`` (n,) are by the curvature of the log likelihood, where all others are unknown,
+    too; infinite where it has no maximum there.
+    """
+
+    log_factors: FloatArray
+    deviations: FloatArray
+    log_likelihood: float
+
+
+def without_effect(objective: Objective, n: int) -> list[int]:
+    """Return which of n factors change nothing."""
+    nominal = objective(np.zeros(n))
+    steps = FIRST_STEP * np.eye(n)
+    return [i for i in range(n) if abs(objective(steps[i]) - nominal) < NO_EFFECT]
+
+
+def most_likely(objective: Objective, n: int) -> Found:
+    """Return the maximum of a log likelihood over the logarithms of n factors, from 1 on."""
+    simplex = np.vstack([np.zeros(n), FIRST_STEP * np.eye(n)])
+    result = optimize.minimize(
+        lambda x: -objective(x),
+        np.zeros(n),
+        method='Nelder-Mead',
+        bounds=[(-LARGEST, LARGEST)] * n,
+        options={
+            'initial_simplex': simplex,
+            'maxfev': EVALUATIONS * n,
+            'xatol': TOLERANCE,
+            'fatol': 0.5 * TOLERANCE,
+        },
+    )
+    best = np.asarray(result.x, dtype=np.float64)
+    return Found(best, _deviations(objective, best), objective(best))
+
+
+def _deviations(objective: Objective, x: FloatArray) -> FloatArray:
+    """Return the standard deviations (n,) that the curvature at a maximum says."""
+    n, h = len(x), CURVATURE_STEP
+    steps = h * np.eye(n)
+    middle = objective(x)
+    sides = np.array([[objective(x + step), objective(x - step)] for step in steps])
+    H = np.diag(2.0 * middle - sides.sum(axis=1)) / h**2  # of minus the log likelihood
+    for i in range(n):
+        for j in range(i):
+            both = objective(x + steps[i] + steps[j])
+            H[i, j] = H[j, i] = (sides[i, 0] + sides[j, 0] - middle - both) / h**2
+    return _inverted(H)
+
+
+def _inverted(H: FloatArray) -> FloatArray:
+    deviations = np.full(len(H), math.inf)
+    curved = np.flatnonzero(np.diagonal(H) > 0.0)
+    while len(curved):
+        part = H[np.ix_(curved, curved)]
+        values, vectors = np.linalg.eigh(part)
+        if values[0] > 0.0:
+            deviations[curved] = np.sqrt(np.diagonal(np.linalg.inv(part)))
+            break
+        curved = np.delete(curved, np.argmax(np.abs(vectors[:, 0])))
+    return deviations
+
+
+def remembered(objective: Callable[[Sequence[float]], float]) -> Objective:
+    """Return a function that computes nothing twice."""
+    known: dict[tuple[float, ...], float] = {}
+
+    def value(x: FloatArray) -> float:
+        key = tuple(x.tolist())
+        if key not in known:
+            known[key] = objective(key)
+        return known[key]
+
+    return value
