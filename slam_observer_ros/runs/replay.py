@@ -22,12 +22,15 @@ from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
 from slam_observer_ros.events import AngularVelocityEvent, Event, VelocityBlock
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.recording.recorded_truth import LandmarkTracks, Truth
 from slam_observer_ros.runs.sampling import DeadReckoning, TrajectorySampler
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
 
 P = ParamSpec('P')
+
+MOST_UNCOMPARED = 64
+"""Observations that are compared with the truth at once: one by one costs three times as much."""
 
 NEES_PERIOD_NS = 5_000_000_000
 """Time between two covariances of the configuration, nanoseconds: they cost O(n³)."""
@@ -167,6 +170,8 @@ class _RunningReplay:
         self._dead_reckoning = DeadReckoning(self._keep_all)
         self._configuration = ConfigurationError()
         self._updates: list[Update] = []
+        # Updates, with ids (n,) and positions (n, 3) of the landmarks, that await the truth.
+        self._uncompared: list[tuple[Update, IntArray, FloatArray]] = []
         self._start_ns: int | None = None
         self._localised_ns: tuple[int, int] | None = None
         self._next_nees_ns = 0
@@ -194,6 +199,8 @@ class _RunningReplay:
         start_s = time.thread_time()
         self._estimator.flush()
         self._seconds += time.thread_time() - start_s
+        if self._pose_truth is not None and self._landmark_tracks is not None:
+            self._compare(self._pose_truth, self._landmark_tracks, is_nees_due=False)
         updates = self._updates
         counts = np.array([len(update.residuals) for update in updates], dtype=np.int64)
         stamps_ns = np.array([update.stamp_ns for update in updates], dtype=np.int64)
@@ -265,23 +272,34 @@ class _RunningReplay:
         self._used_points = used
 
     def _compare_with_truth(self, update: Update) -> None:
+        """Keep what is compared with the truth; compare it now if a covariance may be due."""
         if self._pose_truth is None or self._landmark_tracks is None:
             return
-        true_poses, covered = interpolate(self._pose_truth, np.array([update.stamp_ns]))
-        if not covered[0]:
-            return
-        ids = self._estimator.landmark_ids
+        ids, points = self._estimator.landmark_ids, self._estimator.world_points
+        self._uncompared.append((update, ids, points))
         has_errors = len(ids) > 0 and not self._in_fixed_map
         is_nees_due = has_errors and update.stamp_ns >= self._next_nees_ns
-        if is_nees_due:
-            self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
-        self._configuration.add(
-            update.stamp_ns,
-            update.pose,
-            ids,
-            self._estimator.world_points,
-            true_poses[0],
-            self._landmark_tracks.at(update.stamp_ns),
-            self._estimator.configuration_covariance if is_nees_due else None,
-            update.ids[~update.rejected],
-        )
+        if is_nees_due or len(self._uncompared) == MOST_UNCOMPARED:
+            self._compare(self._pose_truth, self._landmark_tracks, is_nees_due)
+
+    def _compare(self, poses: Trajectory, tracks: LandmarkTracks, is_nees_due: bool) -> None:
+        """Compare what is kept with the truth; a covariance is known of the last of it."""
+        kept, self._uncompared = self._uncompared, []
+        stamps_ns = np.array([update.stamp_ns for update, *_ in kept], dtype=np.int64)
+        true_poses, covered = interpolate(poses, stamps_ns)
+        for row in np.flatnonzero(covered).tolist():
+            update, ids, points = kept[row]
+            covariance_of = None
+            if is_nees_due and row == len(kept) - 1:
+                self._next_nees_ns = update.stamp_ns + NEES_PERIOD_NS
+                covariance_of = self._estimator.configuration_covariance
+            self._configuration.add(
+                update.stamp_ns,
+                update.pose,
+                ids,
+                points,
+                true_poses[row],
+                tracks.at(update.stamp_ns),
+                covariance_of,
+                update.ids[~update.rejected],
+            )
