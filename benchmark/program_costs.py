@@ -15,7 +15,7 @@ from estimators import EKF
 from step_costs import drive, ESTIMATORS, make, settings_for
 import worlds
 
-TURNS = 5
+TURNS = 3
 LONGEST_S = 300.0
 FEW, MANY, SEEN = 10, 1000, 10  # landmarks, for the memory of one
 COMMAND = [sys.executable, '-m', 'slam_observer_ros.cli.main']

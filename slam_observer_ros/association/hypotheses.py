@@ -92,16 +92,15 @@ class Hypotheses:
         self._all = self._all[:1]
         return self.best
 
-    def pose_covariance_after(
+    def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
-    ) -> FloatArray | None:
-        """Return the covariance (6, 6) of the most likely pose at ``end_ns``; None if unknown.
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the most likely pose (4, 4) at ``end_ns``, and its covariance (6, 6) if known.
 
         Hypotheses are moved on from ``start_ns``, and the most likely one may be wrong.
         """
-        return self._mixed(
-            [one.state.pose_after(velocities, start_ns, end_ns) for one in self._all]
-        )
+        of_each = [one.state.pose_after(velocities, start_ns, end_ns) for one in self._all]
+        return of_each[0][0], self._mixed(of_each)
 
     def poses_until(
         self,

@@ -15,7 +15,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import Update
-from slam_observer_ros.estimator.estimator import Estimator
 
 OUTLIERS = 0.02
 """Share of the points that are taken for outliers: sensors have some per cent of them."""
@@ -66,9 +65,6 @@ class LikelihoodRecorder:
         self._stamps_ns: list[int] = []
         self._log_densities: list[FloatArray] = []
         self._shares: list[FloatArray] = []
-
-    def note_stamp(self, estimator: Estimator) -> None:
-        """Take no notice: innovations come with observations."""
 
     def note_update(self, update: Update) -> None:
         """Take in an observation, of which the estimator has judged the innovation."""

@@ -133,7 +133,8 @@ class Calibration:
     ) -> FloatArray:
         """Return :meth:`sensitivity` until each pose (k + 1, p, c); no delay is estimated."""
         shares = 0.5 * self._rates(measured_velocities) * dt_s[:, None]
-        return se3.summed_until((Ad[:-1] + Ad[1:])[:, :, self._calibrated] * shares[:, None, :])
+        of_rates = Ad[:, :, self._calibrated]
+        return se3.summed_until((of_rates[:-1] + of_rates[1:]) * shares[:, None, :])
 
     def _rates(self, measured_velocities: FloatArray) -> FloatArray:
         """Return (k, …) how fast each scale and bias moves the robot per unit of its error."""

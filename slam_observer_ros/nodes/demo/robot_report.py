@@ -25,6 +25,11 @@ class Restart:
     ended_s: float | None = None
     localised_s: float | None = None
 
+    @property
+    def moved_s(self) -> float:
+        """For how long the robot moved before it was localised again; its time stood still."""
+        return (self.localised_s or 0.0) - (self.ended_s or 0.0)
+
     def back_after_s(self, seen: list[Seen]) -> float | None:
         """Return how long after enough tags were in view map → odom was there; None if never."""
         ended_s, localised_s = self.ended_s, self.localised_s
@@ -61,7 +66,8 @@ def report(robot: HallRobot, restart: Restart, rate_hz: float, console: Console)
                 'ANEES of amcl_pose': f'{anees:.2f} (1 is consistent)',
                 f'restarted at {restart.planned_s:g} s': 'not localised again'
                 if back_s is None
-                else f'localised again {back_s:.2f} s after the next {ENOUGH_TAGS} tags',
+                else f'localised again {restart.moved_s:.2f} s after it drove on, '
+                f'{back_s:.2f} s after the next {ENOUGH_TAGS} tags',
             },
         )
     )

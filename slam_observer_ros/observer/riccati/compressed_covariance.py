@@ -41,9 +41,9 @@ class BlockSize:
     """How many landmarks are active."""
 
     dense: int = 200  # as long as there are no more, all are
-    most: int = 64  # then at most so many, or twice as many as are kept
-    kept: int = 16  # when others become active, at least so many nearest to the robot are kept
-    kept_per_seen: int = 4  # or so many times as many as are seen
+    most: int = 48  # then at most so many, or twice as many as are kept
+    kept: int = 12  # when others become active, at least so many nearest to the robot are kept
+    kept_per_seen: int = 3  # or so many times as many as are seen
 
 
 class CompressedCovariance(JointCovariance):
