@@ -3,16 +3,39 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
-from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.common.types import IntArray
+from slam_observer_ros.estimates import CalibrationEstimate, Update
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 OK, WARN = 0, 1
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 
 
-def estimator_values(estimator: Estimator, dropped: Counter[str]) -> dict[str, str]:
+class Diagnosed(Protocol):
+    """What is looked at of an :class:`.Estimator`."""
+
+    last_update: Update | None
+
+    @property
+    def counts(self) -> Counter[str]: ...  # noqa: D102 (as all below, of the estimator)
+    @property
+    def dropped(self) -> Counter[str]: ...  # noqa: D102
+    @property
+    def landmark_ids(self) -> IntArray: ...  # noqa: D102
+    @property
+    def calibration(self) -> Sequence[CalibrationEstimate]: ...  # noqa: D102
+    @property
+    def lyapunov(self) -> float: ...  # noqa: D102
+    @property
+    def stamp_ns(self) -> int | None: ...  # noqa: D102
+    @property
+    def velocity_is_stale(self) -> bool: ...  # noqa: D102
+
+
+def estimator_values(estimator: Diagnosed, dropped: Counter[str]) -> dict[str, str]:
     """Return what was used, what was dropped and why, the map's size and the calibration."""
     update = estimator.last_update
     values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
@@ -24,7 +47,7 @@ def estimator_values(estimator: Estimator, dropped: Counter[str]) -> dict[str, s
     return values
 
 
-def estimator_warnings(estimator: Estimator) -> list[str]:
+def estimator_warnings(estimator: Diagnosed) -> list[str]:
     """Return what is wrong with the velocity, by the estimate alone."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
     warnings = ['no velocity in force: the pose is held'] if stale else []
@@ -32,7 +55,7 @@ def estimator_warnings(estimator: Estimator) -> list[str]:
 
 
 def diagnostics(
-    messages: OutgoingMessages, stamp_ns: int, estimator: Estimator, hardware_id: str
+    messages: OutgoingMessages, stamp_ns: int, estimator: Diagnosed, hardware_id: str
 ) -> Any:
     """Make the diagnostic_msgs/DiagnosticArray of an estimate, named as the node's."""
     warnings = estimator_warnings(estimator)
