@@ -54,6 +54,10 @@ def main() -> None:
     replay(CHECKOUT / 'samples' / 'sample.mcap', 60.0, 'sample')
     data = Path(os.environ.get('SLAM_OBSERVER_DATA', CHECKOUT / '..' / 'shared' / 'data'))
     with tempfile.TemporaryDirectory() as directory:
+        circle = Path(directory) / 'circle.mcap'
+        if slam_observer(['simulate', '--bias', '1.5', '--output', str(circle)]):
+            sys.exit('the circle could not be simulated')
+        replay(circle, 1.0, 'circle', '--gains', 'constant')
         if (folder := data / 'mrclam' / 'MRCLAM_Dataset6').is_dir():
             recording = convert(directory, 'mrclam6_4', 'mrclam', str(folder), '--robot', '4')
             replay(recording, 320.0, 'mrclam6_4', '--config', 'wheeled_bearing_range')

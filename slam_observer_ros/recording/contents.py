@@ -60,17 +60,17 @@ class Contents:
         """Return the frame that the poses of an odometry are in."""
         return self._frame(odometry, lambda raw: [decode_pose(raw)]).lstrip('/')
 
-    def has_parent_of(self, frame: str, selected: SelectedTopics) -> bool:
-        """Return whether a transform on /tf_static or /tf places a frame in another one."""
-        return any(child == frame for _, child in self._transforms(selected))
+    def has_parent_of(self, frame: str, topics: Sequence[Topic]) -> bool:
+        """Return whether a transform on some topics places a frame in another one."""
+        return any(child == frame for _, child in self._transforms(topics))
 
     def has_transform_of(self, frame: str, selected: SelectedTopics) -> bool:
         """Return whether a transform on /tf_static or /tf is from or to a frame."""
-        return any(frame in ends for ends in self._transforms(selected))
-
-    def _transforms(self, selected: SelectedTopics) -> Iterator[tuple[str, str]]:
-        """Yield parent and child of each transform."""
         topics = (*selected.transforms.static, *selected.transforms.moving)
+        return any(frame in ends for ends in self._transforms(topics))
+
+    def _transforms(self, topics: Sequence[Topic]) -> Iterator[tuple[str, str]]:
+        """Yield parent and child of each transform."""
         for message in self._decoded(topics, decode_transform_message):
             for transform in message:
                 yield transform.frame_id.lstrip('/'), transform.child_frame_id.lstrip('/')

@@ -217,6 +217,15 @@ class Recording:
             *selected.transforms.moving,
             *(topic for topic in optional if topic is not None),
         ]
+        return self._copy(writer, selected, topics)
+
+    def copy_static_to(self, writer: RecordingWriter, selected: SelectedTopics) -> None:
+        """Write the poses of sensors that were read, as they were received."""
+        self._copy(writer, selected, selected.transforms.static)
+
+    def _copy(
+        self, writer: RecordingWriter, selected: SelectedTopics, topics: Sequence[Topic]
+    ) -> list[Topic]:
         known = [topic for topic in topics if writer.knows(topic.message_type)]
         latched = (*selected.transforms.static, selected.landmark_truth)
         for raw in self._source.messages(known):

@@ -19,6 +19,7 @@ from slam_observer_ros.messages.state_messages import (
     uncertain_pose,
 )
 from slam_observer_ros.recording.writer import RecordingWriter
+from slam_observer_ros.runs.health import diagnostics
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
@@ -27,7 +28,10 @@ OVERVIEW_PERIOD_NS = 1_000_000_000
 
 ODOMETRY_TOPIC = '/observer_node/odometry'
 MAP_TOPIC = '/landmark_map'
-TOPICS = (ODOMETRY_TOPIC, '/pose', '/lyapunov', '/path', MAP_TOPIC, '/markers')
+DIAGNOSTICS_TOPIC = '/diagnostics'
+TOPICS = (
+    ODOMETRY_TOPIC, '/pose', '/lyapunov', '/path', MAP_TOPIC, '/markers', DIAGNOSTICS_TOPIC,
+)  # fmt: skip
 """Topics of the estimate, named as the node's."""
 
 ALIGNED_POSE_TOPIC = '/aligned_truth/pose'
@@ -142,6 +146,11 @@ class EstimateWriter:
         self._write(MAP_TOPIC, cloud, stamp_ns, latched=True)
         markers = self._messages.markers.landmarks(stamp_ns, *landmarks, estimator.last_update)
         self._write('/markers', markers, stamp_ns)
+        self._write(
+            DIAGNOSTICS_TOPIC,
+            diagnostics(self._writer.messages, stamp_ns, estimator, self._base_frame),
+            stamp_ns,
+        )
         for part in estimator.calibration:
             topic = f'/calibration/{part.name}'
             self._write(topic, self._messages.value(part.value), stamp_ns)

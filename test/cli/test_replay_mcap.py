@@ -8,9 +8,13 @@ from pathlib import Path
 from command_line import CommandLine
 import numpy as np
 import pytest
-from recordings import MESSAGE_COUNT, write_mcap
+from recordings import events, MESSAGE_COUNT, write_mcap
+import ros_messages as ros
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
+
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.recording.writer import RecordingWriter
 
 LAYOUT = Path(__file__).resolve().parents[2] / 'foxglove' / 'replay.json'
 
@@ -85,6 +89,32 @@ def test_landmarks_have_ellipsoids_and_residuals_are_in_standard_deviations(
         values = [m.data for m in found[f'/residual_sigma/landmark_{landmark_id}']]
         assert len(values) == MESSAGE_COUNT / 2 - 1
     assert '/calibration/angular_bias_z' in found
+
+
+def test_it_has_diagnostics_of_the_estimate(slam_observer, recording, tmp_path):
+    written = tmp_path / 'estimate.mcap'
+    figures = slam_observer.succeed('replay', recording, '--mcap', written, '--json').json
+    (status,) = messages_of(written)['/diagnostics'][-1].status
+    assert (status.name, status.message) == ('observer_node: estimate', 'running')
+    values = {value.key: value.value for value in status.values}
+    assert values['landmarks known'] == '3'
+    assert values['used: observed_point'] == str(figures['used']['observed_point'])
+
+
+def test_it_has_where_the_sensors_are_on_the_robot(slam_observer, recording, tmp_path):
+    mounted, written = tmp_path / 'mounted.mcap', tmp_path / 'estimate.mcap'
+    camera = se3.pose(np.eye(3), np.array([0.1, 0.0, 0.2]))
+    with RecordingWriter(mounted) as writer:
+        for event in events():
+            writer.write_event(event)
+        transform = writer.messages.transform_stamped(ros.STAMP_NS, 'base_link', 'camera', camera)
+        message = writer.messages.make('tf2_msgs/msg/TFMessage', transforms=[transform])
+        writer.write_message('/tf_static', message, ros.STAMP_NS, latched=True)
+    slam_observer.succeed('replay', mounted, '--mcap', written)
+    found = messages_of(written)
+    (transform,) = found['/tf_static'][0].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ('base_link', 'camera')
+    assert found['/tf']
 
 
 def test_the_truth_is_moved_to_the_estimate(slam_observer, recording, tmp_path):

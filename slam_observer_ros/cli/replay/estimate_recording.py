@@ -54,10 +54,13 @@ def estimate_writer(
 
     base_frame = inputs.base_frame or InputSettings().base_frame
     with RecordingWriter(args.mcap, overwrite=args.force) as writer:
-        has_parent = False
+        transforms, has_parent = selected.transforms, False
         if args.with_inputs:
             _copy_inputs(recording, selected, writer)
-            has_parent = recording.contents.has_parent_of(base_frame, selected)
+            topics = (*transforms.static, *transforms.moving)
+            has_parent = recording.contents.has_parent_of(base_frame, topics)
+        elif not recording.contents.has_parent_of(base_frame, transforms.static):
+            recording.copy_static_to(writer, selected)  # where the sensors are on the robot
         if has_parent:
             logger.warning(
                 "%s has no transform from '%s' to '%s': the inputs on /tf have another parent of "

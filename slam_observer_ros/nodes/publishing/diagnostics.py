@@ -17,6 +17,7 @@ from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus
+from slam_observer_ros.runs.health import estimator_values, estimator_warnings
 
 SILENT_S = 2.0  # an input without messages for this long is a warning
 RECENT = 30  # statuses, of about a second each, over which rejected points are counted
@@ -100,15 +101,8 @@ class DiagnosticsPublisher:
         return values
 
     def _estimator_values(self) -> dict[str, str]:
-        estimator, update = self._estimator, self._estimator.last_update
-        values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
-        dropped = self._dropped()
-        values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
-        values['landmarks known'] = str(len(estimator.landmark_ids))
-        values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
+        values = estimator_values(self._estimator, self._dropped())
         values['processing time, mean [ms]'] = f'{self._feed.take_mean_processing_ms():.3f}'
-        values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
-        values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
         return values
 
     def _progress(self) -> tuple[Counter[str], Counter[str]]:
@@ -138,9 +132,7 @@ class DiagnosticsPublisher:
             warnings.append(f'{dropped.total()} message{plural} dropped ({reasons})')
         warnings.append(self._points_warning(new))
         warnings.append(self._rejections_warning(new))
-        if self._estimator.stamp_ns is not None and self._estimator.velocity_is_stale:
-            warnings.append('no velocity in force: the pose is held')
-        warnings += [part.problem for part in self._estimator.calibration]
+        warnings += estimator_warnings(self._estimator)
         warnings.append(self._estimate_publisher.problem)
         if not self._estimator.is_localised:
             warnings.append('the pose in the loaded map is not known yet: no pose is published')
