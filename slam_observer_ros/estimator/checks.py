@@ -118,6 +118,10 @@ def check_map(landmark_map: LandmarkMap) -> None:
         if landmark_map.covariances is not None:
             _check_array('map covariances', landmark_map.covariances, (n, 3, 3))
             _check_definite('map covariances', landmark_map.covariances)
+        if landmark_map.orientations is not None:
+            _check_rotations('map orientations', landmark_map.orientations, n)
+        if landmark_map.orientation_sigmas is not None:
+            _check_array('map orientation sigmas', landmark_map.orientation_sigmas, (n,))
     except InvalidEventError as error:
         raise MapError(str(error)) from error
     if ids.dtype.kind not in 'iu' or np.any((ids < 0) | (ids > MAX_ID)):
@@ -199,16 +203,19 @@ def _check_observation(event: ObservationEvent) -> None:
 
 
 def _check_orientations(event: ObservationEvent) -> None:
-    """Check that all are rotations (m, 3, 3), or all zero for unknown ones."""
+    """Check that orientations are rotations, or all zero where unknown."""
     m = len(event.ids)
     if event.orientations is not None:
-        _check_array('landmark orientations', event.orientations, (m, 3, 3))
-        known = event.orientations[event.orientations.any(axis=(1, 2))]
-        if not _are_rotations(known):
-            raise InvalidEventError('bad_orientation', 'a landmark orientation is no rotation')
+        _check_rotations('landmark orientations', event.orientations, m)
     if event.orientation_covariances is not None:
         _check_array('orientation covariances', event.orientation_covariances, (m, 3, 3))
         _check_definite('orientation covariances', event.orientation_covariances)
+
+
+def _check_rotations(name: str, orientations: FloatArray, m: int) -> None:
+    _check_array(name, orientations, (m, 3, 3))
+    if not _are_rotations(orientations[orientations.any(axis=(1, 2))]):
+        raise InvalidEventError('bad_orientation', f'{name}: one is no rotation')
 
 
 def _are_rotations(R: FloatArray) -> bool:

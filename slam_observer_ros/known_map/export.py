@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import with_variances_above
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.merging import shape_covariances
@@ -21,9 +22,22 @@ def map_of(state: State, is_own_frame: bool) -> LandmarkMap:
         covariances = shape_covariances(state, rows)
     elif (covariances := state.landmark_covariances()) is not None:
         covariances = covariances[rows]
+    orientations, sigmas = _orientations_of(state, rows)
     return LandmarkMap(
         state.landmarks.ids[rows],
         state.world_points[rows],
         None if covariances is None else with_variances_above(0.0, covariances),
         state.landmarks.counts[rows],
+        orientations=orientations,
+        orientation_sigmas=sigmas,
     )
+
+
+def _orientations_of(state: State, rows: IntArray) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return orientations (m, 3, 3) in the world, and standard deviations (m,), rad."""
+    tags = state.filter.orientations
+    if tags is None or not tags.are_known[rows].any():
+        return None, None
+    return state.observer.reference_pose[:3, :3] @ tags.B[rows], state.filter.orientation_sigmas(
+        rows
+    ) * tags.are_known[rows]

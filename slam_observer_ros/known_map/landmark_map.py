@@ -18,12 +18,24 @@ class LandmarkMap:
     covariances: FloatArray | None  # (n, 3, 3) of the positions, m²; None if unknown
     counts: IntArray  # (n,) in how many observations each was seen; zero for surveyed ones
     frame_id: str = 'map'
+    # (n, 3, 3) of tags, from their own axes, all zero for points; None if all are points
+    orientations: FloatArray | None = None
+    orientation_sigmas: FloatArray | None = None  # (n,) of rotation vectors, rad, each axis
 
     def select(self, rows: IntArray | BoolArray) -> LandmarkMap:
         """Return the map of the landmarks at ``rows``."""
-        covariances = None if self.covariances is None else self.covariances[rows]
+
+        def part(array: FloatArray | None) -> FloatArray | None:
+            return None if array is None else array[rows]
+
         return LandmarkMap(
-            self.ids[rows], self.world_points[rows], covariances, self.counts[rows], self.frame_id
+            self.ids[rows],
+            self.world_points[rows],
+            part(self.covariances),
+            self.counts[rows],
+            self.frame_id,
+            part(self.orientations),
+            part(self.orientation_sigmas),
         )
 
     @property

@@ -10,7 +10,8 @@ The same format serves saved maps and surveyed ones. A surveyor writes no more t
 
 ``sigma`` is the standard deviation of each coordinate, metres; a saved map has the whole
 ``covariance`` (m²) instead, ``observations`` (how often each landmark was seen), and in its head
-the ``package_version`` and ``settings`` with which it was made.
+the ``package_version`` and ``settings`` with which it was made. A tag may have an ``orientation``,
+a quaternion x y z w from its own axes, and its ``orientation_sigma``, rad, about each axis.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from slam_observer_ros.common.yaml_files import (
     plain_value,
 )
 from slam_observer_ros.events import MAX_ID
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -52,8 +54,13 @@ _MAX_NUMBER = 1e12
 _ROUNDING = 1e-6
 """By how much a correlation of a covariance may miss being one."""
 
+_ROUNDED_NORM = 1e-2
+"""By how much the norm of a quaternion that somebody wrote down may miss being one."""
+
 _LEAST_DEVIATION = 1e-4
 """Metres; entries of smaller standard deviations are compared with this one."""
+
+_OPTIONAL = ('sigma', 'covariance', 'observations', 'orientation', 'orientation_sigma')
 
 _Dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
@@ -167,6 +174,11 @@ def _as_mappings(landmark_map: LandmarkMap) -> list[dict[str, Any]]:
     if landmark_map.covariances is not None:
         for landmark, covariance in zip(landmarks, landmark_map.covariances, strict=True):
             landmark['covariance'] = covariance.tolist()
+    R, sigmas = landmark_map.orientations, landmark_map.orientation_sigmas
+    if R is not None and sigmas is not None:
+        for i in np.flatnonzero(R.any(axis=(1, 2))).tolist():
+            landmarks[i]['orientation'] = so3.to_quaternion(R[i]).tolist()
+            landmarks[i]['orientation_sigma'] = float(sigmas[i])
     return landmarks
 
 
@@ -200,13 +212,14 @@ def _parse(content: Any) -> LandmarkMap:
         _covariances(rows),
         np.array([_observations(row) for row in rows], dtype=np.int64),
         frame_id,
+        *_orientations(rows),
     )
 
 
 def _landmark_id(row: Any, index: int) -> int:
     who = f'entry {index} of landmarks'
     _expect(isinstance(row, dict), f'{who} is not of the form {{id: …, position: …}}')
-    _check_names(who, row, ('id', 'position'), ('sigma', 'covariance', 'observations'))
+    _check_names(who, row, ('id', 'position'), _OPTIONAL)
     landmark_id = _natural(row['id'], f"{who}: 'id'")
     _expect(landmark_id <= MAX_ID, f"{who}: 'id' is {landmark_id}, beyond {MAX_ID}")
     return landmark_id
@@ -218,6 +231,27 @@ def _position(row: Mapping[str, Any]) -> list[float]:
 
 def _observations(row: Mapping[str, Any]) -> int:
     return _natural(row.get('observations', 0), f"landmark {row['id']}: 'observations'")
+
+
+def _orientations(
+    rows: Sequence[Mapping[str, Any]],
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return orientations (n, 3, 3), zero for points, and sigmas (n,), rad; None without any."""
+    if not any('orientation' in row for row in rows):
+        return None, None
+    R, sigmas = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
+    for i, row in enumerate(rows):
+        who = f'landmark {row["id"]}'
+        given = [name for name in ('orientation', 'orientation_sigma') if name in row]
+        _expect(len(given) != 1, f"{who} needs both 'orientation' and 'orientation_sigma'")
+        if given:
+            quaternion = np.array(_numbers(row['orientation'], 4, f"{who}: 'orientation'"))
+            is_turn = abs(np.linalg.norm(quaternion) - 1.0) < _ROUNDED_NORM
+            _expect(is_turn, f"{who}: 'orientation' is no quaternion x y z w of norm 1")
+            R[i] = so3.from_quaternion(quaternion)
+            (sigmas[i],) = _numbers([row['orientation_sigma']], 1, f"{who}: 'orientation_sigma'")
+            _expect(sigmas[i] >= 0.0, f"{who}: 'orientation_sigma' is negative")
+    return R, sigmas
 
 
 def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:

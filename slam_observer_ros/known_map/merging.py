@@ -160,7 +160,19 @@ def _complete(state: State, known: LandmarkMap) -> None:
         _fix(state, known)
     else:
         state.filter.add_known(*_in_reference_frame(state, new))
+    _take_orientations(state, known)
     state.forget_past('the pose in the loaded map was found')
+
+
+def _take_orientations(state: State, known: LandmarkMap) -> None:
+    """Take in what a map knows of orientations, where they are estimated."""
+    R, sigmas = known.orientations, known.orientation_sigmas
+    if state.filter.orientations is None or R is None or sigmas is None:
+        return
+    rows = state.landmarks.rows_of(known.ids)
+    taken = np.flatnonzero((rows >= 0) & R.any(axis=(1, 2)))
+    B = state.observer.reference_pose[:3, :3].T @ R[taken]
+    state.filter.know_orientations(rows[taken], B, sigmas[taken])
 
 
 def _fix(state: State, known: LandmarkMap) -> None:

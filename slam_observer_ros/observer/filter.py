@@ -81,6 +81,14 @@ class Filter:
         """Take over orientations of which nothing is known yet, as they are seen."""
         raise NotImplementedError
 
+    def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
+        """Take in a map's orientations (m, 3, 3), reference frame, with ``sigmas`` (m,), rad."""
+        raise NotImplementedError
+
+    def orientation_sigmas(self, rows: IntArray) -> FloatArray:
+        """Return the standard deviations (m,) of orientations, rad."""
+        raise NotImplementedError
+
     # Landmarks
 
     def add(self, points: FloatArray, covariances: FloatArray) -> None:

@@ -39,6 +39,8 @@ class LandmarkOrientations:
         # (n,) how often each was seen and accepted, and rejections in a row up to now
         self.counts: IntArray = np.empty(0, dtype=np.int64)
         self.rejections: IntArray = np.empty(0, dtype=np.int64)
+        # (n,) standard deviations, rad, of those that are known by a map
+        self.map_sigmas: FloatArray = np.empty(0)
 
     @property
     def are_known(self) -> BoolArray:
@@ -50,10 +52,16 @@ class LandmarkOrientations:
         self.B = np.concatenate([self.B, np.zeros((m, 3, 3))])
         self.counts = np.append(self.counts, np.zeros(m, dtype=np.int64))
         self.rejections = np.append(self.rejections, np.zeros(m, dtype=np.int64))
+        self.map_sigmas = np.append(self.map_sigmas, np.zeros(m))
 
     def put(self, rows: IntArray, B: FloatArray) -> None:
         """Let landmarks have orientations (m, 3, 3), seen once."""
         self.B[rows], self.counts[rows], self.rejections[rows] = B, 1, 0
+
+    def put_known(self, rows: IntArray, B: FloatArray, sigmas: FloatArray, seen: int) -> None:
+        """Let landmarks have orientations (m, 3, 3) of a map, which count as ``seen`` so often."""
+        self.put(rows, B)
+        self.counts[rows], self.map_sigmas[rows] = seen, sigmas
 
     def clear(self, rows: IntArray) -> None:
         """Let landmarks have no orientation."""
@@ -64,6 +72,7 @@ class LandmarkOrientations:
         self.B = np.delete(self.B, rows, axis=0)
         self.counts = np.delete(self.counts, rows)
         self.rejections = np.delete(self.rejections, rows)
+        self.map_sigmas = np.delete(self.map_sigmas, rows)
 
     def turn(self, omega: FloatArray) -> None:
         """Turn all of them, B̂_i ← exp(ω_i) B̂_i, by rotation vectors (n, 3)."""

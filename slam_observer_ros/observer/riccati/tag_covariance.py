@@ -83,6 +83,10 @@ class TagCovariance(JointCovariance):
 class ExactTagMapCovariance(ExactMapCovariance, TagCovariance):
     """P of (ε, c̃) alone, in a map whose orientations are exact as well: φ_i = ε_Ω."""
 
+    def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+        """Return ξ_i (0, 3) of no landmark."""
+        return np.empty((0, 3)), None
+
     def project_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω."""
         q = self._axes.turn

@@ -12,12 +12,12 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.matrices import transpose, with_blocks
+from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose, with_blocks
 from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.observer.riccati.tag_covariance import ExactTagMapCovariance, TagCovariance
 from slam_observer_ros.observer.robust import distances, observation_weights
-from slam_observer_ros.sensor_models.observation_noise import repetition_factors
+from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 
 FLIP_EVIDENCE = 9.0
@@ -37,6 +37,7 @@ class RiccatiTagFilter(RiccatiFilter):
         super().__init__(settings, reference_pose)
         self.joint = TagCovariance(self.axes, self.calibration)
         self.orientations = LandmarkOrientations()
+        self._is_exact = False  # the map
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Move the state by what is seen of known orientations.
@@ -69,6 +70,34 @@ class RiccatiTagFilter(RiccatiFilter):
         """Take over orientations as they are seen, for those of which nothing is known."""
         self.orientations.put(seen.rows, self.observer.A[:3, :3] @ seen.Z)
         self.joint.add_turns(seen.rows, self._noise(seen.covariances))
+
+    def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
+        """Take in orientations of a map, whose errors are independent of all else."""
+        own = self.orientations.are_known[rows] & (not self._is_exact)
+        new, seen = ~own, self._settings.max_rejections
+        self.orientations.put_known(rows[new], B[new], sigmas[new], seen)
+        if self._is_exact:
+            return
+        variances = np.maximum(sigmas, RESOLUTION_RAD)[:, None, None] ** 2
+        R = variances * np.eye(self.axes.turn)
+        self.joint.add_known_turns(rows[new], R[new])
+        # Of those that both have, B̂_i B_iᵀ = exp(ω_i), unless they contradict each other.
+        known, R = rows[own], R[own]
+        omega = self.axes.turns(so3.log(self.orientations.B[known] @ transpose(B[own])))
+        near = distances(omega, self.joint.project_own_turns(known)[1], R)
+        agree = near <= self._settings.rejection_threshold
+        if agree.any():
+            HP, HPH = self.joint.project_own_turns(known[agree])
+            S = with_blocks(HPH, R[agree])
+            self._move(-self.joint.update(HP, S, omega[agree].ravel()))
+
+    def orientation_sigmas(self, rows: IntArray) -> FloatArray:
+        """Return standard deviations (m,) of orientations about the axis of the largest, rad."""
+        if self._is_exact:
+            return self.orientations.map_sigmas[rows]
+        _, P = self.joint.project_own_turns(rows)
+        largest = np.linalg.eigvalsh(diagonal_blocks(P, self.axes.turn))[:, -1]
+        return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
 
     def _turns(self, rows: IntArray, Z: FloatArray) -> FloatArray:
         """Return φ_i (m, q), rad, of orientations ``Z`` (m, 3, 3) seen, body frame."""
@@ -121,9 +150,12 @@ class RiccatiTagFilter(RiccatiFilter):
         joint = ExactTagMapCovariance(self.axes, self.joint, covariances)
         super().fix_landmarks(y_ref, covariances)
         self.joint = joint
+        self._is_exact = True
+        self.orientations = LandmarkOrientations()  # until the map says what they are
+        self.orientations.add(len(y_ref))
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x), and the orientations: B̂_i ← exp(ω_i) B̂_i."""
         super()._move(x)
-        if len(x) > self.joint.first:  # else they are exact
+        if not self._is_exact:
             self.orientations.turn(self.joint.turns(x))
