@@ -67,7 +67,8 @@ venv: $(READY)  ## only set up .venv
 lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt names
 	$(PYTHON_IN_VENV) -m pip install --quiet uv
 	$(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
-		--extra cli --extra cluster --extra test --extra dev --extra ros-jazzy --constraint constraints.txt \
+		--extra cli --extra cluster --extra rerun --extra test --extra dev --extra ros-jazzy \
+		--constraint constraints.txt \
 		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
 
 $(READY): setup.py constraints.txt requirements.lock \

@@ -56,6 +56,7 @@ setup(
         'cluster': ['distributed'],  # runs a batch on the machines of a Dask cluster
         # A ROS installation brings these itself, so nothing here may come with the package.
         **{f'ros-{ros}': [f'ros-{ros}-{wheel}' for wheel in ROS_WHEELS] for ros in ROS_RELEASES},
+        'rerun': ['rerun-sdk>=0.41; python_version >= "3.11"'],  # replay --rerun
         'test': [
             'pytest',  # named in this extra, it is what `colcon test` runs
             'pytest-timeout',  # a ROS test that hangs must fail

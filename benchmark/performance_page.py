@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import worlds
 
-from slam_observer_ros.evaluation.plots.drawing import BLUE, GREEN, GREY, RED, save, STYLE
+from slam_observer_ros.evaluation.plots.drawing import BLACK, BLUE, GREEN, PURPLE, RED, save, STYLE
 
 FIGURES = worlds.CHECKOUT / 'benchmark' / 'performance.json'
 PAGE = worlds.CHECKOUT / 'docs' / 'performance.md'
@@ -38,12 +38,12 @@ BARS = (
 """What is wanted: a text, the table, the row and the column of the figure, and its bar."""
 
 DRAWN = {
-    'constant': {'color': GREY, 'marker': 's'},
+    'constant': {'color': BLACK, 'marker': 's'},
     'scheduled': {'color': BLUE, 'marker': 'D'},
     'riccati': {'color': GREEN, 'marker': '^'},
     EKF: {'color': RED, 'marker': 'o'},
-    ISAM2_DEFAULT: {'color': '#8E5EA2', 'marker': 'v'},
-    ISAM2: {'color': '#8E5EA2', 'marker': '*', 'linestyle': '--'},
+    ISAM2_DEFAULT: {'color': PURPLE, 'marker': 'v'},
+    ISAM2: {'color': PURPLE, 'marker': '*', 'linestyle': '--'},
 }
 """Estimators in the picture, and how they are drawn."""
 

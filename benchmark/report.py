@@ -23,7 +23,7 @@ from scores import Scores
 from variants import CLEAN, FALSE_POINTS, LEFT_OUT, NO_IDS, OUTLIER_COLUMNS, OUTLIERS, WORST
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.evaluation.plots.drawing import BLUE, GREEN, GREY, RED, save, STYLE
+from slam_observer_ros.evaluation.plots.drawing import BLACK, BLUE, GREEN, RED, save, STYLE
 from slam_observer_ros.observer.designs import DESIGNS
 
 LEFT_OUT_COLUMN = 'riccati, these points left out'
@@ -32,7 +32,7 @@ GROWTH_COLUMNS = (*OUTLIER_COLUMNS, 'riccati' + WORST, LEFT_OUT_COLUMN)
 DRAWN: dict[str, dict[str, Any]] = {
     column: {'color': colour, 'marker': marker}
     for column, colour, marker in zip(
-        (*DESIGNS, EKF), (GREY, BLUE, GREEN, RED), 'sD^o', strict=True
+        (*DESIGNS, EKF), (BLACK, BLUE, GREEN, RED), 'sD^o', strict=True
     )
 }
 """Estimators in the figure, and how they are drawn."""

@@ -34,7 +34,6 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIG_FOLDER = CHECKOUT / 'config'
 VELOCITY_RATE_HZ = 20
 SPEED = 0.5
-MAX_SEEN = 5
 DETECTED_SHARE = 0.7
 LANDMARK_SPEED = (0.05, 0.3)
 
@@ -109,12 +108,14 @@ class Loop:
     landmarks : int
         How many there are.
     max_range_m : float
-        How far the sensor sees. It looks at the nearest five, and misses three in ten of them.
+        How far the sensor sees. It looks at the nearest few, and misses three in ten of them.
     observation_rate_hz : int
         A divisor of the velocities' rate, 20 Hz.
     moving_share : float
         Share of the landmarks that move, each straight on at 0.05 to 0.3 m/s: carts pushed on or
         slow robots. Each is beside the course when the robot first comes by.
+    max_seen : int
+        How many of the nearest it looks at.
 
     """
 
@@ -125,6 +126,7 @@ class Loop:
     max_range_m: float
     observation_rate_hz: int
     moving_share: float = 0.0
+    max_seen: int = 5
 
 
 STEREO_LOOP = Loop('stereo_inertial', 300.0, 390.0, 100, 6.0, 5)
@@ -243,7 +245,7 @@ def drive(loop: Loop, settings: Settings, seed: int) -> World:
         events.append(VelocityEvent(stamp_ns, velocities[min(k, len(velocities) - 1)]))
         if k % (VELOCITY_RATE_HZ // loop.observation_rate_hz) == 0:
             there = world.landmarks_at(stamp_ns)
-            seen = _look(stamp_ns, poses[k], there, loop.max_range_m, rng)
+            seen = _look(stamp_ns, poses[k], there, loop, rng)
             if len(seen.ids):
                 events.append(_measured(seen, settings, rng))
     return world
@@ -331,14 +333,14 @@ def _look(
     stamp_ns: int,
     pose: FloatArray,
     landmarks: LandmarkTruth,
-    max_range_m: float,
+    loop: Loop,
     rng: np.random.Generator,
 ) -> ObservationEvent:
     """Return where the landmarks that are seen really are, in the body frame."""
     points = se3.transform(se3.inverse(pose), landmarks.world_points)
     range_m = np.linalg.norm(points, axis=1)
-    nearest = np.argsort(range_m)[:MAX_SEEN]
-    seen = (range_m[nearest] <= max_range_m) & (rng.random(len(nearest)) < DETECTED_SHARE)
+    nearest = np.argsort(range_m)[: loop.max_seen]
+    seen = (range_m[nearest] <= loop.max_range_m) & (rng.random(len(nearest)) < DETECTED_SHARE)
     rows = np.sort(nearest[seen])
     return ObservationEvent(stamp_ns, landmarks.ids[rows], points[rows])
 

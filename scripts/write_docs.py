@@ -35,7 +35,7 @@ from slam_observer_ros.settings.parameter_table import Parameter, table
 from slam_observer_ros.simulation import Scenario
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-PAGES = ('README.md', 'docs/parameters.md', 'docs/topics.md')
+PAGES = ('docs/parameters.md', 'docs/topics.md')
 BLOCK = re.compile(r'(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)', re.DOTALL)
 
 NAMESPACE = '/robot'
@@ -182,9 +182,6 @@ def tables(observer: Interface, simulator: Interface) -> dict[str, str]:
         'outputs': topic_table('topic', observer.published, OUTPUTS),
         'services': topic_table('service', observer.services, SERVICES),
         'simulator-outputs': topic_table('topic', simulator.published, SIMULATED),
-        'first-parameters': parameter_table(
-            row for row in (*table(Settings), *table(ObserverNodeSettings)) if row.basic
-        ),
         **two_tables('estimator', table(Settings)),
         **two_tables('input', table(InputSettings)),
         **two_tables('observer-node', own_parameters()),

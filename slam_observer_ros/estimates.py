@@ -59,6 +59,7 @@ class Update:
 
     Residuals are those before the correction, along the world's axes; the rejected ones were too
     far off to be used. ``lyapunov`` is L (34) of them all; k_i is ``gain_k`` whatever the gains.
+    Those of ``moved_ids`` are taken to be somewhere else from now on.
     ``innovation`` is None unless the estimator was asked for it.
     """
 
@@ -68,6 +69,7 @@ class Update:
     residuals: FloatArray  # (m, 3) r_i, metres
     rejected: BoolArray  # (m,)
     lyapunov: float
+    moved_ids: IntArray
     innovation: NormalisedInnovation | None = None
 
 

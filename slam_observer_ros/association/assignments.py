@@ -29,7 +29,7 @@ from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
-from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.state import State
 
@@ -57,7 +57,7 @@ def find_assignments(
     axes, m = state.axes, len(event.ids)
     seen = _Points(state, event)
     at, rows = _candidates(state, index, seen)
-    residuals = _as_residuals(state.observer, seen, at, rows)
+    residuals = _as_residuals(state.filter, seen, at, rows)
     PC, CPC = state.filter.predicted(residuals)
     r, noise = residuals.on(axes)
     pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
@@ -101,7 +101,7 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     at, rows = _pairs_near(state, index, seen)
     allowed = _may_be(state, seen, at, rows)
     at, rows = at[allowed], rows[allowed]
-    distances = state.filter.distances(_as_residuals(state.observer, seen, at, rows))
+    distances = state.filter.distances(_as_residuals(state.filter, seen, at, rows))
     # Each pair passes the gate alone; a point keeps its nearest landmarks.
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
@@ -119,7 +119,7 @@ def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     of_points = C @ of_pose @ transpose(C) + seen.noise
     spread_m = _spread_m(of_points) + np.max(_spread_m(of_landmarks), initial=0.0)
     reach_m = state.settings.rejection_threshold * spread_m
-    return index.near(state.observer.points, seen.points, reach_m)
+    return index.near(state.filter.points, seen.points, reach_m)
 
 
 def _may_be(state: State, seen: _Points, at: IntArray, rows: IntArray) -> BoolArray:
@@ -130,11 +130,13 @@ def _may_be(state: State, seen: _Points, at: IntArray, rows: IntArray) -> BoolAr
     return np.asarray(np.where(known_rows >= 0, rows == known_rows, others))
 
 
-def _as_residuals(observer: Observer, seen: _Points, at: IntArray, rows: IntArray) -> Residuals:
+def _as_residuals(filter_: Filter, seen: _Points, at: IntArray, rows: IntArray) -> Residuals:
     """Return the residuals if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
-    a = observer.a[rows]
+    a = filter_.translations(rows)
     e = seen.points[at] - a
-    return Residuals(rows, e, e - observer.y_ref[rows], a, seen.noise[at], np.zeros(len(rows)))
+    return Residuals(
+        rows, e, e - filter_.observer.y_ref[rows], a, seen.noise[at], np.zeros(len(rows))
+    )
 
 
 def _largest(vectors: FloatArray) -> float:

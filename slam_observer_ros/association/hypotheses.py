@@ -76,7 +76,7 @@ class Hypotheses:
 
     def count(self, name: str) -> int:
         """Return one of the :attr:`counts`, without adding up all of them."""
-        return self._earlier_counts[name] + self.best.counts[name]
+        return self._earlier_counts.get(name, 0) + self.best.counts.get(name, 0)
 
     def __len__(self) -> int:
         """Return how many hypotheses there are."""
@@ -92,16 +92,15 @@ class Hypotheses:
         self._all = self._all[:1]
         return self.best
 
-    def pose_covariance_after(
+    def pose_after(
         self, velocities: VelocityHistory, start_ns: int, end_ns: int
-    ) -> FloatArray | None:
-        """Return the covariance (6, 6) of the most likely pose at ``end_ns``; None if unknown.
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the most likely pose (4, 4) at ``end_ns``, and its covariance (6, 6) if known.
 
         Hypotheses are moved on from ``start_ns``, and the most likely one may be wrong.
         """
-        return self._mixed(
-            [one.state.pose_after(velocities, start_ns, end_ns) for one in self._all]
-        )
+        of_each = [one.state.pose_after(velocities, start_ns, end_ns) for one in self._all]
+        return of_each[0][0], self._mixed(of_each)
 
     def poses_until(
         self,
@@ -160,10 +159,10 @@ class Hypotheses:
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
-        is_unknown = event.ids == UNKNOWN_ID
-        self._some_have_ids = self._some_have_ids or not is_unknown.all()
+        unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
+        self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         matches = [match(hypothesis.state, event) for hypothesis in self._all]
-        if len(self._all) == 1 and not is_unknown.any():
+        if len(self._all) == 1 and not unknown:
             if not self.best.filter.has_joint_covariance:
                 return self._observe_alone(event, matches[0])
             is_clear = self._limit == 1 or not is_ambiguous(self.best, matches[0])

@@ -123,7 +123,7 @@ def is_ambiguous(state: State, matched: MatchedObservation) -> bool:
     if not state.filter.has_joint_covariance:
         return False
     sensor_distances = _sensor_distances(state, residuals)
-    if (sensor_distances <= state.settings.rejection_threshold).all():
+    if not np.count_nonzero(sensor_distances > state.settings.rejection_threshold):
         return False  # by all of S they are no further off
     some_are_suspect = bool(_suspects(state, residuals, sensor_distances).any())
     return some_are_suspect or is_contradiction(_are_rejected(state, residuals))

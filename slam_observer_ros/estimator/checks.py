@@ -63,6 +63,8 @@ def check_event(event: Event, settings: Settings) -> None:
         _check_speed(event.angular_velocity, settings)
     elif isinstance(event, ObservationEvent):
         _check_observation(event)
+        if settings.use_tag_orientation:
+            _check_orientations(event)
     else:
         raise InvalidEventError('wrong_type', f'a {type(event).__name__} is no event')
     _check_times(event.stamp_ns, event.receive_ns)
@@ -194,19 +196,19 @@ def _check_observation(event: ObservationEvent) -> None:
         _check_coordinates('landmark velocities', event.velocities, (m, 3))
     if event.sensor is not None:
         _check_coordinates("sensor's positions", event.sensor, (m, 3))
+
+
+def _check_orientations(event: ObservationEvent) -> None:
+    """Check that all are rotations (m, 3, 3), or all zero for unknown ones."""
+    m = len(event.ids)
     if event.orientations is not None:
-        _check_orientations(event.orientations, m)
+        _check_array('landmark orientations', event.orientations, (m, 3, 3))
+        known = event.orientations[event.orientations.any(axis=(1, 2))]
+        if not _are_rotations(known):
+            raise InvalidEventError('bad_orientation', 'a landmark orientation is no rotation')
     if event.orientation_covariances is not None:
         _check_array('orientation covariances', event.orientation_covariances, (m, 3, 3))
         _check_definite('orientation covariances', event.orientation_covariances)
-
-
-def _check_orientations(orientations: FloatArray, m: int) -> None:
-    """Check that all are rotations (m, 3, 3), or all zero for unknown ones."""
-    _check_array('landmark orientations', orientations, (m, 3, 3))
-    known = orientations[orientations.any(axis=(1, 2))]
-    if not _are_rotations(known):
-        raise InvalidEventError('bad_orientation', 'a landmark orientation is no rotation')
 
 
 def _are_rotations(R: FloatArray) -> bool:
@@ -264,7 +266,7 @@ def usable_points(
     counts['observed_point'] += len(event.ids)
     event = flatten(event) if settings.two_d_mode else event
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
-    if reserved.any():
+    if np.count_nonzero(reserved):
         warnings.reserved_ids(event.ids[reserved].tolist())
         counts['reserved_id'] += int(np.sum(reserved))
         event = event.select(~reserved)

@@ -329,8 +329,12 @@ class Estimator:
                 timeline.velocities, timeline.state_ns or 0, stamps_ns, with_covariances
             )
         # The present stamp alone, maybe of an observation.
-        covariance = self.pose_covariance if with_covariances else None
-        return self.pose[None], None if covariance is None else covariance[None]
+        if not with_covariances:
+            return self.pose[None], None
+        pose, covariance = self._hypotheses.pose_after(
+            timeline.velocities, timeline.state_ns or 0, timeline.stamp_ns or 0
+        )
+        return pose[None], None if covariance is None else covariance[None]
 
     @property
     def pose_covariance(self) -> FloatArray | None:
@@ -341,7 +345,7 @@ class Estimator:
         """
         timeline = self._timeline
         start_ns, end_ns = timeline.state_ns or 0, timeline.stamp_ns or 0
-        return self._hypotheses.pose_covariance_after(timeline.velocities, start_ns, end_ns)
+        return self._hypotheses.pose_after(timeline.velocities, start_ns, end_ns)[1]
 
     @property
     def body_velocity(self) -> FloatArray:
@@ -571,6 +575,7 @@ class Estimator:
             se3.rotate(observer.reference_pose, outcome.residuals),
             outcome.rejected,
             lyapunov(self.settings.gain_k, outcome.residuals),
+            outcome.moved_ids,
             outcome.innovation,
         )
 

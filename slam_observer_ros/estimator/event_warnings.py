@@ -122,7 +122,7 @@ class EventWarnings:
     def unexpected_poses(self, count: Callable[[str], int]) -> None:
         """Warn that the robot is not where it was taken to be, if ``count`` says so again."""
         for name, text in UNEXPECTED_POSES.items():
-            if count(name) > self._reported[name]:
+            if count(name) > self._reported.get(name, 0):
                 self._warn(name, text)
                 self._reported[name] = count(name)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate
 
 
@@ -29,19 +29,26 @@ class Instant:
 class Innovations:
     """All residuals of a run, one row each, and its u observations of known landmarks.
 
-    ``distances`` are in standard deviations, ``residuals_m`` lengths in metres; ``weights`` are 0
-    for what was gated and below 1 for what was taken with caution.
+    ``distances`` are in standard deviations; ``weights`` are 0 for what was gated and below 1 for
+    what was taken with caution; ``moved`` is what was taken to be somewhere else from then on.
     """
 
     stamps_ns: IntArray  # (m,)
     ids: IntArray  # (m,)
     distances: FloatArray  # (m,)
-    residuals_m: FloatArray  # (m,)
+    residuals: FloatArray  # (m, 3) metres, world
     weights: FloatArray  # (m,)
+    moved: BoolArray  # (m,)
     update_stamps_ns: IntArray  # (u,)
     nis: FloatArray  # (u,) NaN where no joint covariance is known, or nothing was used
     degrees_of_freedom: IntArray  # (u,)
     lyapunov: FloatArray  # (u,)
+
+    @property
+    def residuals_m(self) -> FloatArray:
+        """(m,) lengths of the residuals, metres."""
+        lengths: FloatArray = np.linalg.norm(self.residuals, axis=1)
+        return lengths
 
     @property
     def mean_nis(self) -> float | None:

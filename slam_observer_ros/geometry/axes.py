@@ -36,12 +36,12 @@ class EstimatedAxes(Immutable):
     def output_matrix(self, lever_arms: FloatArray) -> FloatArray:
         """Return (m, point, p) blocks [−[y]×, I]: how a pose error ε moves points y (m, 3)."""
         # One product for all blocks costs a third of filling them in piece by piece.
-        C: FloatArray = lever_arms @ self._turns + self._shift
+        C: FloatArray = lever_arms.dot(self._turns) + self._shift
         return C.reshape(self._shape)
 
     def turn_matrix(self, lever_arms: FloatArray) -> FloatArray:
         """Return (m, point, p) blocks [−[y]×, 0]: how a pose error ε turns vectors y (m, 3)."""
-        C: FloatArray = lever_arms @ self._turns
+        C: FloatArray = lever_arms.dot(self._turns)
         return C.reshape(self._shape)
 
     def full_pose(self, error: FloatArray) -> FloatArray:

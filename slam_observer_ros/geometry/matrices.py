@@ -65,7 +65,7 @@ def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
 def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return √(r_iᵀ Σ_i⁻¹ r_i) (m,) of residuals (m, k) with covariances (m, k, k)."""
     whitened = np.linalg.solve(covariances, r[:, :, None])
-    return np.asarray(np.sqrt((r[:, None, :] @ whitened)[:, 0, 0]))
+    return np.asarray(np.sqrt(np.einsum('ij,ij->i', r, whitened[:, :, 0])))
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:

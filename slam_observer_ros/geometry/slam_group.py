@@ -78,10 +78,13 @@ def exp(Delta: FloatArray, d: FloatArray) -> SlamElement:
     With held body velocity and landmark velocities, `compose(X, exp(V dt, v dt))` solves the
     lifted kinematics exactly over dt.
     """
-    phi, v = Delta[..., :3], Delta[..., 3:, None]
-    J = so3.left_jacobian(phi)
-    R = _IDENTITY + so3.hat(phi) @ J  # exp φ, as J is the integral of exp(s φ)
-    return SlamElement(se3.pose(R, (J @ v)[..., 0]), d @ J.swapaxes(-1, -2))
+    phi, v = Delta[..., :3], Delta[..., 3:]
+    K, J = so3.hat(phi), so3.left_jacobian(phi)
+    # exp φ = I + K J, as J is the integral of exp(s φ).
+    if Delta.ndim == 1:  # as at each correction, at half the cost
+        return SlamElement(se3.pose(_IDENTITY + K.dot(J), J.dot(v)), d.dot(J.T))
+    R = _IDENTITY + K @ J
+    return SlamElement(se3.pose(R, (J @ v[..., None])[..., 0]), d @ J.swapaxes(-1, -2))
 
 
 def alpha(S: FloatArray, Xi: TotalState) -> TotalState:

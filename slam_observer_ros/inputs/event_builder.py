@@ -78,6 +78,11 @@ class EventBuilder:
         self._waiting: deque[tuple[_Waiting, TransformError]] = deque()
         self._taken_as_base: dict[str, tuple[int, VelocityEvent]] = {}
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a measurement waits for its transform."""
+        return bool(self._waiting)
+
     def add(self, measured: Measured, now_ns: int) -> list[Event]:
         """Take a measurement; return the event that comes of it, unless it has to wait.
 

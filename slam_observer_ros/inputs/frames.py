@@ -85,12 +85,14 @@ class BaseFrame:
         """Return where /tf has the fiducials of a detection message, in the base frame."""
         camera_frame = self._sensor_frame or detections.frame_id
         self._refuse_map_frame(camera_frame)
-        points = [
-            self._tag_position(camera_frame, family, number, detections.stamp_ns)
+        found = [
+            self._tag_pose(camera_frame, family, number, detections.stamp_ns)
             for family, number in zip(detections.families, detections.ids, strict=True)
         ]
-        ids = np.array(detections.ids, dtype=np.int64)
-        event = ObservationEvent(detections.stamp_ns, ids, np.array(points).reshape(-1, 3))
+        ids, poses = np.array(detections.ids, dtype=np.int64), np.array(found).reshape(-1, 4, 4)
+        event = ObservationEvent(
+            detections.stamp_ns, ids, poses[:, :3, 3], orientations=poses[:, :3, :3]
+        )
         return self.observation(event, camera_frame)
 
     def velocity(self, event: VelocityEvent, frame_id: str) -> VelocityEvent:
@@ -121,13 +123,13 @@ class BaseFrame:
             return event
         return event.moved(self._transforms.lookup(self.name, frame_id, event.stamp_ns))
 
-    def _tag_position(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
-        """Return where a tag is in the camera's frame (3,), under either of its names."""
+    def _tag_pose(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
+        """Return the pose (4, 4) of a tag in the camera's frame, under either of its names."""
         try:
-            return self._transforms.lookup(camera, f'{family}:{number}', stamp_ns)[:3, 3]
+            return self._transforms.lookup(camera, f'{family}:{number}', stamp_ns)
         except TransformError:
             frame = f'{self._tag_frame_prefix}{number}'
-            return self._transforms.lookup(camera, frame, stamp_ns)[:3, 3]
+            return self._transforms.lookup(camera, frame, stamp_ns)
 
 
 def _sensor_pose(values: Pose6) -> FloatArray | None:

@@ -79,7 +79,7 @@ def shape_covariances(state: State, rows: IntArray) -> FloatArray | None:
     """
     m, axes = len(rows), state.axes
     k, R = axes.point, state.observer.reference_pose[:3, :3]
-    joint, points = state.filter.joint, state.observer.points[rows]
+    joint, points = state.filter.joint, state.filter.points[rows]
     with_pose = None if joint is None or m == 0 else joint.with_pose(rows, points)
     if with_pose is None:
         of_all = state.landmark_covariances()

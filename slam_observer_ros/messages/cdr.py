@@ -1,4 +1,4 @@
-"""Reading of plain CDR, the byte format of ROS 2 messages, without building message objects."""
+"""Plain CDR, the byte format of ROS 2 messages, without building message objects."""
 
 from __future__ import annotations
 
@@ -156,3 +156,9 @@ class CdrBlockReader(CdrReader):
     def _check_common(self, begin: int, end: int) -> None:
         if (self._rows[:, begin:end] != self._rows[0, begin:end]).any():
             raise MessageError('a string, or the byte order, is not the same in all messages')
+
+
+def encode_string(text: str) -> bytes:
+    """Serialise a string, with padding so that a 4-byte value may follow; little endian."""
+    characters = text.encode() + b'\0'
+    return struct.pack('<I', len(characters)) + characters + bytes(-len(characters) % 4)

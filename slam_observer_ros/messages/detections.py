@@ -15,10 +15,14 @@ import numpy as np
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import without_unmeasured
-from slam_observer_ros.messages.poses_and_velocities import PoseMessage
+from slam_observer_ros.messages.poses_and_velocities import (
+    PoseMessage,
+    QUATERNION_NORM_TOLERANCE,
+)
 
 _POSE = 7
 _COVARIANCE = 36
@@ -44,13 +48,16 @@ class TagDetections:
 
 
 def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
-    """Decode the positions of a geometry_msgs/PoseArray, whose landmarks have no ids."""
+    """Decode a geometry_msgs/PoseArray, whose landmarks have no ids."""
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     poses = reader.float64(_POSE * reader.uint32()).reshape(-1, _POSE)
     reader.finish()
     ids = np.full(len(poses), UNKNOWN_ID, dtype=np.int64)
-    return Measurement(frame_id, without_unmeasured(ObservationEvent(stamp_ns, ids, poses[:, :3])))
+    event = ObservationEvent(
+        stamp_ns, ids, poses[:, :3], orientations=orientations_of(poses[:, 3:])
+    )
+    return Measurement(frame_id, without_unmeasured(event))
 
 
 def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
@@ -58,18 +65,26 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
 
     The id of a landmark is the number that ends its detection's ``id``, or else its first
     result's ``class_id``: both are strings. No id are UUIDs, hashes, and numbers beyond
-    ``MAX_ID``, as trackers give them. Its position, with covariance if it is known of all,
-    is that result's, or else, if that is missing or zero, the centre of the box.
+    ``MAX_ID``, as trackers give them. Its pose, with covariance if it is known of all, is that
+    result's, or else, if that is missing or zero, that of the centre of the box.
     """
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     detections = [_read_detection(reader) for _ in range(reader.uint32())]
     reader.finish()
     ids = np.array([landmark_id for landmark_id, _, _ in detections], dtype=np.int64)
-    points = np.array([point for _, point, _ in detections]).reshape(-1, 3)
-    known = [covariance for _, _, covariance in detections if covariance.any()]
-    covariances = np.array(known) if known and len(known) == len(detections) else None
-    event = ObservationEvent(stamp_ns, ids, points, covariances)
+    poses = np.array([pose for _, pose, _ in detections]).reshape(-1, _POSE)
+    whole = np.array([covariance for _, _, covariance in detections]).reshape(-1, 6, 6)
+    covariances, turns = whole[:, :3, :3], whole[:, 3:, 3:]
+    is_known = len(whole) > 0 and bool(covariances.any(axis=(1, 2)).all())
+    event = ObservationEvent(
+        stamp_ns,
+        ids,
+        poses[:, :3],
+        covariances if is_known else None,
+        orientations=orientations_of(poses[:, 3:]),
+        orientation_covariances=turns if turns.any() else None,
+    )
     return Measurement(frame_id, without_unmeasured(event))
 
 
@@ -108,6 +123,21 @@ def observed_tags(
     ]
 
 
+def orientations_of(quaternions: FloatArray) -> FloatArray | None:
+    """Return rotations (m, 3, 3) of quaternions (m, 4) xyzw, zero where they are unknown.
+
+    So is one that is exactly no turn, as messages have it that nobody filled in. None if all are.
+    """
+    with np.errstate(invalid='ignore', over='ignore'):
+        norms = np.linalg.norm(quaternions, axis=1)
+        known = (np.abs(norms - 1.0) < QUATERNION_NORM_TOLERANCE) & quaternions[:, :3].any(axis=1)
+    if not known.any():
+        return None
+    R = np.zeros((len(quaternions), 3, 3))
+    R[known] = so3.from_quaternion(quaternions[known])
+    return R
+
+
 def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
     """Say that none of the frames on /tf is that of a fiducial, and what to do."""
     names = sorted(frames)
@@ -143,32 +173,33 @@ def _observation(
 ) -> Measurement[ObservationEvent]:
     ids = np.array([landmark_id for _, landmark_id in sightings], dtype=np.int64)
     points = np.array([message.position for message, _ in sightings])
-    return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points))
+    R = orientations_of(np.array([message.quaternion for message, _ in sightings]))
+    return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points, orientations=R))
 
 
 def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
-    """Read a vision_msgs/Detection3D: id, position (3,) and covariance (3, 3)."""
+    """Read a vision_msgs/Detection3D: id, position and quaternion (7,), covariance (6, 6)."""
     reader.header()
     results = [_read_result(reader) for _ in range(reader.uint32())]
-    centre = reader.float64(_POSE + _SIZE)[:3]
+    centre = reader.float64(_POSE + _SIZE)[:_POSE]
     names = [reader.string(), *(name for name, _, _ in results[:1])]
     ids = (_id_in_name(name) for name in names)
     landmark_id = next((number for number in ids if number != UNKNOWN_ID), UNKNOWN_ID)
-    if results and results[0][1].any():
-        _, point, covariance = results[0]
-        return landmark_id, point, covariance
+    if results and results[0][1][:3].any():
+        _, pose, covariance = results[0]
+        return landmark_id, pose, covariance
     # Detectors that fill in the box only leave the position of the result at zero.
-    return landmark_id, centre, np.zeros((3, 3))
+    return landmark_id, centre, np.zeros((6, 6))
 
 
 def _read_result(reader: CdrReader) -> tuple[str, FloatArray, FloatArray]:
-    """Read a vision_msgs/ObjectHypothesisWithPose: class, position (3,), covariance (3, 3)."""
+    """Read a vision_msgs/ObjectHypothesisWithPose: class, pose (7,), covariance (6, 6)."""
     name = reader.string()
     values = reader.float64(1 + _POSE + _COVARIANCE)  # the score comes first
-    covariance = values[1 + _POSE :].reshape(6, 6)[:3, :3]
+    covariance = values[1 + _POSE :].reshape(6, 6)
     if covariance[0, 0] < 0.0:  # unknown
-        covariance = np.zeros((3, 3))
-    return name, values[1:4], covariance
+        covariance = np.zeros((6, 6))
+    return name, values[1 : 1 + _POSE], covariance
 
 
 def _read_apriltag(reader: CdrReader) -> tuple[int, str]:

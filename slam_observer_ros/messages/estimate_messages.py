@@ -1,4 +1,7 @@
-"""The estimate as ROS messages, the same for the node and for a recording."""
+"""The estimate as ROS messages, the same for the node and for a recording.
+
+``state_messages`` has those of the state, of which there are many more.
+"""
 
 from __future__ import annotations
 
@@ -14,36 +17,15 @@ PATH_SPACING_NS = 100_000_000
 
 
 class EstimateMessages:
-    """Makes what says where the robot and its landmarks are, in ``map_frame``.
+    """Makes what says where the robot was and its landmarks are, in ``map_frame``.
 
-    Stamps are nanoseconds, poses (4, 4) of ``base_frame``, body velocities (6,) ordered (Ω, v),
-    and covariances (6, 6), None if unknown.
+    Stamps are nanoseconds, poses (4, 4).
     """
 
-    def __init__(self, messages: OutgoingMessages, map_frame: str, base_frame: str) -> None:
+    def __init__(self, messages: OutgoingMessages, map_frame: str) -> None:
         self._messages = messages
-        self._map_frame, self._base_frame = map_frame, base_frame
+        self._map_frame = map_frame
         self.markers = MarkerMessages(messages, map_frame)
-
-    def pose(self, stamp_ns: int, pose: FloatArray, covariance: FloatArray | None) -> Any:
-        """Make a geometry_msgs/PoseWithCovarianceStamped."""
-        return self._messages.make(
-            'geometry_msgs/msg/PoseWithCovarianceStamped',
-            header=self._messages.header(stamp_ns, self._map_frame),
-            pose=self._messages.pose_with_covariance(pose, covariance),
-        )
-
-    def odometry(
-        self, uncertain: Any, body_velocity: FloatArray, covariance: FloatArray | None
-    ) -> Any:
-        """Make a nav_msgs/Odometry of what :meth:`pose` has made."""
-        return self._messages.make(
-            'nav_msgs/msg/Odometry',
-            header=uncertain.header,
-            child_frame_id=self._base_frame,
-            pose=uncertain.pose,
-            twist=self._messages.twist_with_covariance(body_velocity, covariance),
-        )
 
     def path_pose(self, stamp_ns: int, pose: FloatArray) -> Any:
         """Make one pose of the path."""
@@ -71,10 +53,3 @@ class EstimateMessages:
     def value(self, value: float) -> Any:
         """Make a std_msgs/Float64."""
         return self._messages.make('std_msgs/msg/Float64', data=float(value))
-
-    def transform(self, stamp_ns: int, pose: FloatArray) -> Any:
-        """Make a tf2_msgs/TFMessage of the base in the map."""
-        transform = self._messages.transform_stamped(
-            stamp_ns, self._map_frame, self._base_frame, pose
-        )
-        return self._messages.make('tf2_msgs/msg/TFMessage', transforms=[transform])

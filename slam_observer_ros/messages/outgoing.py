@@ -18,6 +18,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.events import MAX_ID, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.messages.cdr import encode_string
 from slam_observer_ros.messages.cloud_fields import (
     COVARIANCE_NAMES,
     FLOAT32_ID_LIMIT,
@@ -29,7 +30,6 @@ from slam_observer_ros.messages.cloud_fields import (
     VELOCITY_NAMES,
 )
 
-_LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 _MATRIX_TO_UPPER_TRIANGLE = [0, 1, 2, 4, 5, 8]
 _PACK_STAMP = struct.Struct('<BBBBiI')
 
@@ -88,18 +88,6 @@ class OutgoingMessages:
         header = self.header(stamp_ns, frame_id)
         return self.make('geometry_msgs/msg/PoseStamped', header=header, pose=self.pose(pose))
 
-    def pose_with_covariance(self, pose: FloatArray, covariance: FloatArray | None) -> Any:
-        """Make a geometry_msgs/PoseWithCovariance.
-
-        The covariance (6, 6) is of (rotation vector, position) about the fixed axes, rad² and m²;
-        None if unknown.
-        """
-        return self.make(
-            'geometry_msgs/msg/PoseWithCovariance',
-            pose=self.pose(pose),
-            covariance=_covariance_field(covariance),
-        )
-
     def transform_stamped(self, stamp_ns: int, parent: str, child: str, pose: FloatArray) -> Any:
         """Make a geometry_msgs/TransformStamped of the pose of ``child`` in ``parent``."""
         transform = self.make(
@@ -123,16 +111,6 @@ class OutgoingMessages:
         """Make a geometry_msgs/TwistStamped."""
         header, twist = self.header(stamp_ns, frame_id), self.twist(body_velocity)
         return self.make('geometry_msgs/msg/TwistStamped', header=header, twist=twist)
-
-    def twist_with_covariance(
-        self, body_velocity: FloatArray, covariance: FloatArray | None
-    ) -> Any:
-        """Make a geometry_msgs/TwistWithCovariance; covariance (6, 6), None if unknown."""
-        return self.make(
-            'geometry_msgs/msg/TwistWithCovariance',
-            twist=self.twist(body_velocity),
-            covariance=_covariance_field(covariance),
-        )
 
     def point_cloud2(
         self,
@@ -191,23 +169,15 @@ def encode_point_cloud(stamp_ns: int, frame_id: str, ids: IntArray, points: Floa
     return b''.join(
         (
             _PACK_STAMP.pack(0, 1, 0, 0, seconds, nanoseconds),
-            _encode_string(frame_id),
+            encode_string(frame_id),
             count,
             points.astype('<f4').tobytes(),
             struct.pack('<I', 1),
-            _encode_string(ID_NAME),
+            encode_string(ID_NAME),
             count,
             ids.astype('<f4').tobytes(),
         )
     )
-
-
-def _covariance_field(covariance: FloatArray | None) -> FloatArray:
-    """Return 36 numbers, position first; −1 first, as in Imu, if it is unknown."""
-    if covariance is None:
-        return np.array([-1.0] + [0.0] * 35)
-    field: FloatArray = covariance[_LINEAR_FIRST][:, _LINEAR_FIRST].ravel()
-    return field
 
 
 def _cloud_records(
@@ -231,9 +201,3 @@ def _cloud_records(
     for name, column in columns.items():
         records[name] = column
     return records
-
-
-def _encode_string(text: str) -> bytes:
-    """Serialise a string, with padding so that a 4-byte value may follow."""
-    characters = text.encode() + b'\0'
-    return struct.pack('<I', len(characters)) + characters + bytes(-len(characters) % 4)

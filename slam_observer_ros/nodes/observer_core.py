@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
@@ -28,6 +29,7 @@ from slam_observer_ros.nodes.services.control_services import ControlServices
 from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
 from slam_observer_ros.nodes.services.kept_pose import KeptPose
 from slam_observer_ros.nodes.services.map_services import MapServices
+from slam_observer_ros.nodes.services.named_map_services import NamedMapServices
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -70,7 +72,8 @@ class ObserverCore:
             node, settings, self._estimator, BaseFrame(settings, self._transforms)
         )
         self._publisher = EstimatePublisher(node, settings, self._estimator, self._transforms)
-        self._feed.on_events = self._publish_if_due
+        self._feed.on_events = self._publish_new
+        self._feed.on_waiting = self._begin_to_retry
         self._inputs = open_inputs(node, settings, self._feed)
         self._is_catching_up = False
         _refuse_own_outputs(node, self._inputs)
@@ -87,6 +90,7 @@ class ObserverCore:
         )
         # What others may do to the estimate
         self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
+        NamedMapServices(node, self._maps)
         self._kept_pose = KeptPose(node, settings, self._estimator)
         self._kept_pose.restore()
         InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
@@ -147,37 +151,59 @@ class ObserverCore:
 
     def _create_timers(self, publish_rate_hz: float) -> list[Timer]:
         # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        create = partial(self._node.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        # These two run only while something waits, the others always.
+        self._publish_timer = create(1.0 / publish_rate_hz, self._publish_waiting)
+        self._retry_timer = create(RETRY_PERIOD_S, self._retry)
         return [
-            self._node.create_timer(period_s, callback, clock=clock)
-            for period_s, callback in (
-                (1.0 / publish_rate_hz, self._publish_state),
-                (OVERVIEW_PERIOD_S, self._publisher.publish_overview),
-                (OVERVIEW_PERIOD_S, self._maps.keep_recent),
-                (DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
-                (CHECK_PERIOD_S, self._localisation.publish),
-                (KEEP_PERIOD_S, self._kept_pose.keep),
-                (RETRY_PERIOD_S, self._feed.retry),
-                *((CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
-            )
+            self._publish_timer,
+            self._retry_timer,
+            create(OVERVIEW_PERIOD_S, self._publisher.publish_overview),
+            create(OVERVIEW_PERIOD_S, self._maps.keep_recent),
+            create(DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
+            create(CHECK_PERIOD_S, self._localisation.publish),
+            create(KEEP_PERIOD_S, self._kept_pose.keep),
+            *(create(CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
         ]
 
-    def _publish_if_due(self) -> None:
-        """Publish what is new once the velocities that wait are used, so that it is not old."""
-        if self._is_catching_up or not self._publisher.is_due:
+    def _publish_new(self, source: str) -> None:
+        """Publish what an input has given if it is due, else a little later."""
+        if self._is_catching_up:
             return
-        self._is_catching_up = True  # their events come here, too
+        if self._publisher.is_due(source):
+            self._catch_up()
+            self._publisher.publish_state(source)
+        if self._must_publish:
+            _start(self._publish_timer)
+
+    def _catch_up(self) -> None:
+        """Use the velocities that wait, so that what is published is not old."""
+        self._is_catching_up = True  # their events are published with it
         for source in self._inputs:
             if source.name in MOTION_INPUTS:
                 source.read_until(MAX_STAMP_NS)
         self._is_catching_up = False
         self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
-        self._publisher.publish_state()
 
-    def _publish_state(self) -> None:
+    def _publish_waiting(self) -> None:
         self._publisher.publish_state()
         if self._feed.is_paused:
             self._publisher.repeat_transform()
+        if not self._must_publish:
+            self._publish_timer.cancel()
+
+    @property
+    def _must_publish(self) -> bool:
+        """Whether something is to be published though nothing comes in."""
+        return self._feed.is_active and (self._feed.is_paused or self._publisher.is_waiting)
+
+    def _begin_to_retry(self) -> None:
+        _start(self._retry_timer)
+
+    def _retry(self) -> None:
+        self._feed.retry()
+        if not self._feed.is_waiting:
+            self._retry_timer.cancel()
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         """Use what still waits of the run that has ended, and then what has come of the next."""
@@ -195,6 +221,12 @@ class ObserverCore:
 
     def _apply_parameters(self, _changes: list[Parameter]) -> None:
         self._estimator.change_settings(read_settings(self._node, Settings))
+
+
+def _start(timer: Timer) -> None:
+    """Let a timer run, unless it does."""
+    if timer.is_canceled():
+        timer.reset()
 
 
 def _refuse_own_outputs(node: Node, inputs: Iterable[InputTopic[Any]]) -> None:

@@ -9,7 +9,7 @@ import threading
 
 import rclpy
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -18,6 +18,11 @@ from rclpy.utilities import remove_ros_args
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.nodes.stop_signal import StopSignal
 
+try:
+    from rclpy.experimental.events_executor import EventsExecutor
+except ImportError:  # rclpy before 7.1.4
+    EventsExecutor = None
+
 REFUSALS = (SlamObserverError, InvalidParameterValueException, InvalidParameterTypeException)
 """What a node may raise at its start; the last one of what rclpy declares, as use_sim_time."""
 
@@ -25,8 +30,8 @@ USAGE = """\
 usage: ros2 run slam_observer_ros NODE [--ros-args [-p NAME:=VALUE] [--params-file FILE]
                                                    [-r TOPIC:=/OTHER_TOPIC] ...]
 
-README.md lists the topics and services of observer_node and its main parameters,
-docs/parameters.md all parameters; of a running node `ros2 param list` does.
+docs/topics.md lists the topics and services of observer_node, docs/parameters.md all parameters;
+of a running node `ros2 param list` does.
 """
 
 STOP_LATENCY_S = 0.1
@@ -83,7 +88,8 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     has_ended = threading.Event()
     if hasattr(node, 'end_in_haste'):
         threading.Thread(target=_watch, args=(node, stop, has_ended), daemon=True).start()
-    executor = SingleThreadedExecutor()
+    executor = _executor()
+    stop.listen()  # EventsExecutor has taken SIGINT and SIGTERM
     executor.add_node(node)
     try:
         while not stop.is_set and rclpy.ok():
@@ -95,6 +101,14 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
         exit_code = _destroy(node)
         has_ended.set()
     return exit_code
+
+
+def _executor() -> Executor:
+    """Return what hears of each message by itself, where rclpy has it.
+
+    The other one asks all that a node has whenever one message comes: most of the node's CPU time.
+    """
+    return SingleThreadedExecutor() if EventsExecutor is None else EventsExecutor()
 
 
 def _watch(node: Node, stop: StopSignal, has_ended: threading.Event) -> None:

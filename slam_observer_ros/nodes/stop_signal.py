@@ -18,10 +18,14 @@ class StopSignal:
     def __init__(self) -> None:
         self.is_set = False
         self._has_begun = False
-        numbers = [signal.SIGINT, signal.SIGTERM]
+        self._numbers = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
-            numbers.append(signal.SIGHUP)
-        for number in numbers:
+            self._numbers.append(signal.SIGHUP)
+        self.listen()
+
+    def listen(self) -> None:
+        """Take the signals, again if something else has taken them."""
+        for number in self._numbers:
             signal.signal(number, self._set)
 
     def begin(self) -> None:

@@ -60,7 +60,9 @@ class Filter:
         is the time since each was last seen.
         """
         # A filter that postpones moves of landmarks has made them for :meth:`expected_points`.
-        observer = self.observer
+        observer, joint = self.observer, self.joint
+        if joint is not None and not joint.is_dense:
+            joint.activate(rows)
         e, r = observer.errors(rows, points)
         return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s)
 
@@ -104,6 +106,11 @@ class Filter:
     def expected_points(self, rows: IntArray) -> FloatArray:
         """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
         return self.observer.body_points(rows)
+
+    def translations(self, rows: IntArray) -> FloatArray:
+        """Return â_i (m, 3) of landmarks, metres."""
+        a: FloatArray = self.observer.a[rows]
+        return a
 
     # The frame
 

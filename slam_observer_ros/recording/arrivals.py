@@ -54,6 +54,7 @@ class Arrivals:
 
     def add_all(self, received_ns: IntArray, stamps_ns: IntArray) -> None:
         """Note the same of several measurements (k,)."""
+        # Integers of Python, as NumPy's lose digits on their way to a quotient.
         received_s = np.array([to_s(received) for received in received_ns.tolist()])
         if not self._count:
             self.first_s = self.last_s = float(received_s[0])

@@ -7,6 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
+import numpy as np
+
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.inputs.event_builder import Measured
@@ -22,6 +24,7 @@ from slam_observer_ros.messages.message_types import (
     VELOCITY_DECODERS,
 )
 from slam_observer_ros.messages.point_clouds import scan_problem
+from slam_observer_ros.messages.pose_blocks import decode_poses, PoseBlock
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_imu,
     decode_odometry_pose,
@@ -29,7 +32,7 @@ from slam_observer_ros.messages.poses_and_velocities import (
     PoseMessage,
 )
 from slam_observer_ros.messages.velocity_blocks import BLOCK_DECODERS, BlockDecoder
-from slam_observer_ros.recording.sources import RawMessage, Topic
+from slam_observer_ros.recording.sources import RawBlock, RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
 
@@ -76,6 +79,16 @@ def decode_pose(raw: RawMessage) -> PoseMessage:
     """Decode a pose; it has its receive time if its publisher left the stamp out."""
     message = POSE_DECODERS[raw.topic.message_type](raw.data)
     return replace(message, stamp_ns=message.stamp_ns or raw.receive_stamp_ns)
+
+
+def decode_pose_block(raw: RawBlock) -> PoseBlock:
+    """Decode poses as :func:`decode_pose` each of them.
+
+    Raise :class:`MessageError` if one is malformed, or they do not have all in common.
+    """
+    block = decode_poses(raw.topic.message_type, raw.data)
+    stamps_ns = np.where(block.stamps_ns == 0, raw.receive_stamps_ns, block.stamps_ns)
+    return replace(block, stamps_ns=stamps_ns)
 
 
 def decode_transform_message(raw: RawMessage) -> list[PoseMessage]:

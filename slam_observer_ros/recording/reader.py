@@ -23,6 +23,7 @@ from slam_observer_ros.inputs.event_builder import (
 )
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
+from slam_observer_ros.messages.pose_blocks import PoseBlock
 from slam_observer_ros.messages.velocity_blocks import BlockDecoder
 from slam_observer_ros.recording.arrivals import Arrivals
 from slam_observer_ros.recording.contents import Contents
@@ -31,6 +32,7 @@ from slam_observer_ros.recording.decoding import (
     Decode,
     decode_landmarks,
     decode_pose,
+    decode_pose_block,
     decode_transform_message,
     input_decoders,
 )
@@ -186,13 +188,12 @@ class Recording:
         decode_block, moving = block_decoder(selected, inputs), selected.transforms.moving
         reading = _Reading(transforms, builder, decoders, decode_block, simulated, moving)
         for raw in self._source.blocks((*decoders, *moving), selected.velocity):
-            if isinstance(raw, RawMessage):
-                yield from self._events_of(raw, reading)
-            elif (velocities := self._velocities_of(raw, reading)) is not None:
-                yield velocities
-            else:
-                for message in raw.messages():
-                    yield from self._events_of(message, reading)
+            if isinstance(raw, RawBlock) and (block := _velocities_of(raw, reading)) is not None:
+                self.arrivals[raw.topic.name].add_all(raw.receive_stamps_ns, block.stamps_ns)
+                yield block
+                continue
+            for message in raw.messages():
+                yield from self._events_of(message, reading)
         yield from builder.finish()
 
     def _events_of(self, raw: RawMessage, reading: _Reading) -> Iterator[Event]:
@@ -206,20 +207,6 @@ class Recording:
                 events += reading.builder.add(timed, raw.receive_stamp_ns)
         for event in events:
             yield dataclasses.replace(event, receive_ns=raw.receive_stamp_ns)
-
-    def _velocities_of(self, raw: RawBlock, reading: _Reading) -> VelocityBlock | None:
-        """Return what :meth:`_events_of` gives of all messages; None if one needs it."""
-        if reading.decode_block is None or len(raw.data) < FEWEST_IN_BLOCK:
-            return None
-        try:
-            frame_id, velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
-        except MessageError:
-            return None
-        has_stamps = raw.topic in reading.simulated or velocities.stamps_ns.all()
-        if not (has_stamps and reading.builder.passes_on(frame_id)):
-            return None
-        self.arrivals[raw.topic.name].add_all(raw.receive_stamps_ns, velocities.stamps_ns)
-        return velocities
 
     def copy_to(self, writer: RecordingWriter, selected: SelectedTopics) -> list[Topic]:
         """Write what was read, as it was received; return topics left out, of unknown types."""
@@ -244,13 +231,24 @@ class Recording:
 
         Poses of another frame are moved to it by /tf_static, or left as they are, with a warning.
         """
-        poses = list(self._all_decoded(selected.pose_truth, decode_pose))
+        poses = list(self._true_poses(selected.pose_truth))
         base_in: dict[str, FloatArray] = {}
         if frames := other_frames(base_frame, poses):
             transforms = self._static_transforms(selected)
             base_in = base_in_frames(frames, base_frame, transforms)
         landmarks = self._all_decoded(selected.landmark_truth, decode_landmarks)
         return Truth.from_messages(poses, base_in, landmarks)
+
+    def _true_poses(self, topic: Topic | None) -> Iterator[PoseBlock]:
+        for raw in self._source.blocks((topic,), topic) if topic else ():
+            block = _pose_block(raw) if isinstance(raw, RawBlock) else None
+            if block is not None:
+                yield block
+                continue
+            for message in raw.messages():
+                pose = self._decoded(message, decode_pose)
+                if pose is not None:
+                    yield PoseBlock.of(pose)
 
     def _static_transforms(self, selected: SelectedTopics) -> TransformBuffer:
         transforms = TransformBuffer()
@@ -294,3 +292,23 @@ class Recording:
         if not self.dropped[reason]:
             logger.warning('Dropped a message (%s): %s', reason, error)
         self.dropped[reason] += 1
+
+
+def _velocities_of(raw: RawBlock, reading: _Reading) -> VelocityBlock | None:
+    """Return the velocities of messages; None if one of them needs a look for itself."""
+    if reading.decode_block is None or len(raw.data) < FEWEST_IN_BLOCK:
+        return None
+    try:
+        frame_id, velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
+    except MessageError:
+        return None
+    has_stamps = raw.topic in reading.simulated or velocities.stamps_ns.all()
+    return velocities if has_stamps and reading.builder.passes_on(frame_id) else None
+
+
+def _pose_block(raw: RawBlock) -> PoseBlock | None:
+    """Return the poses of messages; None if one of them needs a look for itself."""
+    try:
+        return decode_pose_block(raw)
+    except MessageError:
+        return None

@@ -17,7 +17,7 @@ from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
+from slam_observer_ros.messages.pose_blocks import PoseBlock
 
 logger = logging.getLogger(__name__)
 
@@ -95,15 +95,16 @@ class Truth:
     @classmethod
     def from_messages(
         cls,
-        poses: Sequence[PoseMessage],
+        poses: Sequence[PoseBlock],
         base_in: Mapping[str, FloatArray],
         landmarks: Iterable[Measurement[ObservationEvent]],
     ) -> Truth:
         """Gather poses and landmarks of any order; ``base_in`` is of :func:`base_in_frames`."""
-        stamps_ns = np.array([message.stamp_ns for message in poses], dtype=np.int64)
+        none = np.empty(0, dtype=np.int64)
+        stamps_ns = np.concatenate([none, *(block.stamps_ns for block in poses)])
         stamps_ns, order = np.unique(stamps_ns, return_index=True)
-        bases = np.array([base_in.get(message.child_frame_id, _AT_BASE) for message in poses])
-        world_poses = pose_stack(poses) @ bases.reshape(-1, 4, 4)
+        of_base = [block.poses @ base_in.get(block.child_frame_id, _AT_BASE) for block in poses]
+        world_poses = np.concatenate([np.empty((0, 4, 4)), *of_base])
         return cls(stamps_ns, world_poses[order], LandmarkTracks.from_messages(landmarks))
 
     def flattened(self) -> Truth:
@@ -129,10 +130,10 @@ def _positions_by_stamp(
         yield stamp_ns, positions
 
 
-def other_frames(base_frame: str, poses: Iterable[PoseMessage]) -> set[str]:
+def other_frames(base_frame: str, poses: Iterable[PoseBlock]) -> set[str]:
     """Return the frames of poses that say whose they are, and are not those of the base."""
     known = ('', base_frame.lstrip('/'))
-    frames = {message.child_frame_id for message in poses}
+    frames = {block.child_frame_id for block in poses}
     return {frame for frame in frames if base_frame and frame.lstrip('/') not in known}
 
 

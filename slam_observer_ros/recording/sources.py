@@ -58,6 +58,10 @@ class RawMessage(NamedTuple):
         """When the last of it was received, as a block has it."""
         return self.receive_stamp_ns
 
+    def messages(self) -> Iterator[RawMessage]:
+        """Yield this one, as a block yields its own."""
+        yield self
+
 
 class RawBlock(NamedTuple):
     """Messages of one topic and size, received one after the other."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.common.version import VERSION
-from slam_observer_ros.evaluation.ellipses import ellipses
 from slam_observer_ros.evaluation.trajectory import interpolate
 from slam_observer_ros.report.curves import calibration, consistency, drops, errors
 from slam_observer_ros.report.findings import findings
@@ -26,7 +25,8 @@ MAX_ELLIPSES = 40_000
 FLAT = 0.05
 """Height of a map over its width, below which only its plan is drawn."""
 
-TOP, SIDE = (0, 1), (0, 2)
+UPPER = np.triu_indices(3)
+"""Entries of a covariance that the page has: xx, xy, xz, yy, yz, zz."""
 
 
 def report_data(run: ReportedRun) -> dict[str, Json]:
@@ -94,26 +94,19 @@ def _path(run: ReportedRun) -> dict[str, Json]:
 
 
 def _instants(run: ReportedRun) -> dict[str, Json]:
-    """Return robot and map at instants, with ellipses on the plan and, in space, on the side."""
+    """Return robot and map at instants, with the covariances of their positions."""
     total = sum(len(instant.ids) for instant in run.instants)
     some = run.instants[_thinned(total, MAX_ELLIPSES)]
     seconds = run.seconds(np.array([instant.stamp_ns for instant in some], dtype=np.int64))
-    planes = [TOP] if _is_flat(run) else [TOP, SIDE]
     poses = np.array([instant.pose for instant in some]).reshape(-1, 4, 4)
     return {
         't': rounded(seconds, 2),
         'xyz': rounded(poses[:, :3, 3], 3),
         'ahead': rounded(poses[:, :3, 0], 3),
-        'robot': [
-            [_ellipses(_position_covariance(instant.pose_covariance), plane) for plane in planes]
-            for instant in some
-        ],
+        'robot': [_covariances(_position_covariance(instant.pose_covariance)) for instant in some],
         'ids': [instant.ids.tolist() for instant in some],
         'points': [rounded(instant.world_points.T, 3) for instant in some],
-        'ellipses': [
-            [_ellipses(instant.landmark_covariances, plane) for plane in planes]
-            for instant in some
-        ],
+        'covariances': [_covariances(instant.landmark_covariances) for instant in some],
     }
 
 
@@ -121,8 +114,14 @@ def _position_covariance(pose_covariance: FloatArray | None) -> FloatArray | Non
     return None if pose_covariance is None else pose_covariance[None, 3:, 3:]
 
 
-def _ellipses(covariances: FloatArray | None, plane: tuple[int, int]) -> Json:
-    return None if covariances is None else rounded(ellipses(covariances, plane), 3)
+def _covariances(covariances: FloatArray | None) -> Json:
+    """Return the six entries of each covariance, m², with three digits."""
+    if covariances is None:
+        return None
+    return [
+        [float(f'{entry:.3g}') for entry in entries]
+        for entries in covariances[:, UPPER[0], UPPER[1]].tolist()
+    ]
 
 
 def _true_landmarks(run: ReportedRun) -> Json:
@@ -157,6 +156,7 @@ def _landmarks(run: ReportedRun) -> list[Json]:
                 int(np.count_nonzero(of_it)),
                 int(np.count_nonzero(of_it & (innovations.weights == 0.0))),
                 int(np.count_nonzero(used & (innovations.weights < 1.0))),
+                int(np.count_nonzero(of_it & innovations.moved)),
                 *rounded(
                     np.array(
                         [
@@ -180,12 +180,13 @@ def _rms(values: FloatArray) -> float:
 def _residuals(run: ReportedRun) -> dict[str, Json]:
     """Return residuals in σ: of a great many the suspicious ones, and some of the others."""
     innovations = run.innovations
-    shown = _shown(innovations.weights, innovations.distances)
+    shown = _shown(innovations.weights, innovations.distances) | innovations.moved
     return {
         't': rounded(run.seconds(innovations.stamps_ns[shown]), 2),
         'id': innovations.ids[shown].tolist(),
         'sigma': rounded(innovations.distances[shown], 2),
         'weight': rounded(innovations.weights[shown], 2),
+        'moved': np.flatnonzero(innovations.moved[shown]).tolist(),
         'left_out': int(np.count_nonzero(~shown)),
     }
 

@@ -10,6 +10,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import MAX_REJECTED
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.report.noise_advice import noise_advice
 from slam_observer_ros.report.reported_run import ReportedRun
 
 MAX_GROWTHS = 3
@@ -34,7 +35,8 @@ class Finding:
 
 def findings(run: ReportedRun) -> list[Finding]:
     """Return what is worth knowing of a run, the most important first."""
-    return [*_growths(run), *_consistency(run), *_calibration(run)]
+    advice = [Finding(text) for text in noise_advice(run)]
+    return [*_growths(run), *_consistency(run), *advice, *_calibration(run)]
 
 
 def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int, int]]:
@@ -140,5 +142,4 @@ def _consistency(run: ReportedRun) -> list[Finding]:
 
 
 def _calibration(run: ReportedRun) -> list[Finding]:
-    parts = run.instants[-1].calibration if run.instants else ()
-    return [Finding(part.problem) for part in parts if part.problem]
+    return [Finding(part.problem) for part in run.calibration if part.problem]

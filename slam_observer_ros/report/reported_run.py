@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.evaluation.metrics import pose_errors, TrajectoryErrors
 from slam_observer_ros.evaluation.run_record import Innovations, Instant
 from slam_observer_ros.evaluation.trajectory import interpolate, Trajectory
@@ -24,7 +25,8 @@ MIN_GAP_S = 3.0
 class ReportedRun:
     """A replay with what was recorded of it, from ``start_ns`` on.
 
-    ``trajectory`` is the online one and ``errors`` its errors; ``anees`` is that of the pose. Both
+    ``trajectory`` is the online one and ``errors`` its errors; ``dead_reckoning`` is that of the
+    velocities alone; ``anees`` is that of the pose. Both
     are None where there is no truth.
     """
 
@@ -34,6 +36,7 @@ class ReportedRun:
     settings: Settings
     start_ns: int
     trajectory: Trajectory
+    dead_reckoning: Trajectory
     in_known_map: bool
     truth: Truth
     errors: TrajectoryErrors | None
@@ -54,6 +57,11 @@ class ReportedRun:
     @property
     def _instants_ns(self) -> IntArray:
         return np.array([instant.stamp_ns for instant in self.instants], dtype=np.int64)
+
+    @property
+    def calibration(self) -> Sequence[CalibrationEstimate]:
+        """What was found out about the velocity in the end."""
+        return self.instants[-1].calibration if self.instants else ()
 
     @property
     def used_s(self) -> FloatArray:

@@ -12,7 +12,15 @@ from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
+from slam_observer_ros.messages.message_types import ODOMETRY, TRANSFORMS
+from slam_observer_ros.messages.state_messages import (
+    encode_transform,
+    StateMessages,
+    uncertain_pose,
+)
 from slam_observer_ros.recording.writer import RecordingWriter
+
+POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 OVERVIEW_PERIOD_NS = 1_000_000_000
 """Time between two maps, nanoseconds."""
@@ -42,8 +50,9 @@ class EstimateWriter:
         publishes_tf: bool,
     ) -> None:
         self._writer = writer
-        self._messages = EstimateMessages(writer.messages, map_frame, base_frame)
-        self._map_frame = map_frame
+        self._messages = EstimateMessages(writer.messages, map_frame)
+        self._state = StateMessages(map_frame, base_frame)
+        self._map_frame, self._base_frame = map_frame, base_frame
         self._period_ns = round(NANOSECONDS_PER_SECOND / rate_hz)
         self._publishes_tf = publishes_tf
         self._path: list[Any] = []
@@ -108,16 +117,19 @@ class EstimateWriter:
             self._write(ALIGNED_LANDMARKS_TOPIC, cloud, first_ns, latched=True)
 
     def _write_state(self, estimator: Estimator, stamp_ns: int) -> None:
-        messages, pose = self._messages, estimator.pose
-        uncertain = messages.pose(stamp_ns, pose, estimator.pose_covariance)
-        velocity, covariance = estimator.body_velocity, estimator.body_velocity_covariance
-        self._write('/pose', uncertain, stamp_ns, latched=True)
-        self._write(ODOMETRY_TOPIC, messages.odometry(uncertain, velocity, covariance), stamp_ns)
+        pose = estimator.pose
+        uncertain = uncertain_pose(pose, estimator.pose_covariance)
+        message = self._state.pose(stamp_ns, uncertain)
+        self._writer.write('/pose', POSE, message, stamp_ns, latched=True)
+        velocity = estimator.body_velocity, estimator.body_velocity_covariance
+        odometry = self._state.odometry(stamp_ns, uncertain, *velocity)
+        self._writer.write(ODOMETRY_TOPIC, ODOMETRY, odometry, stamp_ns)
         if self._publishes_tf:
-            self._write('/tf', messages.transform(stamp_ns, pose), stamp_ns)
+            transform = encode_transform(stamp_ns, self._map_frame, self._base_frame, pose)
+            self._writer.write('/tf', TRANSFORMS, transform, stamp_ns)
         if is_due(stamp_ns, self._path_ns, PATH_SPACING_NS):
             self._path_ns = stamp_ns
-            self._path.append(messages.path_pose(stamp_ns, pose))
+            self._path.append(self._messages.path_pose(stamp_ns, pose))
 
     def _write_landmarks(self, estimator: Estimator, stamp_ns: int) -> None:
         landmarks = (

@@ -72,7 +72,6 @@ class RunRecorder:
         judged = [(update, update.innovation) for update in self._updates if update.innovation]
         updates = [update for update, _ in judged]
         each = [innovation for _, innovation in judged]
-        lengths = [np.linalg.norm(update.residuals, axis=1) for update in updates]
         stamps_ns = np.array([update.stamp_ns for update in updates], dtype=np.int64)
         counts = np.array([len(update.ids) for update in updates], dtype=np.int64)
         none = np.empty(0)
@@ -80,8 +79,13 @@ class RunRecorder:
             stamps_ns=np.repeat(stamps_ns, counts),
             ids=np.concatenate([none.astype(np.int64), *(update.ids for update in updates)]),
             distances=np.concatenate([none, *(innovation.distances for innovation in each)]),
-            residuals_m=np.concatenate([none, *lengths]),
+            residuals=np.concatenate(
+                [np.empty((0, 3)), *(update.residuals for update in updates)]
+            ),
             weights=np.concatenate([none, *(innovation.weights for innovation in each)]),
+            moved=np.concatenate(
+                [none.astype(np.bool_), *(np.isin(u.ids, u.moved_ids) for u in updates)]
+            ),
             update_stamps_ns=stamps_ns,
             nis=np.array([innovation.nis for innovation in each], dtype=np.float64),
             degrees_of_freedom=np.array(

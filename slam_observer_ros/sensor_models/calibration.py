@@ -120,12 +120,12 @@ class Calibration:
         if not self.count:
             return np.empty((Ad.shape[1], 0))
         shares = se3.at_poses(self._rates(measured_velocities) * dt_s[:, None])
-        of_rates = Ad[:, :, self._calibrated] * shares[:, None, :]
+        of_rates = Ad.take(self._calibrated, axis=2) * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
         F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
         if len(self._calibrated) < self.count and at_ends is not None:
             first, last = self.apply(at_ends)
-            F[:, -1] = Ad[0] @ first - Ad[-1] @ last
+            F[:, -1] = Ad[0].dot(first) - Ad[-1].dot(last)
         return F
 
     def sensitivity_until(
@@ -133,11 +133,12 @@ class Calibration:
     ) -> FloatArray:
         """Return :meth:`sensitivity` until each pose (k + 1, p, c); no delay is estimated."""
         shares = 0.5 * self._rates(measured_velocities) * dt_s[:, None]
-        return se3.summed_until((Ad[:-1] + Ad[1:])[:, :, self._calibrated] * shares[:, None, :])
+        of_rates = Ad[:, :, self._calibrated]
+        return se3.summed_until((of_rates[:-1] + of_rates[1:]) * shares[:, None, :])
 
     def _rates(self, measured_velocities: FloatArray) -> FloatArray:
         """Return (k, …) how fast each scale and bias moves the robot per unit of its error."""
-        rates = measured_velocities[:, self._calibrated]
+        rates: FloatArray = measured_velocities.take(self._calibrated, axis=1)
         rates[:, self._scales :] = _moves(measured_velocities)[:, None]
         return rates
 

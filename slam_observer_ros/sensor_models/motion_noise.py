@@ -42,7 +42,7 @@ class MotionNoise(Immutable):
 
     def covariances(self, held: HeldVelocities) -> FloatArray:
         """Return what k motions may be off by: (k, 6, 6), rad² and m²."""
-        dt_s, some_are_stated = held.dt_s[:, None], held.is_stated.any()
+        dt_s, some_are_stated = held.dt_s[:, None], np.count_nonzero(held.is_stated)
         # White noise of the stated density, and in proportion to the mean speed: a single message
         # is noisy itself, and its square too large.
         s = self._settings  # which may change
@@ -52,7 +52,7 @@ class MotionNoise(Immutable):
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         # In a gap the robot may do anything that is allowed.
-        if held.gap_s.any():
+        if np.count_nonzero(held.gap_s):
             variances += np.minimum(self._unknown_squared * held.gap_s[:, None], MAX_GAP_ERRORS**2)
         covariances: FloatArray = variances[:, :, None] * _IDENTITY_6
         # A stated covariance is that of one error for as long as the velocity is held, and of
@@ -86,7 +86,7 @@ def _squares(angular: Vector3, linear: Vector3) -> FloatArray:
 
 
 def _some_last_longer(held: HeldVelocities, usual_s: FloatArray) -> bool:
-    return bool((held.before_s + held.dt_s[:, None] > usual_s).any())
+    return bool(np.count_nonzero(held.before_s + held.dt_s[:, None] > usual_s))
 
 
 def _white_s(held: HeldVelocities) -> FloatArray:

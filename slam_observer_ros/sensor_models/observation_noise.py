@@ -7,6 +7,10 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, Immutable
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.matrices import limited
+from slam_observer_ros.sensor_models.fiducial_noise import (
+    along_and_across,
+    orientation_covariances,
+)
 from slam_observer_ros.settings.estimator_settings import Settings
 
 RESOLUTION_M = 1e-4
@@ -66,20 +70,21 @@ class ObservationNoise(Immutable):
             covariances[unknown] = self.at(lines_of_sight[unknown])
         return covariances
 
-    def orientation_covariances(self, event: ObservationEvent) -> FloatArray:
+    def orientation_covariances(self, event: ObservationEvent, Z: FloatArray) -> FloatArray:
         """Return what an observation's orientations may be off by (m, 3, 3), rad².
 
-        Of rotation vectors along the event's axes; all can be inverted.
+        Of rotation vectors along the event's axes; all can be inverted. ``Z`` (m, 3, 3) are the
+        orientations that are expected, or measured where none is.
         """
-        by_settings = np.broadcast_to(
-            self._settings.orientation_noise**2 * _IDENTITY, (len(event.ids), 3, 3)
-        )
-        stated = event.orientation_covariances
-        if stated is None:
-            return by_settings
-        is_stated = np.asarray(stated.any(axis=(1, 2)))[:, None, None]
-        known = limited(stated, np.full(3, np.pi)) + RESOLUTION_RAD**2 * _IDENTITY
-        return np.where(is_stated, known, by_settings)
+        settings, stated = self._settings, event.orientation_covariances
+        if settings.observation_model == 'fiducial':
+            modelled = orientation_covariances(Z, event.lines_of_sight, settings)
+        else:
+            modelled = np.tile(settings.orientation_noise**2 * _IDENTITY, (len(Z), 1, 1))
+        if stated is not None:
+            is_stated = stated.any(axis=(1, 2))
+            modelled[is_stated] = limited(stated[is_stated], np.full(3, np.pi))
+        return modelled + RESOLUTION_RAD**2 * _IDENTITY
 
     def at(self, lines_of_sight: FloatArray) -> FloatArray:
         """Return what the settings say of points along ``lines_of_sight`` (m, 3)."""
@@ -89,9 +94,11 @@ class ObservationNoise(Immutable):
             return _invertible(each)
         range_squared = np.einsum('ij,ij->i', lines_of_sight, lines_of_sight)
         if s.observation_model == 'stereo':
-            parallax = s.disparity_noise / (s.stereo_focal_length * s.stereo_baseline)
+            parallax = s.disparity_noise / (s.focal_length * s.stereo_baseline)
             along = (range_squared * parallax) ** 2
-            across = range_squared * (s.pixel_noise / s.stereo_focal_length) ** 2
+            across = range_squared * (s.pixel_noise / s.focal_length) ** 2
+        elif s.observation_model == 'fiducial':
+            along, across = along_and_across(range_squared, s)
         else:
             along = s.range_noise**2 + range_squared * s.range_scale_noise**2
             across = range_squared * s.bearing_noise**2

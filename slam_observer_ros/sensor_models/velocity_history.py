@@ -121,7 +121,7 @@ class VelocityHistory:
     def held(self, start_ns: int, end_ns: int) -> HeldVelocities:
         """Return the velocities in force from ``start_ns`` to ``end_ns``."""
         held = self._held(self._pieces(start_ns, end_ns))
-        return held.with_gaps_apart() if held.gap_s.any() else held
+        return held.with_gaps_apart() if np.count_nonzero(held.gap_s) else held
 
     def held_until(
         self, start_ns: int, stamps_ns: IntArray
@@ -133,8 +133,7 @@ class VelocityHistory:
         """
         pieces = self._pieces(start_ns, int(stamps_ns[-1]))
         held, counts = self._held(pieces), pieces.ends_ns.searchsorted(stamps_ns, 'right')
-        rows = np.searchsorted(self._stamps_ns, stamps_ns, 'right') - 1
-        usual_s = self._written().usual_s[rows]
+        usual_s = self._written().usual_s[pieces.rows.start + counts]
         if held.gap_s.any():
             counts = held.counts_with_gaps_apart(counts)
             held = held.with_gaps_apart()

@@ -18,14 +18,14 @@ def parameter_file_text(rows: Iterable[Parameter], values: Mapping[str, Value]) 
         facts = ', '.join(fact for fact in (row.unit, row.range_text()) if fact)
         comment = f'{row.description} ({facts})' if facts else row.description
         lines += textwrap.wrap(comment, WIDTH, initial_indent='    # ', subsequent_indent='    # ')
-        lines.append(f'    {row.name}: {_yaml(values.get(row.name, row.default))}')
+        lines.append(f'    {row.name}: {value_text(values.get(row.name, row.default))}')
     return '\n'.join(lines) + '\n'
 
 
-def _yaml(value: Value) -> str:
-    """Write a value so that ROS reads its type: numbers with a point, as 1.0 and 1.0e-06."""
-    if isinstance(value, tuple):
-        return f'[{", ".join(_yaml(entry) for entry in value)}]'
+def value_text(value: object) -> str:
+    """Return a value as YAML of which ROS reads the type: numbers with a point, as 1.0e-06."""
+    if isinstance(value, (tuple, list)):
+        return f'[{", ".join(value_text(entry) for entry in value)}]'
     if isinstance(value, float):
         mantissa, e, exponent = repr(value).partition('e')
         return mantissa if not e else f'{mantissa}{"" if "." in mantissa else ".0"}e{exponent}'

@@ -160,7 +160,7 @@ class Settings(Immutable):
     observation_model: str = parameter(
         'range_bearing',
         'Which noise figures apply to landmarks whose message has no covariance',
-        choices=('range_bearing', 'cartesian', 'stereo'),
+        choices=('range_bearing', 'cartesian', 'stereo', 'fiducial'),
         basic=True,
     )
     range_noise: float = parameter(
@@ -192,11 +192,16 @@ class Settings(Immutable):
         read_only=False,
         basic=True,
     )
-    stereo_focal_length: float = parameter(500.0, 'Stereo: focal length', unit='px', minimum=1.0)
+    focal_length: float = parameter(
+        500.0, 'Stereo and fiducial: focal length', unit='px', minimum=1.0
+    )
+    tag_size: float = parameter(
+        0.16, 'Fiducial: edge of the square whose corners are detected', unit='m', minimum=1e-3
+    )
     stereo_baseline: float = parameter(0.2, 'Stereo: baseline', unit='m', minimum=1e-3)
     pixel_noise: float = parameter(
         1.0,
-        'Stereo: standard deviation across the line of sight',
+        'Stereo: standard deviation across the line of sight; fiducial: of each corner',
         unit='px',
         minimum=1e-6,
         read_only=False,

@@ -31,6 +31,7 @@ RENAMED: dict[str, str] = {
     'linear_scale_error': 'linear_scale_stddev',
     'observation_error_time': 'observation_correlation_time',
     'rejection_distance': 'rejection_threshold',
+    'stereo_focal_length': 'focal_length',
     'velocity_delay_error': 'velocity_delay_stddev',
 }
 """Former names of parameters, and what these are called now: old files are refused with it."""

@@ -8,12 +8,17 @@ What was relinearised stays as it is: from then on a summary stands for it, in c
 which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a blind stretch
 there may be no such summary until landmarks seen before are seen again. Else the cost does not
 grow with the history, of which only :meth:`Relinearisation.smooth` needs all.
+
+It is O(n³) for n landmarks. In a map without a dense covariance (:mod:`.compressed_covariance`)
+nothing is relinearised any more. Its history goes on, to be smoothed, until it would have to begin
+again: then it is given up.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+from typing import Protocol
 
 import numpy as np
 
@@ -58,23 +63,31 @@ SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
 """The same for smoothing everything."""
 
 
+class JointFilter(Protocol):
+    """What there must be of a filter; its covariance may become one for large maps."""
+
+    observer: Observer
+    calibration: Calibration
+    axes: EstimatedAxes
+    joint: JointCovariance | None
+
+
 class Relinearisation:
     """What a filter has seen since a prior, and when that is relinearised.
 
-    ``observer``, ``calibration`` and ``joint`` are a filter's, at its start; relinearising changes
-    them. ``relinearization_*``, ``smoothing_window``, ``huber_threshold``, ``rejection_threshold``
-    and the noise of observations are read from the settings. ``history`` has what was seen.
+    Relinearising changes ``filter_``, one with a joint covariance, given at its start.
+    ``relinearization_*``, ``smoothing_window``, ``huber_threshold``, ``rejection_threshold`` and
+    the noise of observations are read from the settings. ``history`` has what was seen.
     """
 
     def __init__(
         self,
-        observer: Observer,
-        calibration: Calibration,
-        joint: JointCovariance,
+        filter_: JointFilter,
         settings: Settings,
     ) -> None:
-        self._observer, self._calibration, self._joint = observer, calibration, joint
-        self._axes, self._settings = calibration.axes, settings
+        self._filter, self._settings = filter_, settings
+        self._observer, self._calibration = filter_.observer, filter_.calibration
+        self._axes = filter_.axes
         self._observation_noise = ObservationNoise(settings)
         self._warning = _Warning()
         self._seen = self._observations = 0
@@ -84,17 +97,18 @@ class Relinearisation:
     @property
     def is_active(self) -> bool:
         """Whether there is a history."""
-        return self._settings.relinearization_interval > 0
+        return self._settings.relinearization_interval > 0 and not self._is_given_up
 
     def reset(self, since: str) -> None:
         """Forget all but what is known now; ``since`` is why, in words."""
+        self._is_given_up = not self._joint.is_dense
         self._start(self._known(), since)
 
     def move(self, motion: Motion) -> None:
         """Note a motion of the robot."""
         if not self.is_active:
             return
-        if self._observer.u.any():
+        if self._observer.have_moved and self._observer.u.any():
             # How far they went depends on how the robot was turned, which no smoother here knows.
             self.reset('a landmark came with a velocity')
         else:
@@ -119,7 +133,10 @@ class Relinearisation:
         self.history.add(keyframe, self._observer.A, self._calibration.values)
         self._seen += 1
         self._observations += 1
-        if in_doubt:
+        if not self._joint.is_dense:
+            if self._window_is_full:
+                self.reset('the history was cut (smoothing_window=0 keeps all of it)')
+        elif in_doubt:
             self._relinearise()
             # The landmark may be relocated by this very keyframe, which must be kept for that.
             self._is_overdue = True
@@ -159,6 +176,17 @@ class Relinearisation:
             )
         if self._observer.have_moved:
             raise ParameterError('smoothing takes landmarks to rest; some came with velocities')
+        if self._is_given_up:
+            raise ParameterError(
+                f'nothing can be smoothed in so large a map since {self.history.since}'
+            )
+
+    @property
+    def _joint(self) -> JointCovariance:
+        joint = self._filter.joint
+        if joint is None:
+            raise TypeError('a filter without a joint covariance has nothing to relinearise')
+        return joint
 
     def _start(self, prior: Prior, since: str) -> None:
         self.history = History(self._axes, self._observation_noise, prior, since)
@@ -246,8 +274,11 @@ class Relinearisation:
 
     def _known(self) -> Prior:
         """Return what is known now."""
-        observer, points = self._observer, self._observer.points
-        P = self._joint.of_positions(points)
+        observer, joint = self._observer, self._joint
+        points = observer.points[:0] if self._is_given_up else observer.points
+        P = joint.P[: joint.first, : joint.first]
+        if not self._is_given_up:
+            P = joint.of_positions(points)
         P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)
         return Prior(observer.A, self._calibration.values, points, P)
 

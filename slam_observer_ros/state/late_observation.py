@@ -44,9 +44,12 @@ def carried_forward(
     rows = state.landmarks.rows_of(event.ids)
     own = (lag_s * state.landmark_velocity_stddev) ** 2 * np.eye(3)
     moved = replace(moved, covariances=point_covariances(state, moved, rows) + shared + own)
-    if event.orientations is None:
+    if moved.orientations is None:
         return moved
-    R, turns = back[:3, :3], state.observation_noise.orientation_covariances(moved)
+    R, turns = (
+        back[:3, :3],
+        state.observation_noise.orientation_covariances(moved, moved.orientations),
+    )
     turns = turns + len(points) * R @ Q[:3, :3] @ R.T
     return replace(moved, orientation_covariances=turns)
 

@@ -35,9 +35,7 @@ class State:
         self.relinearisation: Relinearisation | None = None  # where the filter needs it
         takes_points = filter_.orientations is None and not self.landmark_velocity_stddev
         if filter_.joint is not None and takes_points:
-            self.relinearisation = Relinearisation(
-                self.observer, filter_.calibration, filter_.joint, settings
-            )
+            self.relinearisation = Relinearisation(filter_, settings)
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
         self.was_contradicted = False  # most known landmarks seen last were rejected

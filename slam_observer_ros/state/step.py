@@ -72,12 +72,13 @@ def _correct(state: State, residuals: Residuals) -> FloatArray:
 def _count(state: State, matched: MatchedObservation, rejected: BoolArray) -> None:
     """Count which known landmarks (m,) were accepted, and which rejected."""
     event, rows, count = matched.known, matched.residuals.rows, int(np.count_nonzero(rejected))
-    state.counts['unmapped_landmark'] += matched.left_out
+    if matched.left_out:
+        state.counts['unmapped_landmark'] += matched.left_out
     if not len(rows):
         return
     state.rejected_in_a_row = state.rejected_in_a_row + 1 if count == len(rows) else 0
     state.was_contradicted = is_contradiction(rejected)
-    state.landmarks.accept(rows[~rejected], event.stamp_ns)
+    state.landmarks.accept(rows[~rejected] if count else rows, event.stamp_ns)
     if count:
         state.landmarks.reject(rows[rejected], *positions(state, event.select(rejected)))
         state.counts['rejected_landmark'] += count
@@ -87,7 +88,7 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
     """Relinearise, if it is time; relocate landmarks in doubt that this does not explain."""
     # After the correction it is known better where they were seen.
     in_doubt = state.landmarks.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
-    some_are = bool(in_doubt.any())
+    some_are = bool(np.count_nonzero(in_doubt))
     past = state.relinearisation
     if past is not None and past.is_active:
         past.add(keyframe_of(state, event, rows), some_are)

@@ -74,7 +74,19 @@ def _seen(
     state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray, are_wanted: BoolArray
 ) -> SeenOrientations:
     """Return those of the orientations in an observation that are wanted (m,) and known."""
-    noise = state.observation_noise.orientation_covariances(event)
+    noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
     seen = SeenOrientations(rows, Z, flipped(Z, event.lines_of_sight), noise, dt_s)
     return seen.select(are_wanted & Z.any(axis=(1, 2)))
+
+
+def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:
+    """Return the orientations (m, 3, 3) that should be seen; those that are, where none is known.
+
+    By that which is seen a tag that seems to be tilted would be trusted more than a frontal one.
+    """
+    tags = state.filter.orientations
+    if tags is None:
+        return Z
+    expected: FloatArray = state.observer.A[:3, :3].T @ tags.B[rows]
+    return np.where(tags.are_known[rows][:, None, None], expected, Z)

@@ -318,7 +318,7 @@ def test_landmarks_that_are_always_seen_late_are_not_drawn_towards_the_robot():
     )
     directions = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0]])
     share = 0.12  # of the range is the standard deviation there
-    parallax = stereo.disparity_noise / (stereo.stereo_focal_length * stereo.stereo_baseline)
+    parallax = stereo.disparity_noise / (stereo.focal_length * stereo.stereo_baseline)
     range_m, noise, others = share / parallax, np.random.default_rng(0), np.array([99])
     estimators = {is_late: Estimator(stereo) for is_late in (False, True)}
     for step in range(60):

@@ -322,7 +322,8 @@ def innovations(number: int, **changed: Any) -> Innovations:
     counts, none = np.arange(number, dtype=np.int64), np.empty(0)
     given: dict[str, Any] = {
         'stamps_ns': counts * 10**8, 'ids': counts, 'distances': values,
-        'residuals_m': 0.1 * values, 'weights': np.ones(number),
+        'residuals': 0.1 * values[:, None] * np.array([1.0, 0.0, 0.0]),
+        'weights': np.ones(number), 'moved': np.zeros(number, dtype=np.bool_),
         'update_stamps_ns': none.astype(np.int64), 'nis': none,
         'degrees_of_freedom': none.astype(np.int64), 'lyapunov': none,
     }  # fmt: skip

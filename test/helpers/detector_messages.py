@@ -35,10 +35,13 @@ for type_name, text in DEFINITIONS.items():
 
 
 def pose_array(
-    points: Iterable[Sequence[float]], frame_id: str, stamp_ns: int = ros.STAMP_NS
+    points: Iterable[Sequence[float]],
+    frame_id: str,
+    stamp_ns: int = ros.STAMP_NS,
+    quaternion: Sequence[float] = NO_TURN,
 ) -> object:
-    """geometry_msgs/PoseArray."""
-    poses = [ros.pose(point, NO_TURN) for point in points]
+    """geometry_msgs/PoseArray, all of whose poses have one orientation."""
+    poses = [ros.pose(point, quaternion) for point in points]
     return ros.make('geometry_msgs/msg/PoseArray', ros.header(frame_id, stamp_ns), poses)
 
 
@@ -48,17 +51,21 @@ def detection(
     covariance: np.ndarray | None = None,
     centre: Sequence[float] = (7.0, 8.0, 9.0),
     position: Sequence[float] = (1.0, 2.0, 3.0),
+    quaternion: Sequence[float] = NO_TURN,
 ) -> object:
-    """vision_msgs/Detection3D of a box, and of a result at ``position`` if it has a class."""
+    """vision_msgs/Detection3D of a box, and of a result at ``position`` if it has a class.
+
+    ``covariance`` is of the position (3, 3), or of the pose (6, 6), position first.
+    """
     results = []
     if class_id is not None:
         hypothesis = ros.make('vision_msgs/msg/ObjectHypothesis', class_id, 0.9)
         whole = np.zeros((6, 6))
         if covariance is not None:
-            whole[:3, :3] = covariance
+            whole[: len(covariance), : len(covariance)] = covariance
         pose = ros.make(
             'geometry_msgs/msg/PoseWithCovariance',
-            ros.pose(position, NO_TURN),
+            ros.pose(position, quaternion),
             whole.ravel(),
         )
         results = [ros.make('vision_msgs/msg/ObjectHypothesisWithPose', hypothesis, pose)]

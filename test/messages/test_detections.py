@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import detector_messages as detector
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 import ros_messages as ros
 
@@ -64,6 +64,31 @@ def test_where_a_result_has_no_position_the_centre_of_the_box_is_taken():
     assert_array_equal(event.ids, [1, 2])
     assert_array_equal(event.points, [[7.0, 8.0, 9.0], [0.0, 0.0, 1.0]])
     assert event.covariances is None, 'that of the result is not of the box'
+
+
+TURN = np.array([0.0, 0.0, 0.6, 0.8])
+TURNED = np.array([[0.28, -0.96, 0.0], [0.96, 0.28, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_poses_and_detections_have_orientations_unless_nobody_filled_them_in():
+    raw = ros.serialise(detector.pose_array([(1.0, 2.0, 3.0)], 'camera', quaternion=TURN))
+    assert_allclose(decode_pose_array(raw).event.orientations, [TURNED], atol=1e-12)
+    for unset in (np.zeros(4), detector.NO_TURN, np.full(4, np.nan), np.full(4, 1e200)):
+        raw = ros.serialise(detector.pose_array([(1.0, 2.0, 3.0)], 'camera', quaternion=unset))
+        assert decode_pose_array(raw).event.orientations is None
+    both = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    event = detections(
+        detector.detection('1', 'x', both, quaternion=TURN), detector.detection('2', 'x', both)
+    )
+    assert_allclose(event.orientations, [TURNED, np.zeros((3, 3))], atol=1e-12)
+    assert_array_equal(event.covariances[0], np.diag([1.0, 2.0, 3.0]))
+    assert_array_equal(event.orientation_covariances[0], np.diag([0.1, 0.2, 0.3]))
+
+
+def test_fiducials_on_tf_have_orientations():
+    message = PoseMessage(ros.STAMP_NS, 'camera', 'tag36h11:5', np.array([1.0, 2.0, 3.0]), TURN)
+    (measurement,) = observed_tags([message], 'tag_')
+    assert_allclose(measurement.event.orientations, [TURNED], atol=1e-12)
 
 
 def test_what_was_not_measured_is_left_out():

@@ -14,6 +14,7 @@ import ros_messages as ros
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.events import MAX_ID
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.messages import cloud_fields, point_clouds
 from slam_observer_ros.messages import poses_and_velocities as messages
 from slam_observer_ros.messages.detections import decode_apriltags
@@ -27,6 +28,11 @@ from slam_observer_ros.messages.message_types import (
     VELOCITY_DECODERS,
 )
 from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.messages.state_messages import (
+    encode_transform,
+    StateMessages,
+    uncertain_pose,
+)
 
 FINITE = st.floats(-1e6, 1e6)
 TWISTS = st.tuples(*[FINITE] * 6)
@@ -539,11 +545,8 @@ def outgoing_messages(make):
         make.quaternion(pose[:3, :3]),
         make.pose(pose),
         make.pose_stamped(stamp, 'map', pose),
-        make.pose_with_covariance(pose, COVARIANCE),
-        make.pose_with_covariance(pose, None),
         make.transform_stamped(stamp, 'map', 'base_link', pose),
         make.twist(velocity),
-        make.twist_with_covariance(velocity, None),
         make.twist_stamped(stamp, 'base_link', velocity),
         make.point_cloud2(stamp, 'map', *cloud),
         make.point_cloud2(stamp, 'map', *cloud, covariances, velocities),
@@ -552,13 +555,44 @@ def outgoing_messages(make):
 
 @pytest.mark.parametrize('covariance', [ANGULAR_FIRST_COVARIANCE, None])
 def test_a_covariance_that_is_sent_is_read_again(covariance):
-    pose = ros.OUTGOING.pose_with_covariance(np.eye(4), covariance)
-    message = ros.make('geometry_msgs/msg/PoseWithCovarianceStamped', ros.header('map'), pose)
-    read = messages.decode_pose_with_covariance_stamped(ros.serialise(message)).covariance
+    raw = StateMessages('map', '').pose(ros.STAMP_NS, uncertain_pose(np.eye(4), covariance))
+    read = messages.decode_pose_with_covariance_stamped(raw).covariance
     if covariance is None:
         assert read is None
     else:
         np.testing.assert_array_equal(read, covariance)
+
+
+@given(FRAMES, FRAMES)
+def test_the_state_is_serialised_as_rosbags_does(map_frame, base_frame):
+    turned = so3.exp(np.array([0.1, -0.2, 0.3]))
+    pose, velocity = se3.pose(turned, np.array([1.0, 2.0, 3.0])), np.arange(1.0, 7.0)
+    position, quaternion = pose[:3, 3].tolist(), so3.to_quaternion(turned).tolist()
+    linear_first = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+    sent = COVARIANCE[linear_first]
+    messages_of_state = StateMessages(map_frame, base_frame)
+
+    odometry = ros.odometry(velocity, sent, position, quaternion, (map_frame, base_frame))
+    made_of = uncertain_pose(pose, COVARIANCE)
+    made = messages_of_state.odometry(ros.STAMP_NS, made_of, velocity, COVARIANCE)
+    assert made == ros.serialise(odometry)
+
+    uncertain = ros.make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped', ros.header(map_frame), odometry.pose
+    )
+    assert messages_of_state.pose(ros.STAMP_NS, made_of) == ros.serialise(uncertain)
+
+    transform = ros.transform_stamped((map_frame, base_frame), position, quaternion)
+    expected = ros.serialise(ros.make('tf2_msgs/msg/TFMessage', [transform]))
+    assert encode_transform(ros.STAMP_NS, map_frame, base_frame, pose) == expected
+
+
+def test_a_message_that_is_made_leaves_the_one_before_as_it_is():
+    state = StateMessages('map', 'base_link')
+    first = state.pose(1, uncertain_pose(np.eye(4), None))
+    kept = bytes(first)
+    state.pose(2, uncertain_pose(np.eye(4), COVARIANCE))
+    assert first == kept
 
 
 def test_rclpy_serialises_the_same_bytes():

@@ -6,6 +6,7 @@ import time
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -25,10 +26,12 @@ SECOND = 1_000_000_000
 class Published:
     """A publisher on a node that is none, and the odometry that it has published."""
 
-    def __init__(self, monkeypatch, **parameters):
+    def __init__(self, monkeypatch, readers=1, **parameters):
         self.clock = SimpleNamespace(now_s=1000.0)
         monkeypatch.setattr(time, 'monotonic', lambda: self.clock.now_s)
         self.odometry = []
+        self.poses = []
+        self.readers = readers
         node = Mock()
         node.create_publisher.side_effect = self._publisher
         self.estimator = Estimator(Settings(reorder_window=0.0, **parameters))
@@ -37,16 +40,18 @@ class Published:
 
     def _publisher(self, message_class, _topic, _qos):
         publisher = Mock()
+        publisher.get_subscription_count.return_value = self.readers
         if message_class is Odometry:
             publisher.publish.side_effect = self.odometry.append
+        if message_class is PoseWithCovarianceStamped:
+            publisher.publish.side_effect = self.poses.append
         return publisher
 
     def at(self, now_s, velocity=None):
         """Take a velocity, in exact time, at some time; publish what is due."""
         self.clock.now_s = 1000.0 + now_s
         self.estimator.add(velocity or VelocityEvent(round(now_s * SECOND), np.ones(6)))
-        if self.publisher.is_due:
-            self.publisher.publish_state()
+        self.publisher.publish_state('twist')
 
 
 def test_each_state_of_an_input_of_the_same_rate_is_published_though_it_jitters(monkeypatch):
@@ -57,8 +62,39 @@ def test_each_state_of_an_input_of_the_same_rate_is_published_though_it_jitters(
     assert len(published.odometry) == 500
 
 
+def test_a_state_that_is_late_for_once_puts_off_no_other(monkeypatch):
+    published = Published(monkeypatch)
+    for step in range(500):
+        published.at(1.0 + 0.02 * step + 0.015 * (step % 10 == 3))
+    assert len(published.odometry) == 500
+
+
 def test_a_faster_input_is_published_at_the_rate_that_was_set(monkeypatch):
     published = Published(monkeypatch)
     for step in range(2000):
         published.at(1.0 + 0.005 * step)
     assert 495 <= len(published.odometry) <= 505
+
+
+def test_what_another_input_gives_in_between_takes_no_turn_of_the_one_that_sets_the_pace(
+    monkeypatch,
+):
+    published = Published(monkeypatch)
+    for step in range(100):
+        at_s = 1.0 + 0.02 * step
+        published.at(at_s)
+        published.clock.now_s += 0.012
+        published.estimator.add(VelocityEvent(round((at_s + 0.012) * SECOND), np.ones(6)))
+        published.publisher.publish_state('landmarks')
+        assert published.publisher.is_waiting
+    assert len(published.odometry) == 100
+
+
+def test_what_nobody_reads_is_not_published(monkeypatch):
+    published = Published(monkeypatch, readers=0)
+    for step in range(10):
+        published.at(1.0 + 0.02 * step)
+    assert not published.odometry
+    assert not published.poses
+    published.publisher.publish_overview()
+    assert len(published.poses) == 1, 'which who comes late gets'

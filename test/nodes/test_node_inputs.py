@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 import importlib.util
+import inspect
 import time
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -32,7 +33,7 @@ from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
 from slam_observer_ros.nodes.intake import warning_decoders
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
-from slam_observer_ros.nodes.intake.input_topic import InputTopic
+from slam_observer_ros.nodes.intake.input_topic import InputTopic, with_info
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.qos import LATCHED_QOS
@@ -506,3 +507,13 @@ def test_another_type_of_cloud_than_is_asked_for_is_said_by_its_own_name():
     _, landmarks = open_inputs(node, ObserverNodeSettings(landmarks_type='PoseArray'), Mock())
     landmarks.check_publishers()
     assert landmarks.problem.endswith('PoseArray is needed; set landmarks_type: PointCloud2')
+
+
+def test_a_callback_gets_what_dds_knows_of_a_message_from_every_executor():
+    received = []
+    callback = with_info(lambda raw, info: received.append((raw, info)))
+    callback(b'1', {'received_timestamp': 1})
+    callback((b'2', {'received_timestamp': 2}))  # as EventsExecutor does
+    assert received == [(b'1', {'received_timestamp': 1}), (b'2', {'received_timestamp': 2})]
+    with pytest.raises(TypeError):  # rclpy would take it for one that wants the message alone
+        inspect.signature(callback).bind(b'')

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from scipy.stats import chi2
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -26,6 +26,7 @@ from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
+from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -127,9 +128,9 @@ def name_file(ros, path, must_succeed=True):
 
 
 def initial_pose(pose, frame_id='map', variances=(0.01,) * 6):
-    message = PoseWithCovarianceStamped(header=MESSAGES.header(time.time_ns(), frame_id))
-    message.pose = MESSAGES.pose_with_covariance(pose, np.diag(variances))
-    return message
+    uncertain = uncertain_pose(pose, np.diag(variances))
+    raw = StateMessages(frame_id, '').pose(time.time_ns(), uncertain)
+    return deserialize_message(raw, PoseWithCovarianceStamped)
 
 
 def test_saved_killed_loaded_and_localised(ros, robot, tmp_path):

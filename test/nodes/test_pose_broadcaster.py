@@ -8,6 +8,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from rclpy.serialization import deserialize_message
 from robots import pose_of, stamp_ns
 
 from slam_observer_ros.geometry import se3
@@ -56,7 +57,8 @@ class Robot:
     def take(self):
         """Return the transforms sent since the last time."""
         publish = self.node.create_publisher.return_value.publish
-        sent = [call.args[0].transforms[0] for call in publish.call_args_list]
+        raw = [call.args[0] for call in publish.call_args_list]
+        sent = [deserialize_message(each, TFMessage).transforms[0] for each in raw]
         publish.reset_mock()
         return sent
 

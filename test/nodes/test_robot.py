@@ -18,9 +18,10 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 @pytest.mark.ros
 @pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built')
-def test_the_robot_is_localised_before_and_after_a_restart(monkeypatch, capsys):
+@pytest.mark.parametrize('options', [[], ['--keep-pose']], ids=' '.join)
+def test_the_robot_is_localised_before_and_after_a_restart(monkeypatch, capsys, options):
     monkeypatch.chdir(CHECKOUT)
-    exit_code = robot.main(['--duration', '24', '--real-time-factor', '2'])
+    exit_code = robot.main(['--duration', '14', '--real-time-factor', '1', *options])
     output = capsys.readouterr().out
     assert exit_code == 0, output
     assert 'The robot was localised.' in output

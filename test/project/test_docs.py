@@ -240,3 +240,7 @@ def test_citation_has_the_version():
     citation = yaml.safe_load((CHECKOUT / 'CITATION.cff').read_text())
     setup = run_setup(str(CHECKOUT / 'setup.py'), stop_after='init')
     assert citation['version'] == setup.get_version()
+
+
+def test_the_readme_is_read_in_a_few_minutes():
+    assert len((CHECKOUT / 'README.md').read_text().split()) <= 800

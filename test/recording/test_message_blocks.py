@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -158,3 +159,57 @@ def test_velocities_in_blocks_are_those_one_by_one(rng, message_type, oddities):
             value = getattr(event, field.name)
             assert_array_equal(value, getattr(same, field.name), err_msg=field.name)
             assert type(value) is type(getattr(same, field.name))
+
+
+def true_pose(rng, message_type, stamp_ns, frame):
+    position, quaternion = rng.normal(size=3), rng.normal(size=4)
+    quaternion *= rng.choice([1.0, 1.05]) / np.linalg.norm(quaternion)
+    if message_type == 'TransformStamped':
+        return ros.transform_stamped(('map', frame), position, quaternion, stamp_ns)
+    if message_type == 'Odometry':
+        return ros.odometry(np.zeros(6), np.eye(6), position, quaternion, ('map', frame), stamp_ns)
+    header, pose = ros.header('map', stamp_ns), ros.pose(position, quaternion)
+    if message_type == 'PoseStamped':
+        return ros.make('geometry_msgs/msg/PoseStamped', header, pose)
+    uncertain = ros.make('geometry_msgs/msg/PoseWithCovariance', pose, np.zeros(36))
+    return ros.make('geometry_msgs/msg/PoseWithCovarianceStamped', header, uncertain)
+
+
+def recorded_truth(rng, message_type, oddities):
+    yield from recorded(rng, 'Twist', 0)
+    for number in range(100):
+        odd = rng.random(4) < 0.03 * oddities
+        received_ns = ros.STAMP_NS + number * STEP_NS
+        stamp_ns = 0 if odd[0] else received_ns + int(rng.integers(-3, 3)) * STEP_NS
+        message = true_pose(rng, message_type, stamp_ns, 'imu_link' if odd[1] else 'base_link')
+        data = ros.serialise(message, little_endian=not odd[2])
+        data = data[:-9] if odd[3] else data
+        yield '/ground_truth/pose', message.__msgtype__, received_ns, data
+
+
+def read_truth(path):
+    with Recording(path) as recording:
+        selected = recording.find_topics(TopicNames(velocity='/odom'))
+        truth = recording.truth(selected, 'base_link')
+    return truth, recording.malformed
+
+
+@given(
+    rng=generators(),
+    message_type=st.sampled_from(
+        ('PoseStamped', 'PoseWithCovarianceStamped', 'TransformStamped', 'Odometry')
+    ),
+    oddities=st.sampled_from([0, 1]),
+)
+@hypothesis_settings(max_examples=20, deadline=None)
+def test_true_poses_in_blocks_are_those_one_by_one(rng, message_type, oddities):
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / 'run.mcap'
+        write_mcap(path, recorded_truth(rng, message_type, oddities), chunk_size=5000)
+        truth, malformed = read_truth(path)
+        with patch.object(reader, '_pose_block', lambda _raw: None):
+            expected, expected_malformed = read_truth(path)
+    assert malformed == expected_malformed
+    assert len(truth.poses) > 0
+    assert_array_equal(truth.stamps_ns, expected.stamps_ns)
+    assert_array_equal(truth.poses, expected.poses)

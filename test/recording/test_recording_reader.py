@@ -19,6 +19,7 @@ from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.measurement import Measurement
+from slam_observer_ros.messages.pose_blocks import PoseBlock
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, other_frames
@@ -296,7 +297,8 @@ def test_a_split_recording_lasts_from_the_start_of_the_first_file_to_the_end_of_
 @pytest.mark.parametrize(('base_frame', 'expected'), [('', set()), ('base_link', {'wheels'})])
 def test_true_poses_are_of_another_frame_only_where_the_robots_has_a_name(base_frame, expected):
     frames = ('', 'wheels', '/base_link')
-    poses = [PoseMessage(0, 'map', frame, np.zeros(3), np.eye(4)[3]) for frame in frames]
+    messages = [PoseMessage(0, 'map', frame, np.zeros(3), np.eye(4)[3]) for frame in frames]
+    poses = [PoseBlock.of(message) for message in messages]
     assert other_frames(base_frame, poses) == expected
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import hashlib
 import json
 from pathlib import Path
@@ -11,10 +12,12 @@ from browser import open_page
 from command_line import CommandLine
 import numpy as np
 import pytest
-from recordings import write_mcap
+from recordings import events, MESSAGE_COUNT, write_mcap
 
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.ellipses import ellipses
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.report.findings import growth_windows
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
@@ -135,6 +138,70 @@ def test_the_slider_moves_to_the_time_in_the_address(report):
         opened = open_page(report, f'#t={t}')
         readout = re.search(r'<output id="readout"[^>]*>([^<]*)', opened.html).group(1)
         assert readout.startswith(f'{t:.1f} s')
+
+
+def run_in_page(report: Path, script: str) -> str:
+    """Return the title that a script, run in a report after it was drawn, has given to it."""
+    changed = report.with_name('changed.html')
+    before, after = report.read_text().rsplit('</body>', 1)
+    changed.write_text(f'{before}<script>{script}</script></body>{after}')
+    opened = open_page(changed)
+    assert opened.console == []
+    return re.search('<title>([^<]*)', opened.html).group(1)
+
+
+def test_motion_in_space_has_a_view_that_turns(report):
+    assert not numbers_of(report)['is_flat']
+    script = """
+        const side = document.getElementById('side'), turn = document.getElementById('turn');
+        const seen = () => side.data.find((trace) => trace.name === 'estimate').x.slice();
+        const before = seen();
+        turn.value = '90';
+        turn.dispatchEvent(new Event('input'));
+        const after = seen(), xyz = run.path.xyz;
+        const equal = (a, b) => a.every((v, n) => Math.abs(v - b[n]) < 1e-9);
+        const hidden = document.getElementById('views').hidden;
+        document.title = [equal(before, xyz[0]), equal(after, xyz[1]), hidden].join();
+    """
+    assert run_in_page(report, script) == 'true,true,false'
+
+
+def test_ellipses_hold_95_percent_in_any_view(report):
+    script = """
+        const xs = [], ys = [];
+        addEllipse(1, 2, [4, 0.5, 0.2, 1, 0.1, 9], PLAN, xs, ys);
+        const distances = xs.slice(0, -1).map((x, n) => {
+          const u = x - 1, v = ys[n] - 2;
+          return (u * u - u * v + 4 * v * v) / (4 - 0.25);
+        });
+        document.title = distances.every((d) => Math.abs(d - 5.991464547) < 1e-6);
+    """
+    assert run_in_page(report, script) == 'true'
+
+
+def test_on_paper_each_curve_is_a_figure_of_its_own(report):
+    script = """
+        dispatchEvent(new Event('beforeprint'));
+        const onPaper = document.querySelectorAll('#curves > div.js-plotly-plot').length;
+        dispatchEvent(new Event('afterprint'));
+        const curves = document.getElementById('curves').data;
+        document.title = [onPaper > 3, curves.length > onPaper].join();
+    """
+    assert run_in_page(report, script) == 'true,true'
+
+
+def test_landmarks_that_are_believed_moved_are_marked(slam_observer, tmp_path):
+    written, report = tmp_path / 'moved.mcap', tmp_path / 'moved.html'
+    with RecordingWriter(written) as writer:
+        for number, event in enumerate(events()):
+            if isinstance(event, ObservationEvent) and number > MESSAGE_COUNT / 2:
+                event = replace(event, points=event.points + [[0, 4, 0], [0, 0, 0], [0, 0, 0]])
+            writer.write_event(event)
+    assert slam_observer('replay', written, '--report', report).code == 0
+    numbers = numbers_of(report)
+    moved = {numbers['residuals']['id'][row] for row in numbers['residuals']['moved']}
+    assert moved == {3}
+    assert 'believed moved' in open_page(report).html
 
 
 def test_moving_the_slider_moves_the_robot(report):

@@ -326,7 +326,7 @@ def test_stereo_errs_with_the_square_of_the_range_in_depth(rng, log_range):
     covariance = observed(
         [range_m * sight],
         observation_model='stereo',
-        stereo_focal_length=400.0,
+        focal_length=400.0,
         stereo_baseline=0.1,
         pixel_noise=2.0,
         disparity_noise=0.5,
@@ -400,7 +400,7 @@ def spread_after(range_m, **settings):
     'settings',
     [
         {'range_noise': 0.1, 'range_scale_noise': 0.2, 'bearing_noise': 0.02},
-        {'observation_model': 'stereo', 'stereo_focal_length': 400.0, 'stereo_baseline': 0.1},
+        {'observation_model': 'stereo', 'focal_length': 400.0, 'stereo_baseline': 0.1},
     ],
 )
 def test_known_landmarks_weigh_the_same_whether_seen_too_near_or_too_far(settings):

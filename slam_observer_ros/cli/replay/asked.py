@@ -65,7 +65,7 @@ def without_outputs(args: argparse.Namespace, recording: Path) -> argparse.Names
 
     ``args`` has those of :func:`add_run_options`; what they set is in :class:`Asked`.
     """
-    outputs = {'tum': None, 'map': None, 'report': None, 'mcap': None, 'plot': None}
+    outputs = dict.fromkeys(('tum', 'map', 'report', 'mcap', 'rerun', 'plot'))
     others: dict[str, object] = {'with_inputs': False, 'json': True, 'force': True}
     read: dict[str, object] = {'recording': recording, 'config': None, 'set': []}
     return argparse.Namespace(**vars(args) | outputs | others | read)

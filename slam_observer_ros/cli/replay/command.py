@@ -14,6 +14,7 @@ from slam_observer_ros.cli.replay.estimate_recording import add_recording_option
 from slam_observer_ros.cli.replay.files import check_files, FIGURES, write_files
 from slam_observer_ros.cli.replay.identity import identity, sha256_of
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
+from slam_observer_ros.cli.replay.rerun import add_rerun_option
 from slam_observer_ros.cli.replay.run import replayed
 from slam_observer_ros.cli.replay.summary import as_json, print_summary, summary_rows
 from slam_observer_ros.common.errors import LossError, OutputError
@@ -49,6 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'calibration over time',
     )
     add_recording_options(outputs)
+    add_rerun_option(outputs)
     add_result_options(outputs, FIGURES)
     parser.add_argument(
         '--strict',

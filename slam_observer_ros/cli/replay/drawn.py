@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
+from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import nees_over_time
 from slam_observer_ros.evaluation.gaps import fill_gaps
@@ -29,26 +30,36 @@ def write_report_of(
     title: str, outcome: ReplayOutcome, summary: Mapping[str, str], path: Path
 ) -> None:
     """Write the report, with the lines of the table that is printed."""
-    recorder = outcome.recorder
+    write_report(path, _reported_run(title, outcome, summary))
+
+
+def show_run_in_rerun(
+    title: str, outcome: ReplayOutcome, summary: Mapping[str, str], path: Path | None
+) -> None:
+    """Write a file for Rerun, or open its viewer if that is None."""
+    from slam_observer_ros.report.rerun_log import show_in_rerun  # which only some have
+
+    show_in_rerun(_reported_run(title, outcome, summary), path)
+
+
+def _reported_run(title: str, outcome: ReplayOutcome, summary: Mapping[str, str]) -> ReportedRun:
+    recorder, estimator = outcome.recorder, outcome.result.estimator
     if not isinstance(recorder, RunRecorder):
-        return
-    estimator = outcome.result.estimator
-    write_report(
-        path,
-        ReportedRun(
-            title=title,
-            figures=summary,
-            warnings=outcome.warnings,
-            settings=estimator.settings,
-            start_ns=outcome.result.start_ns,
-            trajectory=outcome.result.trajectory,
-            in_known_map=outcome.result.in_known_map,
-            truth=outcome.truth,
-            errors=outcome.accuracy.pose_errors,
-            anees=outcome.accuracy.anees,
-            instants=recorder.finish(estimator),
-            innovations=recorder.innovations,
-        ),
+        raise EvaluationError('nothing was recorded that could be shown')
+    return ReportedRun(
+        title=title,
+        figures=summary,
+        warnings=outcome.warnings,
+        settings=estimator.settings,
+        start_ns=outcome.result.start_ns,
+        trajectory=outcome.result.trajectory,
+        dead_reckoning=outcome.result.dead_reckoning,
+        in_known_map=outcome.result.in_known_map,
+        truth=outcome.truth,
+        errors=outcome.accuracy.pose_errors,
+        anees=outcome.accuracy.anees,
+        instants=recorder.finish(estimator),
+        innovations=recorder.innovations,
     )
 
 

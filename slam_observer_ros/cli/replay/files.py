@@ -17,6 +17,7 @@ from slam_observer_ros.cli.outputs import (
     filled_directory,
 )
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
+from slam_observer_ros.cli.replay.rerun import check_rerun, VIEWER
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.evaluation.trajectory import write_tum
 from slam_observer_ros.known_map.map_file import write_map
@@ -33,10 +34,16 @@ def check_files(args: argparse.Namespace) -> None:
     if args.config is not None:
         read['the file of --config'] = [find_config(args.config)]
     loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
-    kept = {'--tum': args.tum, '--report': args.report, '--mcap': args.mcap}
+    kept = {
+        '--tum': args.tum,
+        '--report': args.report,
+        '--mcap': args.mcap,
+        '--rerun': args.rerun or None,
+    }
     check_inputs_are_kept(kept, read | loaded)
     check_inputs_are_kept({'--map': args.map}, read)
-    check_outputs([args.tum, args.map, args.report, args.mcap], args.force)
+    check_outputs([args.tum, args.map, args.report, args.mcap, args.rerun or None], args.force)
+    check_rerun(args)
     check_plots(args, FIGURES)
 
 
@@ -48,6 +55,7 @@ def write_files(
         ('trajectory', args.tum, lambda path: write_tum(outcome.trajectory, path)),
         ('map', args.map, lambda path: _write_map(outcome, map_frame, path)),
         ('report', args.report, lambda path: _write_report(args, outcome, summary, path)),
+        ('Rerun file', args.rerun or None, lambda path: _show_in_rerun(args, outcome, summary)),
         ('figures', args.plot, lambda path: _draw_figures(args, outcome, path)),
     )
     written: dict[str, Path] = {} if args.mcap is None else {'recording': args.mcap}
@@ -60,6 +68,8 @@ def write_files(
             written[name] = path
         except (SlamObserverError, OSError) as error:
             errors.append(str(error))
+    if args.rerun is VIEWER:
+        _show_in_rerun(args, outcome, summary)
     return written, errors
 
 
@@ -81,6 +91,15 @@ def _write_report(
     from slam_observer_ros.cli.replay.drawn import write_report_of  # which takes a while to import
 
     write_report_of(args.recording.name, outcome, summary, path)
+
+
+def _show_in_rerun(
+    args: argparse.Namespace, outcome: ReplayOutcome, summary: Mapping[str, str]
+) -> None:
+    from slam_observer_ros.cli.replay.drawn import show_run_in_rerun
+
+    path = None if args.rerun is VIEWER else args.rerun
+    show_run_in_rerun(args.recording.name, outcome, summary, path)
 
 
 def _draw_figures(args: argparse.Namespace, outcome: ReplayOutcome, directory: Path) -> None:

@@ -74,8 +74,7 @@ def _replay(
             events = show_progress(events, 'replaying', recording.event_count(selected))
         recorder = _recorder(args)
         map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
-        is_drawn = any(output is not None for output in (args.tum, args.plot, args.report))
-        needs_poses = is_drawn or len(truth.stamps_ns) > 0
+        needs_poses = args.tum is not None or _is_shown(args) or len(truth.stamps_ns) > 0
         with estimate_writer(args, recording, selected, inputs, map_frame) as writer:
             recorders = [noter for noter in (recorder, writer) if noter is not None]
             result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
@@ -94,9 +93,14 @@ def _replay(
 
 
 def _recorder(args: argparse.Namespace) -> RunRecorder | NisTally | None:
-    if args.report is not None or args.plot is not None:
+    if _is_shown(args):
         return RunRecorder()
     return NisTally() if args.json else None
+
+
+def _is_shown(args: argparse.Namespace) -> bool:
+    """Return whether anything is asked for that shows the whole run."""
+    return any(output is not None for output in (args.report, args.plot, args.rerun))
 
 
 def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:

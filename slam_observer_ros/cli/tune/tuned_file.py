@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
 
-import yaml
-
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind
 from slam_observer_ros.cli.tune.verdict import Verdict
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.output_files import unfinished_file
 from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.settings.dump import value_text
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import Value
 
@@ -90,6 +89,4 @@ def write_tuned(
 
 
 def _entry(name: str, value: object) -> str:
-    plain = list(value) if isinstance(value, tuple) else value
-    text: str = yaml.safe_dump(plain, default_flow_style=True, width=10_000)
-    return f'    {name}: {text.splitlines()[0]}'  # a scalar has an end of its own below it
+    return f'    {name}: {value_text(value)}'

@@ -55,15 +55,17 @@ class RobotError(SlamObserverError):
 class Observer:
     """The process of the observer, which can be ended and started again."""
 
-    def __init__(self, folder: Path, real_time_factor: float) -> None:
+    def __init__(self, folder: Path, real_time_factor: float, keeps_pose: bool) -> None:
         self._log = folder / f'{EXECUTABLE}.log'
         arguments = LAUNCH_ARGUMENTS | {'map_file': str(folder / LAUNCH_ARGUMENTS['map_file'])}
         # The rate is one of wall time, in which the simulation is faster.
-        rate = ('-p', f'publish_rate:={RATE_HZ * real_time_factor}')
+        more = ['-p', f'publish_rate:={RATE_HZ * real_time_factor}']
+        if keeps_pose:
+            more += ['-p', f'pose_file:={folder / "pose.yaml"}']
         self._command = [
             *(sys.executable, '-m', f'slam_observer_ros.nodes.{EXECUTABLE}'),
             *command_line(PARAMS_FILE, arguments),
-            *rate,
+            *more,
         ]
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -119,6 +121,9 @@ def _parser() -> argparse.ArgumentParser:
         default=2.0,
         help='simulated seconds a second (default 2)',
     )
+    parser.add_argument(
+        '--keep-pose', action='store_true', help='let the observer keep its pose over the restart'
+    )
     parser.add_argument('--seed', type=int, default=0, help='of what is random (default 0)')
     return parser
 
@@ -134,7 +139,7 @@ def _run(options: argparse.Namespace, folder: Path, console: Console) -> tuple[H
         robot = HallRobot(options.seed)
         cleanup.callback(robot.destroy_node)
         cleanup.enter_context(_listening(robot))
-        observer = Observer(folder, options.real_time_factor)
+        observer = Observer(folder, options.real_time_factor, options.keep_pose)
         cleanup.callback(observer.end)
         observer.start()
         _wait_until_heard(robot, observer)

@@ -14,7 +14,7 @@ from slam_observer_ros.nodes.demo.hall_robot import error_of, Estimated, HallRob
 ENOUGH_TAGS = 2  # from which position and heading in the plane follow
 MAX_ERROR_M, MAX_ERROR_RAD = 0.15, 0.08  # of the RMS; with the noise of the hall it is a third
 MAX_BACK_S = 1.0
-MIN_RATE = 0.8  # of what is asked for, on a machine with other work
+MIN_RATE = 0.9  # of what is asked for; less says something of the machine alone
 
 
 @dataclass
@@ -24,6 +24,11 @@ class Restart:
     planned_s: float
     ended_s: float | None = None
     localised_s: float | None = None
+
+    @property
+    def moved_s(self) -> float:
+        """For how long the robot moved before it was localised again; its time stood still."""
+        return (self.localised_s or 0.0) - (self.ended_s or 0.0)
 
     def back_after_s(self, seen: list[Seen]) -> float | None:
         """Return how long after enough tags were in view map → odom was there; None if never."""
@@ -61,17 +66,19 @@ def report(robot: HallRobot, restart: Restart, rate_hz: float, console: Console)
                 'ANEES of amcl_pose': f'{anees:.2f} (1 is consistent)',
                 f'restarted at {restart.planned_s:g} s': 'not localised again'
                 if back_s is None
-                else f'localised again {back_s:.2f} s after the next {ENOUGH_TAGS} tags',
+                else f'localised again {restart.moved_s:.2f} s after it drove on, '
+                f'{back_s:.2f} s after the next {ENOUGH_TAGS} tags',
             },
         )
     )
     is_good = (
         position_m < MAX_ERROR_M
         and heading_rad < MAX_ERROR_RAD
-        and reached_hz > MIN_RATE * rate_hz
         and back_s is not None
         and back_s <= MAX_BACK_S
     )
+    if reached_hz < MIN_RATE * rate_hz:
+        console.print('The machine is too slow for this: try a smaller --real-time-factor.')
     console.print('The robot was localised.' if is_good else 'That is not as it should be.')
     return is_good
 

@@ -31,6 +31,11 @@ class ClockChange:
         self._jumped_s = -AROUND_S
         self._back_ns = 0
 
+    @property
+    def is_holding(self) -> bool:
+        """Whether a message waits for /clock to jump."""
+        return bool(self._held)
+
     def begin(self, back_ns: int) -> None:
         """Take that /clock has jumped back, nanoseconds; until the end the last run is used up."""
         self._is_jumping = True

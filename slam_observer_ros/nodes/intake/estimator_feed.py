@@ -49,7 +49,9 @@ class EstimatorFeed:
     dropped : Counter
         Messages that did not become events, by reason.
     on_events : callable
-        Called after events were used.
+        Called after events were used, with the name of the input that gave them; '' for several.
+    on_waiting : callable
+        Called when something begins to wait: :meth:`retry` is to be called often from then on.
     clocks : dict of str to ClockOffset
         How far off the stamps are, by input.
     is_active : bool
@@ -87,12 +89,20 @@ class EstimatorFeed:
         self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
         self.is_active = False
         self.is_paused = False
-        self.on_events: Callable[[], None] = lambda: None
+        self.on_events: Callable[[str], None] = lambda _name: None
+        self.on_waiting: Callable[[], None] = lambda: None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether something waits for a transform, or for /clock to jump."""
+        return self._builder.is_waiting or self._change.is_holding
 
     def add(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Take what an input measures; without a stamp it has that of its reception."""
         if not (self.is_active and self._is_of_another_run(name, measured, receive_ns)):
             self._use(name, measured, receive_ns)
+        if self.is_waiting:
+            self.on_waiting()
 
     def begin_clock_jump(self, back_ns: int) -> None:
         """Use only what is of the time before /clock has jumped back, nanoseconds, until the end.
@@ -127,7 +137,7 @@ class EstimatorFeed:
         if timed is not measured:
             reason = f'stamps are zero on {self._topics[name]}'
             self._log.warning(reason, f'{reason}: the time of reception is taken instead')
-        self._give(self._builder.add(timed, time.monotonic_ns()))
+        self._give(self._builder.add(timed, time.monotonic_ns()), name)
 
     def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
         """Take landmarks, unless they are a lidar's scan."""
@@ -145,10 +155,10 @@ class EstimatorFeed:
             self.add_observation(each, receive_ns)
 
     def retry(self) -> None:
-        """Try again what waits for a transform, or for /clock to jump; call it often."""
+        """Try again what waits for a transform, or for /clock to jump."""
         for received in self._change.take_overdue():
             self._use(*received)
-        self._give(self._builder.retry(time.monotonic_ns()))
+        self._give(self._builder.retry(time.monotonic_ns()), '')
 
     def clear(self) -> None:
         """Drop what waits, and what is known of clocks, as after a jump of the clock."""
@@ -183,7 +193,7 @@ class EstimatorFeed:
         self._processing_s, self._processed = 0.0, 0
         return mean_s * 1e3
 
-    def _give(self, events: list[Event]) -> None:
+    def _give(self, events: list[Event], name: str) -> None:
         # All before the first is used: if that shows a jump of the clock, offsets are forgotten.
         for event in [self._in_own_time(event) for event in events]:
             start_s = time.perf_counter()
@@ -191,7 +201,7 @@ class EstimatorFeed:
             self._processing_s += time.perf_counter() - start_s
             self._processed += 1
         if events:
-            self.on_events()
+            self.on_events(name)
 
     def _in_own_time(self, event: Event) -> Event:
         stamp_ns = event.stamp_ns

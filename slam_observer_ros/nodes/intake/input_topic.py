@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
 import math
 import time
 from typing import Any, Generic, TypeVar
@@ -45,6 +46,20 @@ def take(subscription: Subscription) -> tuple[bytes, Mapping[str, int]] | None:
             subscription.msg_type, subscription.raw
         )
     return taken
+
+
+def with_info(receive: Callable[[bytes, Mapping[str, int]], None]) -> Callable[..., None]:
+    """Return a callback that gets a message with what DDS knows of it from every executor.
+
+    EventsExecutor gives both as one argument, in rclpy 7.1 at least.
+    """
+
+    def callback(*taken: Any) -> None:
+        receive(*(taken[0] if len(taken) == 1 else taken))
+
+    # By which rclpy sees that the callback wants both.
+    callback.__signature__ = signature(receive)  # type: ignore[attr-defined]
+    return callback
 
 
 class InputTopic(Generic[MessageT]):
@@ -147,7 +162,11 @@ class InputTopic(Generic[MessageT]):
         found = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in found]
         if usable and self._type_name not in usable:
-            self._subscribe(usable[0])
+            # A topic has one type at a time, and the executor lets go of the old one after this.
+            if self._subscription is None:
+                self._subscribe(usable[0])
+            else:
+                self.close()
         self._fault = self._find_fault(publishers, usable)
         if problem := self.problem:
             self._log.warning(self.topic, problem)
@@ -159,10 +178,9 @@ class InputTopic(Generic[MessageT]):
             self._subscription = None
 
     def _subscribe(self, type_name: str) -> None:
-        self.close()
         self._type_name = type_name
         self._subscription = self._node.create_subscription(
-            message_class(type_name), self.topic, self._receive, self._qos, raw=True
+            message_class(type_name), self.topic, with_info(self._receive), self._qos, raw=True
         )
         self._node.get_logger().info(f"receiving {type_name} on '{self.topic}'")
 

@@ -36,6 +36,9 @@ class LiveTransforms(TransformSource, Protocol):
     on_transform: Callable[[str, str, int], None]
     """Called with parent, child and stamp, nanoseconds, of each transform on /tf."""
 
+    is_own: Callable[[bytes], bool]
+    """Says of a message on /tf whether it came from here; then it is not looked into."""
+
     def read_waiting(self) -> None:
         """Take what has come on /tf: while the node was busy, it may be a lot."""
 
@@ -52,6 +55,7 @@ class TopicTransforms:
         self._own = own
         self._log = ThrottledLog(node)
         self.on_transform: Callable[[str, str, int], None] = _ignore
+        self.is_own: Callable[[bytes], bool] = _is_of_another
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
         self.newest_ns = self._buffer.newest_ns
@@ -69,6 +73,8 @@ class TopicTransforms:
 
     def _subscribe(self, topic: str, qos: QoSProfile, *, is_static: bool) -> Subscription:
         def receive(raw: bytes) -> None:
+            if self.is_own(raw):
+                return
             try:
                 transforms = decode_transforms(raw)
             except MessageError as error:
@@ -88,6 +94,7 @@ class Tf2Transforms:
 
     def __init__(self, node: Node) -> None:
         self.on_transform: Callable[[str, str, int], None] = _ignore
+        self.is_own: Callable[[bytes], bool] = _is_of_another  # tf2 looks into all messages
         self._buffer = tf2_ros.Buffer()
         self._insert = self._buffer.set_transform
         self._buffer.set_transform = self._set_transform
@@ -137,6 +144,11 @@ class Tf2Transforms:
 
 def _ignore(_parent: str, _child: str, _stamp_ns: int) -> None:
     """Take no notice of a transform."""
+
+
+def _is_of_another(_raw: bytes) -> bool:
+    """Take each message to be of another publisher."""
+    return False
 
 
 def _read_waiting(subscription: Subscription) -> None:

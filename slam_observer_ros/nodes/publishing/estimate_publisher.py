@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-import time
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
@@ -20,9 +19,11 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
 from slam_observer_ros.messages.outgoing import encode_point_cloud
+from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
 from slam_observer_ros.nodes.intake.input_topic import rivals
 from slam_observer_ros.nodes.intake.transform_listener import LiveTransforms
 from slam_observer_ros.nodes.message_classes import MESSAGES
+from slam_observer_ros.nodes.publishing.pace import Pace
 from slam_observer_ros.nodes.publishing.pose_broadcaster import PoseBroadcaster
 from slam_observer_ros.nodes.qos import LATCHED_POSE_QOS, LATCHED_QOS, RELIABLE_QOS
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
@@ -38,10 +39,6 @@ TOPICS = (
     'markers',
 )
 """Topics of the estimate, before remapping."""
-
-EARLY = 0.5
-"""Part of the period by which a state may come early, so that one of an input of the same rate,
-which jitters, is never left for the next."""
 
 
 class EstimatePublisher:
@@ -63,9 +60,9 @@ class EstimatePublisher:
         self._settings = settings
         self._log = ThrottledLog(node)
         self._estimator = estimator
-        self._messages = EstimateMessages(MESSAGES, settings.map_frame, settings.base_frame)
-        self._period_s = 1.0 / settings.publish_rate
-        self._due_s = 0.0  # when the next state may be published, by a steady clock
+        self._messages = EstimateMessages(MESSAGES, settings.map_frame)
+        self._state = StateMessages(settings.map_frame, settings.base_frame)
+        self._pace = Pace(settings.publish_rate)
         self._fast_stamp_ns: int | None = None
         self._slow_stamp_ns: int | None = None
         self._path: deque[PoseStamped] = deque(maxlen=settings.path_length)
@@ -83,6 +80,7 @@ class EstimatePublisher:
                 node, settings, transforms, estimator.settings.reorder_window
             )
             transforms.on_transform = self._broadcaster.hear
+            transforms.is_own = self._broadcaster.is_own
 
     @property
     def problem(self) -> str:
@@ -108,37 +106,45 @@ class EstimatePublisher:
             self._log.warning(topic, text)
         return text
 
-    @property
-    def is_due(self) -> bool:
-        """Whether ``publish_rate`` allows to publish a state now."""
-        return time.monotonic() >= self._due_s - EARLY * self._period_s
+    def is_due(self, source: str) -> bool:
+        """Whether ``publish_rate`` allows to publish now what an input has given; '' for none."""
+        return self._pace.is_due(source)
 
-    def publish_state(self) -> None:
+    @property
+    def is_waiting(self) -> bool:
+        """Whether there is something to publish, once it is due or the odometry is there."""
+        is_waiting = self._broadcaster is not None and self._broadcaster.is_waiting
+        return is_waiting or self._is_new(self._fast_stamp_ns)
+
+    def publish_state(self, source: str = '') -> None:
         """Publish odometry, pose, transform, Lyapunov value and landmarks if new and due."""
         if self._broadcaster is not None:
             self._broadcaster.retry()
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None or stamp_ns == self._fast_stamp_ns or not self.is_due:
+        if stamp_ns is None or not (self._is_new(self._fast_stamp_ns) and self.is_due(source)):
             return
-        if not self._estimator.is_localised:
-            return
-        self._due_s = max(self._due_s, time.monotonic()) + self._period_s
+        self._pace.note(source)
         self._fast_stamp_ns = stamp_ns
         pose = self._estimator.pose
         self._publish_pose(stamp_ns, pose)
         if self._broadcaster is not None:
             self._broadcaster.add(stamp_ns, pose)
         self._extend_path(stamp_ns, pose)
-        self._lyapunov.publish(self._messages.value(self._estimator.lyapunov))
-        self._publish_estimates(stamp_ns)
+        # What nobody reads, and nobody can read later, is not made.
+        if self._lyapunov.get_subscription_count():
+            self._lyapunov.publish(self._messages.value(self._estimator.lyapunov))
+        if self._estimates.get_subscription_count():
+            self._publish_estimates(stamp_ns)
 
     def publish_overview(self) -> None:
         """Publish path, map and markers if they are new; they are costly, so seldom."""
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns in (None, self._slow_stamp_ns) or not self._estimator.is_localised:
+        if stamp_ns is None or not self._is_new(self._slow_stamp_ns):
             return
         self._slow_stamp_ns = stamp_ns
-        self._path_publisher.publish(self._messages.path(stamp_ns, self._path))
+        self._keep_pose(stamp_ns)
+        if self._path_publisher.get_subscription_count():
+            self._path_publisher.publish(self._messages.path(stamp_ns, self._path))
         self._publish_landmarks(stamp_ns)
 
     def replace_landmarks(self) -> None:
@@ -171,12 +177,30 @@ class EstimatePublisher:
             self._broadcaster.clear()
         self.replace_landmarks()
 
+    def _is_new(self, published_ns: int | None) -> bool:
+        """Return whether there is a state of another stamp than the one that was published."""
+        stamp_ns = self._estimator.stamp_ns
+        return stamp_ns not in (None, published_ns) and self._estimator.is_localised
+
     def _publish_pose(self, stamp_ns: int, pose: FloatArray) -> None:
+        poses, odometries = (
+            publisher.get_subscription_count() for publisher in (self._pose, self._odometry)
+        )
+        if not (poses or odometries):
+            return
         estimator = self._estimator
-        uncertain = self._messages.pose(stamp_ns, pose, estimator.pose_covariance)
-        self._pose.publish(uncertain)
-        velocity, covariance = estimator.body_velocity, estimator.body_velocity_covariance
-        self._odometry.publish(self._messages.odometry(uncertain, velocity, covariance))
+        uncertain = uncertain_pose(pose, estimator.pose_covariance)
+        if poses:
+            self._pose.publish(self._state.pose(stamp_ns, uncertain))
+        if odometries:
+            velocity = estimator.body_velocity, estimator.body_velocity_covariance
+            self._odometry.publish(self._state.odometry(stamp_ns, uncertain, *velocity))
+
+    def _keep_pose(self, stamp_ns: int) -> None:
+        """Publish the pose, while nobody reads it, for whoever comes later."""
+        if not self._pose.get_subscription_count():
+            uncertain = uncertain_pose(self._estimator.pose, self._estimator.pose_covariance)
+            self._pose.publish(self._state.pose(stamp_ns, uncertain))
 
     def _publish_landmarks(self, stamp_ns: int) -> None:
         estimator = self._estimator

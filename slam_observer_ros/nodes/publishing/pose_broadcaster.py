@@ -75,6 +75,11 @@ class PoseBroadcaster:
         self._rival_s = -RIVAL_S
         self.problem = ''
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a pose waits for odometry, or for it to be known who is the base's parent."""
+        return bool(self._waiting)
+
     def add(self, stamp_ns: int, pose: FloatArray) -> None:
         """Publish a pose (4, 4) of the base in the map, now or once its odometry is there."""
         if self._begin_s is None:
@@ -84,12 +89,16 @@ class PoseBroadcaster:
             self._waiting.popleft()
         self.retry()
 
+    def is_own(self, raw: bytes) -> bool:
+        """Return whether a message heard on /tf is one of the last that were sent from here."""
+        return raw in self._publisher.sent
+
     def hear(self, parent: str, child: str, stamp_ns: int) -> None:
         """Take a transform that was heard on /tf: nobody else may give the same frame a parent."""
         ends = [self._settings.map_frame, self._child]
         if [parent, child] != (ends[::-1] if self._settings.invert_tf else ends):
             return
-        if stamp_ns not in self._own_ns:
+        if stamp_ns not in reversed(self._own_ns):  # the last ones are heard first
             self._rival_s = time.monotonic()
             self._log.warning('another', self.rival)
 
@@ -204,6 +213,8 @@ class PoseBroadcaster:
     def _choose_child(self, child: str, reason: str) -> None:
         self._child = child
         settings = self._settings
+        if not self._publisher.can_publish:
+            return
         self._node.get_logger().info(
             f"publishing '{settings.map_frame}' to '{child}' on /tf: "
             f"{reason} '{settings.odom_frame}' to '{settings.base_frame}'"

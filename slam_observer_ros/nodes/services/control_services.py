@@ -35,6 +35,7 @@ class ControlServices:
     def _pause(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._estimator.release()  # what has come before the pause counts
         self._feed.is_paused = True
+        self._feed.on_events('')
         return self._answer(response, 'paused: the pose is held, and all that comes in is dropped')
 
     def _resume(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

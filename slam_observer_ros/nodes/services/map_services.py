@@ -88,6 +88,14 @@ class MapServices:
             except SlamObserverError as error:
                 raise MapError(f'the map is not saved: {error}') from error
 
+    def save_to(self, path: str, response: Trigger.Response) -> Trigger.Response:
+        """Save the map to a file, that of ``map_path`` if none is named; return the response."""
+        return self._answer(response, self._save, path)
+
+    def load_from(self, path: str, response: Trigger.Response) -> Trigger.Response:
+        """Load a map from a file, likewise."""
+        return self._answer(response, self._load, path)
+
     def keep_recent(self) -> None:
         """Have a map at hand for :meth:`end_in_haste`; a twentieth of the time goes there."""
         start_s = time.monotonic()
@@ -148,16 +156,18 @@ class MapServices:
     def _answer_save(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        return self._answer(response, self._save)
+        return self.save_to('', response)
 
     def _answer_load(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        return self._answer(response, self._load)
+        return self.load_from('', response)
 
-    def _answer(self, response: Trigger.Response, act: Callable[[Path], str]) -> Trigger.Response:
+    def _answer(
+        self, response: Trigger.Response, act: Callable[[Path], str], path: str = ''
+    ) -> Trigger.Response:
         try:
-            response.message = act(self._path())
+            response.message = act(absolute(path) if path else self._path())
             response.success = True
             self._node.get_logger().info(response.message)
         except SlamObserverError as error:

@@ -10,12 +10,17 @@ S. Bonnabel, *The invariant extended Kalman filter as a stable observer*, 2017).
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
+from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import block_diagonal, kalman_update, transpose
+from slam_observer_ros.geometry.matrices import (
+    block_diagonal,
+    kalman_update,
+    transpose,
+    with_blocks,
+)
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -24,6 +29,11 @@ from slam_observer_ros.sensor_models.motion import Motion
 
 class JointCovariance:
     """P, and which of its columns are whose."""
+
+    # Whether all landmarks are in P, and the rows of those that are, in its order: a correction
+    # moves these. See :mod:`.compressed_covariance`.
+    is_dense = True
+    active: IntArray | slice = slice(None)
 
     def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
         self._axes, self._p = axes, axes.p
@@ -70,6 +80,17 @@ class JointCovariance:
         """Return ξ_i (n, 3) of x, and the changes of velocities, None where there are none."""
         return self._axes.full_points(x[self.first :]), None
 
+    def activate(self, rows: IntArray) -> None:
+        """See to it that landmarks (m,), which are going to be observed, are in P."""
+
+    def dense(self) -> JointCovariance:
+        """Return the same with all landmarks in P."""
+        return self
+
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far landmarks (m, 3) have yet to be moved, metres."""
+        raise NotImplementedError
+
     # The step
 
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
@@ -107,15 +128,29 @@ class JointCovariance:
 
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
-        columns = self._columns(rows).reshape(len(rows), self._axes.point)
-        return self._output(C, columns)
+        P, columns = self.P, self._columns(rows).reshape(len(rows), self._axes.point)
+        to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
+        PC = self.pose @ transpose(C) - transpose(to_pose)
+        return PC, C @ PC - to_pose @ transpose(C) + own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the same of all together, (p, m k) and (m k, m k)."""
-        return self._output(C.reshape(-1, self._p), self._columns(rows))
+        C, columns = C.reshape(-1, self._p), self._columns(rows)
+        seen = self._matrix.rows(columns)
+        to_pose = seen[:, : self._p]
+        PC = self.pose.dot(C.T) - to_pose.T
+        return PC, C.dot(PC) - to_pose.dot(C.T) + seen.take(columns, axis=1)
+
+    def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
+        """Return −K r of residuals r (m, k) of noise R (m, k, k), K = P Hᵀ S⁻¹, and update P."""
+        HP, HPH = self.project(C, rows)
+        return -self.update(HP, with_blocks(HPH, R), r.ravel())
 
     def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
-        """Update P by what :meth:`project` projected; return K r, K = P Hᵀ S⁻¹ the gain."""
+        """Update P by what :meth:`project` projected, which is used up; return K r.
+
+        K = P Hᵀ S⁻¹ is the gain.
+        """
         if not len(r):
             return np.zeros(len(self.P))
         L, is_indefinite = dpotrf(S, lower=1)
@@ -123,11 +158,10 @@ class JointCovariance:
             moved: FloatArray = kalman_update(self.P, HP, S).dot(r)
             return moved
         # P − Wᵀ W and Wᵀ z, W = L⁻¹ H P, z = L⁻¹ r, L Lᵀ = S.
-        right = np.empty((len(r), len(self.P) + 1))
-        right[:, :-1], right[:, -1] = HP, r
-        W = dtrsm(1.0, L, right.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
-        self._matrix.subtract_square(W[:, :-1])
-        Kr: FloatArray = W[:, -1].dot(W[:, :-1])
+        z = dtrsv(L, r, lower=1)
+        W = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1).T
+        self._matrix.subtract_square(W)
+        Kr: FloatArray = z.dot(W)
         return Kr
 
     # Landmarks
@@ -174,12 +208,6 @@ class JointCovariance:
         P[: self._p, : self._p] = covariance
         self.set_of_positions(P, points)
 
-    def _output(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-        P = self.P
-        to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
-        PC = self.pose @ transpose(C) - transpose(to_pose)
-        return PC, C @ PC - to_pose @ transpose(C) + own
-
     def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
         # ξ_i = C_i ε + noise of these covariances
         k, columns, C = self._axes.point, self._columns(rows), C.reshape(-1, self._p)
@@ -211,6 +239,8 @@ class JointCovariance:
 
 class ExactMapCovariance(JointCovariance):
     """P of (ε, c̃) alone, in a map that is taken to be exact: ã_i = 0, and ξ_i = [ŷ_i]× ε_Ω."""
+
+    active = slice(0)
 
     def __init__(
         self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray

@@ -14,12 +14,18 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.observer.riccati.compressed_covariance import (
+    BlockSize,
+    CompressedCovariance,
+)
 from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
 from slam_observer_ros.observer.riccati.moving_landmarks import MovingLandmarksCovariance
 from slam_observer_ros.observer.robust import observation_weights
@@ -34,6 +40,7 @@ class RiccatiFilter(Filter):
     joint: JointCovariance
     has_joint_covariance: ClassVar[bool] = True
     ignores = OF_CONSTANT_GAINS
+    block = BlockSize()  # of large maps
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
@@ -47,20 +54,22 @@ class RiccatiFilter(Filter):
     def propagate(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to P."""
         super().propagate(motion)
-        self.joint.propagate(motion, self.observer.points, self.observer.u)
+        observer, active = self.observer, self.joint.active
+        points = observer.y_ref[active] + observer.a[active]
+        self.joint.propagate(motion, points, observer.u[active])
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
         r, R = residuals.on(self.axes)
         # A gate, then Huber's weights; errors that last make R larger, too.
         weights = observation_weights(r, self.predicted(residuals)[1], R, self._settings)
-        passed = weights > 0.0
-        used, r, R = residuals.select(passed), r[passed], R[passed]
+        passed, used = weights > 0.0, residuals
+        if np.count_nonzero(passed) < len(r):
+            used, r, R = residuals.select(passed), r[passed], R[passed]
         repeated = repetition_factors(used.dt_s, self._settings.observation_correlation_time)
-        R = R / (weights[passed] / repeated)[:, None, None]
+        R = R * (repeated / weights[passed])[:, None, None]
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
-        HP, HPH = self.joint.project(self.joint.output_matrix(used), used.rows)
-        self._move(-self.joint.update(HP, with_blocks(HPH, R), r.ravel()))
+        self._move(self.joint.correct(self.joint.output_matrix(used), used.rows, R, r))
         return weights
 
     def distances(self, residuals: Residuals) -> FloatArray:
@@ -81,16 +90,19 @@ class RiccatiFilter(Filter):
 
     def add(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
+        self._compress_if_large(len(points))
         super().add(points, covariances)
         self.joint.add_seen(self.observer.turned(covariances))
 
     def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks whose errors are independent of all else."""
+        self._compress_if_large(len(y_ref))
         super().add_known(y_ref, covariances)
         self.joint.add_known(y_ref, covariances)
 
     def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
+        self.joint.activate(rows)
         super().relocate(rows, points, covariances)
         self.joint.relocate(rows, self.observer.turned(covariances))
 
@@ -107,13 +119,14 @@ class RiccatiFilter(Filter):
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
         super().set_pose(pose, covariance)
-        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.observer.points)
+        self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.points)
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
         # A motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v (G), and the positions
         # of the known landmarks by J γ.
-        k, joint = self.axes.point, self.joint
+        self.joint = joint = self.joint.dense()
+        k = self.axes.point
         G = joint.gauge(len(self.observer.y_ref))
         J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
         # What P says of these positions, and the map's noise.
@@ -137,12 +150,40 @@ class RiccatiFilter(Filter):
 
     def landmark_covariances(self, duration_s: float = 0.0) -> FloatArray:
         """Return those (n, 3, 3) of ã_i, when landmarks have moved on for ``duration_s``."""
-        points = self.observer.points + duration_s * self.observer.u
+        points = self.points + duration_s * self.observer.u
         return self.joint.landmarks(points, duration_s)
 
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and ã_i; None in an exact map."""
-        return self.joint.with_pose(rows, self.observer.points[rows])
+        return self.joint.with_pose(rows, self.points[rows])
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 3) estimated landmarks, reference frame, metres."""
+        points = self.observer.points
+        if not self.joint.is_dense:
+            points += self.joint.postponed_shifts(np.arange(len(points)))
+        return points
+
+    def expected_points(self, rows: IntArray) -> FloatArray:
+        """Return where landmarks should be seen (m, 3), metres, body frame; −1 for a new one."""
+        if self.joint.is_dense:
+            return super().expected_points(rows)
+        observer = self.observer
+        points = observer.y_ref[rows] + self.translations(rows)
+        return observer.in_body_frame(points)
+
+    def translations(self, rows: IntArray) -> FloatArray:
+        """Return â_i (m, 3) of landmarks, metres."""
+        a = super().translations(rows)
+        return a if self.joint.is_dense else a + self.joint.postponed_shifts(rows)
+
+    def _compress_if_large(self, added: int) -> None:
+        """Go on with a covariance for many landmarks, unless they move or have orientations."""
+        is_large = len(self.observer.y_ref) + added > self.block.dense
+        may_move = self._settings.landmark_velocity_stddev > 0.0 or self.observer.have_moved
+        if self.joint.is_dense and is_large and not may_move and self.orientations is None:
+            self.joint = CompressedCovariance(self.joint, self.observer, self.block)
 
     def _move(self, x: FloatArray) -> None:
         """Move the state by exp(x): Â ← exp(ε) Â, ŷ_i ← exp(ε_Ω) ŷ_i + J(ε_Ω) ξ_i."""
@@ -150,7 +191,7 @@ class RiccatiFilter(Filter):
         self.calibration.shift(x[p:first])
         xi, u = self.joint.split(x)
         X = slam_group.exp(self.axes.full_pose(x[:p]), xi)
-        moved = slice(len(xi))  # none in an exact map
+        moved = self.joint.active  # none in an exact map
         turned = se3.rotate(X.A, observer.y_ref[moved]) - observer.y_ref[moved]
         observer.correct(X.A, moved, X.a + turned)
         if u is not None:

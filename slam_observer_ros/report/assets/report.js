@@ -11,6 +11,8 @@ const run = JSON.parse(/** @type {HTMLElement} */ (document.getElementById('numb
 /* Okabe and Ito: distinct for all kinds of colour vision. */
 const BLUE = '#0072b2', SKY = '#56b4e9', ORANGE = '#e69f00', RED = '#d55e00', GREEN = '#009e73', PINK = '#cc79a7';
 const HEIGHTS = { large: 200, small: 130 };
+/* What fits on a page of A4 or Letter; the browser says it is printing before it has the page's width. */
+const PAPER = { width: 680, map: 400, side: 330 };
 const dark = matchMedia('(prefers-color-scheme: dark)');
 let printing = false;
 
@@ -23,31 +25,59 @@ function ink() { return dark.matches && !printing ? '#e6e9ee' : '#1b1f24'; }
 function scale() { return dark.matches && !printing ? [[0, '#4a74b5'], [0.5, '#9c9a8e'], [1, '#ffe945']] : [[0, '#f0d84a'], [0.5, '#7c7b78'], [1, '#00204d']]; }
 function grid() { return dark.matches && !printing ? '#39404a' : '#d5d9de'; }
 
-/** Points of an ellipse, then a gap. @param {number} x @param {number} y @param {number[]} shape @param {Curve} xs @param {Curve} ys */
-function addEllipse(x, y, [a, b, angle], xs, ys) {
+/* Half-axis of the ellipse that holds 95 % in a plane, in standard deviations. */
+const SIGMAS = Math.sqrt(5.991464547);
+
+/** Two directions of the world, on which all is projected. @typedef {{across: number[], up: number[]}} View */
+/** @type {View} */
+const PLAN = { across: [1, 0, 0], up: [0, 1, 0] };
+
+/** Seen from the side, from a direction in the plane and from above it. @param {number} turn degrees @param {number} tilt degrees @returns {View} */
+function sideView(turn, tilt) {
+  const [a, e] = [turn * Math.PI / 180, tilt * Math.PI / 180];
+  return { across: [Math.cos(a), Math.sin(a), 0], up: [-Math.sin(a) * Math.sin(e), Math.cos(a) * Math.sin(e), Math.cos(e)] };
+}
+
+/** @param {number[]} one @param {number[]} other */
+const dot = (one, other) => one[0] * other[0] + one[1] * other[1] + one[2] * other[2];
+
+/** Projects many points. @param {Curve[]} xyz @param {number[]} direction @returns {Curve} */
+function along(xyz, direction) {
+  return xyz[0].map((x, n) => (x === null ? null : dot([x, /** @type {number} */ (xyz[1][n]), /** @type {number} */ (xyz[2][n])], direction)));
+}
+
+/** Points of the ellipse that a covariance has in a view, then a gap. @param {number} x @param {number} y @param {number[]} upper @param {View} view @param {Curve} xs @param {Curve} ys */
+function addEllipse(x, y, [xx, xy, xz, yy, yz, zz], view, xs, ys) {
+  /** @param {number[]} v */
+  const times = (v) => [dot([xx, xy, xz], v), dot([xy, yy, yz], v), dot([xz, yz, zz], v)];
+  const P = times(view.across), Q = times(view.up);
+  const a = dot(P, view.across), b = dot(P, view.up), c = dot(Q, view.up);
+  /* A root of the covariance in the plane takes a circle to its ellipse. */
+  const first = Math.sqrt(Math.max(a, 0)), skew = first > 0 ? b / first : 0, second = Math.sqrt(Math.max(c - skew * skew, 0));
   for (let i = 0; i <= 24; i += 1) {
-    const u = a * Math.cos(i * Math.PI / 12), v = b * Math.sin(i * Math.PI / 12);
-    xs.push(x + u * Math.cos(angle) - v * Math.sin(angle));
-    ys.push(y + u * Math.sin(angle) + v * Math.cos(angle));
+    const u = SIGMAS * Math.cos(i * Math.PI / 12), v = SIGMAS * Math.sin(i * Math.PI / 12);
+    xs.push(x + first * u);
+    ys.push(y + skew * u + second * v);
   }
   xs.push(null);
   ys.push(null);
 }
 
-/** What moves with the slider. @param {number} i instant @param {number} plane 0 plan, 1 side @param {number} second which axis is drawn upwards */
-function stateAt(i, plane, second) {
-  const { xyz, ahead, robot, points, ellipses } = run.instants;
-  const [x, y] = [xyz[i][0], xyz[i][second]];
+/** What moves with the slider. @param {number} i instant @param {View} view */
+function stateAt(i, view) {
+  const { xyz, ahead, robot, points, covariances } = run.instants;
+  const [x, y] = [dot(xyz[i], view.across), dot(xyz[i], view.up)];
+  const px = along(points[i], view.across), py = along(points[i], view.up);
   /** @type {Curve} */ const ex = [];
   /** @type {Curve} */ const ey = [];
-  (ellipses[i][plane] || []).forEach((/** @type {number[]} */ e, /** @type {number} */ n) => addEllipse(points[i][0][n], points[i][second][n], e, ex, ey));
+  (covariances[i] || []).forEach((/** @type {number[]} */ upper, /** @type {number} */ n) => addEllipse(/** @type {number} */ (px[n]), /** @type {number} */ (py[n]), upper, view, ex, ey));
   /** @type {Curve} */ const rx = [];
   /** @type {Curve} */ const ry = [];
-  if (robot[i][plane]) addEllipse(x, y, robot[i][plane][0], rx, ry);
+  if (robot[i]) addEllipse(x, y, robot[i][0], view, rx, ry);
   const length = 0.04 * extent;
   return {
-    x: [points[i][0], ex, rx, [x, x + length * ahead[i][0]], [x]],
-    y: [points[i][second], ey, ry, [y, y + length * ahead[i][second]], [y]],
+    x: [px, ex, rx, [x, x + length * dot(ahead[i], view.across)], [x]],
+    y: [py, ey, ry, [y, y + length * dot(ahead[i], view.up)], [y]],
     text: [run.instants.ids[i].map((/** @type {number} */ id) => String(id)), null, null, null, null],
   };
 }
@@ -57,23 +87,24 @@ const extent = (() => {
   return Math.max(...all.map((v) => (v.length ? v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.max(a, b)) - v.reduce((/** @type {number} */ a, /** @type {number} */ b) => Math.min(a, b)) : 1)), 0.1);
 })();
 
-/** @param {string} id @param {number} plane @param {number} second */
-function drawMap(id, plane, second) {
-  const path = run.path, first = stateAt(0, plane, second);
+/** @param {string} id @param {View} view */
+function drawMap(id, view) {
+  const isPlan = id === 'map';
+  const path = run.path, first = stateAt(Number(slider.value), view);
   const traces = [];
   if (path.true_xyz) {
-    traces.push({ x: path.true_xyz[0], y: path.true_xyz[second], mode: 'lines', name: 'truth, aligned', line: { color: ink(), width: 1, dash: 'dot' }, hoverinfo: 'skip' });
+    traces.push({ x: along(path.true_xyz, view.across), y: along(path.true_xyz, view.up), mode: 'lines', name: 'truth, aligned', line: { color: ink(), width: 1, dash: 'dot' }, hoverinfo: 'skip' });
   }
   const colours = path.error_m
     ? { color: path.error_m, colorscale: scale(), size: 4, colorbar: { title: { text: 'error [m]', side: 'right' }, thickness: 12, len: 0.8 } }
     : { color: path.t, colorscale: scale(), size: 4, colorbar: { title: { text: 'time [s]', side: 'right' }, thickness: 12, len: 0.8 } };
   traces.push({
-    x: path.xyz[0], y: path.xyz[second], mode: 'markers', name: 'estimate', marker: colours, customdata: path.t,
+    x: along(path.xyz, view.across), y: along(path.xyz, view.up), mode: 'markers', name: 'estimate', marker: colours, customdata: path.t,
     text: path.error_m ? path.error_m.map((/** @type {number|null} */ e) => (e === null ? 'no truth' : `${e.toFixed(2)} m off`)) : path.t,
     hovertemplate: '%{customdata:.1f} s, %{text}<extra></extra>',
   });
   if (run.true_landmarks) {
-    traces.push({ x: run.true_landmarks.xyz[0], y: run.true_landmarks.xyz[second], mode: 'markers', name: 'true landmarks', marker: { symbol: 'x-thin', size: 9, line: { color: ink(), width: 1.5 } }, text: run.true_landmarks.ids, hovertemplate: 'true landmark %{text}<extra></extra>' });
+    traces.push({ x: along(run.true_landmarks.xyz, view.across), y: along(run.true_landmarks.xyz, view.up), mode: 'markers', name: 'true landmarks', marker: { symbol: 'x-thin', size: 9, line: { color: ink(), width: 1.5 } }, text: run.true_landmarks.ids, hovertemplate: 'true landmark %{text}<extra></extra>' });
   }
   const still = traces.length;
   traces.push(
@@ -87,15 +118,27 @@ function drawMap(id, plane, second) {
   Plotly.newPlot(id, traces, {
     paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink() },
     margin: { l: 50, r: 10, t: 10, b: 40 }, legend: { orientation: 'h', y: 1.02, yanchor: 'bottom', x: 0.5, xanchor: 'center' },
-    xaxis: { ...axis, title: { text: 'x [m]' }, constrain: 'domain' },
-    yaxis: { ...axis, title: { text: second === 1 ? 'y [m]' : 'z [m]' }, scaleanchor: 'x', constrain: 'domain' },
-    hovermode: 'closest', uirevision: 'kept', showlegend: plane === 0,
-  }, { responsive: true, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches ? undefined : false });
+    xaxis: { ...axis, title: { text: axisName(view.across, 'across') }, constrain: 'domain' },
+    yaxis: { ...axis, title: { text: axisName(view.up, 'up') }, scaleanchor: 'x', constrain: 'domain' },
+    hovermode: 'closest', uirevision: 'kept', showlegend: isPlan,
+    ...(printing ? { width: PAPER.width, height: isPlan ? PAPER.map : PAPER.side } : {}),
+  }, { responsive: !printing, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches ? undefined : false });
   element(id).dataset.still = String(still);
   /** @type {any} */ (element(id)).on('plotly_click', (/** @type {any} */ event) => {
     const t = event.points[0].customdata;
     if (typeof t === 'number') goTo(t);
   });
+}
+
+/** @param {number[]} direction @param {string} otherwise */
+function axisName(direction, otherwise) {
+  const n = direction.findIndex((share) => share > 0.9999);
+  return `${n < 0 ? otherwise : 'xyz'[n]} [m]`;
+}
+
+/** The view that the two sliders below the side view give. */
+function chosenView() {
+  return sideView(Number(/** @type {HTMLInputElement} */ (element('turn')).value), Number(/** @type {HTMLInputElement} */ (element('tilt')).value));
 }
 
 /** @typedef {{title: string, traces: any[], axis?: any, small?: boolean}} Row */
@@ -114,18 +157,20 @@ function rows() {
   position.push(curve(errors.t, errors.bound_m, 'stated 95 %, from the first pose on', { color: ink(), dash: 'dash' }));
   all.push({ title: 'position [m]', traces: position, axis: { rangemode: 'tozero' } });
   const ids = residuals.id;
-  /** @param {(w: number) => boolean} test @param {any} y @param {string} name @param {any} marker */
+  const moved = new Set(residuals.moved);
+  /** @param {(w: number, i: number) => boolean} test @param {any} y @param {string} name @param {any} marker */
   const some = (test, y, name, marker) => {
-    const rows = residuals.weight.map((/** @type {number} */ w, /** @type {number} */ i) => i).filter((/** @type {number} */ i) => test(residuals.weight[i]));
+    const rows = residuals.weight.map((/** @type {number} */ w, /** @type {number} */ i) => i).filter((/** @type {number} */ i) => test(residuals.weight[i], i));
     return { x: rows.map((/** @type {number} */ i) => residuals.t[i]), y: rows.map((/** @type {number} */ i) => y(i)), text: rows.map((/** @type {number} */ i) => `landmark ${ids[i]}: ${residuals.sigma[i]} σ`), name, mode: 'markers', marker, hovertemplate: '%{text}<extra></extra>' };
   };
   const known = residuals.sigma.some((/** @type {number} */ s) => s > 0);
   /** @param {any} y @param {boolean} legend */
   const kinds = (y, legend) => [
-    some((w) => w === 1, y, 'used', { color: SKY, size: 4 }),
-    some((w) => w > 0 && w < 1, y, 'down-weighted', { color: ORANGE, size: 6, symbol: 'triangle-up' }),
-    some((w) => w === 0, y, 'rejected', { color: RED, size: 8, symbol: 'x' }),
-  ].map((trace, n) => ({ ...trace, showlegend: legend, legendgroup: `kind${n}` }));
+    some((w, i) => w === 1 && !moved.has(i), y, 'used', { color: SKY, size: 4 }),
+    some((w, i) => w > 0 && w < 1 && !moved.has(i), y, 'down-weighted', { color: ORANGE, size: 6, symbol: 'triangle-up' }),
+    some((w, i) => w === 0 && !moved.has(i), y, 'rejected', { color: RED, size: 8, symbol: 'x' }),
+    some((_, i) => moved.has(i), y, 'believed moved', { color: PINK, size: 11, symbol: 'star' }),
+  ].filter((trace) => trace.x.length).map((trace, n) => ({ ...trace, showlegend: legend, legendgroup: `kind${n}` }));
   if (known) {
     all.push({ title: 'residual [σ]', traces: kinds((/** @type {number} */ i) => Math.max(residuals.sigma[i], 0.1), true), axis: { type: 'log', range: [-1, Math.max(1, Math.log10(1.2 * Math.max(...residuals.sigma, 1)))], dtick: 1 } });
   }
@@ -168,19 +213,34 @@ function rows() {
   return all;
 }
 
+/** One figure of all rows on the screen, where they are zoomed together; on paper one each, as pages end between figures. */
 function drawCurves() {
-  const all = rows(), narrow = element('curves').clientWidth < 700;
+  const all = rows(), place = element('curves');
+  Plotly.purge(place);
+  place.replaceChildren();
+  if (printing) {
+    all.forEach((row) => drawRows(place.appendChild(document.createElement('div')), [row]));
+    return;
+  }
+  drawRows(place, all);
+  /** @type {any} */ (place).on('plotly_click', (/** @type {any} */ event) => goTo(event.points[0].x));
+}
+
+/** @param {HTMLElement} place @param {Row[]} all */
+function drawRows(place, all) {
+  const narrow = place.clientWidth < 700;
   /* Above each row there is room for its legend, a line for each name where they don't fit into one. */
   const spaces = all.map((row) => 28 + 18 * (narrow ? row.traces.filter((trace) => trace.showlegend !== false).length : 1));
   const heights = all.map((row) => (row.small ? HEIGHTS.small : HEIGHTS.large));
   const total = heights.reduce((a, b, n) => a + b + spaces[n], 0);
   const end = run.errors.t[run.errors.t.length - 1] || 1;
+  const now = run.instants.t[Number(slider.value)] || 0;
   /** @type {any} */
   const layout = {
-    height: total + 44, paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink(), size: 12 },
+    height: total + 44, ...(printing ? { width: PAPER.width } : {}), paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: { color: ink(), size: 12 },
     margin: { l: 62, r: 12, t: 4, b: 40 }, hovermode: 'closest', uirevision: 'kept',
-    xaxis: { gridcolor: grid(), zeroline: false, title: { text: 'time [s]' }, anchor: `y${all.length}`, range: [0, end] },
-    shapes: [{ type: 'line', xref: 'x', yref: 'paper', x0: 0, x1: 0, y0: 0, y1: 1, line: { color: RED, width: 1.5 } }].concat(run.gaps.map((/** @type {number[]} */ gap) => ({ type: 'rect', xref: 'x', yref: 'paper', x0: gap[0], x1: gap[1], y0: 0, y1: 1, line: { width: 0 }, fillcolor: 'rgba(128,128,128,0.18)', layer: 'below' }))),
+    xaxis: { gridcolor: grid(), zeroline: false, title: { text: 'time [s]' }, anchor: `y${all.length > 1 ? all.length : ''}`, range: [0, end] },
+    shapes: [{ type: 'line', xref: 'x', yref: 'paper', x0: now, x1: now, y0: 0, y1: 1, line: { color: RED, width: 1.5 } }].concat(run.gaps.map((/** @type {number[]} */ gap) => ({ type: 'rect', xref: 'x', yref: 'paper', x0: gap[0], x1: gap[1], y0: 0, y1: 1, line: { width: 0 }, fillcolor: 'rgba(128,128,128,0.18)', layer: 'below' }))),
   };
   /** @type {any[]} */
   const traces = [];
@@ -194,8 +254,7 @@ function drawCurves() {
     row.traces.forEach((trace) => traces.push({ ...trace, xaxis: 'x', yaxis: `y${name}`, legend: `legend${name}` }));
     top += heights[n];
   });
-  Plotly.newPlot('curves', traces, layout, { responsive: true, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches ? undefined : false });
-  /** @type {any} */ (element('curves')).on('plotly_click', (/** @type {any} */ event) => goTo(event.points[0].x));
+  Plotly.newPlot(place, traces, layout, { responsive: !printing, displaylogo: false, displayModeBar: matchMedia('(hover: hover)').matches && !printing ? undefined : false });
 }
 
 /** @param {number} t seconds */
@@ -217,12 +276,13 @@ function show() {
 function update() {
   const i = Number(slider.value), t = run.instants.t[i];
   if (t === undefined) return;
-  [['map', 0, 1], ['side', 1, 2]].forEach(([id, plane, second]) => {
-    const still = Number(element(String(id)).dataset.still);
-    if (!element(String(id)).dataset.still) return;
-    const state = stateAt(i, Number(plane), Number(second));
-    Plotly.restyle(id, { x: state.x, y: state.y, text: state.text.map((text) => text || '') }, [0, 1, 2, 3, 4].map((n) => still + n));
+  [['map', PLAN], ['side', chosenView()]].forEach(([id, view]) => {
+    const place = element(String(id));
+    if (!place.dataset.still) return;
+    const still = Number(place.dataset.still), state = stateAt(i, /** @type {View} */ (view));
+    Plotly.restyle(place, { x: state.x, y: state.y, text: state.text.map((text) => text || '') }, [0, 1, 2, 3, 4].map((n) => still + n));
   });
+  if (printing) return;
   Plotly.relayout('curves', { 'shapes[0].x0': t, 'shapes[0].x1': t });
   const near = run.path.t.reduce((/** @type {number} */ a, /** @type {number} */ time, /** @type {number} */ k) => (Math.abs(time - t) < Math.abs(run.path.t[a] - t) ? k : a), 0);
   const error = run.path.error_m ? run.path.error_m[near] : null;
@@ -268,7 +328,7 @@ function write() {
   if (!run.findings.length) element('findings').hidden = true;
   element('map-note').textContent = run.path.true_xyz ? 'The estimate as it was at each moment; its colour is the distance from the truth, aligned with the whole run.' : 'The estimate as it was at each moment. The recording holds no truth to compare it with.';
   if (run.errors.bound_m.some((/** @type {number|null} */ b) => b !== null)) element('map-note').textContent += ' Ellipses hold 95 %; they count from the first pose, from where everything is mapped.';
-  fillTable('landmarks', ['id', 'observed', 'rejected', 'down-weighted', 'residual RMS [m]', 'residual RMS [σ]', 'stated σ [m]', 'error [m]'], run.landmarks);
+  fillTable('landmarks', ['id', 'observed', 'rejected', 'down-weighted', 'believed moved', 'residual RMS [m]', 'residual RMS [σ]', 'stated σ [m]', 'error [m]'], run.landmarks);
   fillTable('figures', [], run.figures);
   fillTable('settings', ['name', 'value', 'default'], run.settings);
   fillTable('versions', [], run.versions);
@@ -278,8 +338,9 @@ function write() {
 
 function draw() {
   if (!run.instants.t.length) { element('time-bar').hidden = true; return; }
-  drawMap('map', 0, 1);
-  if (!run.is_flat) drawMap('side', 1, 2);
+  drawMap('map', PLAN);
+  element('views').hidden = run.is_flat;
+  if (!run.is_flat) drawMap('side', chosenView());
   drawCurves();
   update();
 }
@@ -291,6 +352,7 @@ draw();
 const wanted = /^#t=([0-9.]+)$/.exec(location.hash);
 if (wanted) goTo(Number(wanted[1]));
 slider.addEventListener('input', show);
+['turn', 'tilt'].forEach((id) => element(id).addEventListener('input', () => drawMap('side', chosenView())));
 dark.addEventListener('change', draw);
 addEventListener('beforeprint', () => { printing = true; draw(); });
 addEventListener('afterprint', () => { printing = false; draw(); });

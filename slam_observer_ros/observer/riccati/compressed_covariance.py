@@ -1,0 +1,372 @@
+"""The joint covariance of large maps: a dense one of few landmarks, others follow when needed.
+
+P is that of pose, calibration and the landmarks that are *active*: near, or seen of late. Motions
+and observations change P alone, and what they yet have to do to all others is postponed
+(:mod:`.postponed_correction`) until other landmarks become active. It is exact but for one thing:
+what the noise of a motion does to the error ξ_i of a landmark out of view is judged by a reference
+position, which is set again when the estimate is ``REFERENCE_SHIFT_M`` off (J. Guivant and
+E. Nebot, *Optimization of the SLAM algorithm for real-time implementation*, 2001). As long as
+there are few landmarks all are active.
+"""
+
+from __future__ import annotations
+
+from copy import copy, deepcopy
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry.matrices import symmetric, transpose, with_blocks
+from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance, sheared
+from slam_observer_ros.observer.riccati.outside_landmarks import OutsideLandmarks
+from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
+from slam_observer_ros.sensor_models.motion import Motion
+
+REFERENCE_SHIFT_M = 0.1
+"""How far estimates of landmarks out of view may be from their references."""
+
+CHECK_INTERVAL = 10
+"""Corrections after which that is looked at."""
+
+FOLDING = 3e7
+"""Multiplications by which postponed corrections are worked off at each correction, at least."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlockSize:
+    """How many landmarks are active."""
+
+    dense: int = 200  # as long as there are no more, all are
+    most: int = 48  # then at most so many, or twice as many as are kept
+    kept: int = 12  # when others become active, at least so many nearest to the robot are kept
+    kept_per_seen: int = 3  # or so many times as many as are seen
+
+
+class CompressedCovariance(JointCovariance):
+    """P of pose, calibration and active landmarks, and what all others need to follow."""
+
+    active: IntArray
+    is_dense = False
+
+    def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
+        vars(self).update(vars(dense))
+        self._form, self._observer, self._size = copy(dense), observer, size
+        self._form.P = self.P[: self.first, : self.first]
+        n = len(observer.y_ref)
+        self._places: IntArray = np.empty(0, dtype=np.int64)  # (n,) place in P, −1 for outside
+        self._set_active(np.arange(n), n)
+        self._slots = np.full(n, -1)  # (n,) where each landmark is outside, −1 for nowhere
+        self._outside = OutsideLandmarks(self._axes.point, len(self.P))
+        self._postponed = PostponedCorrection(self.P, self._axes.point)
+        self._unchecked, self._most = 0, size.most
+
+    def __deepcopy__(self, memo: dict[int, object]) -> CompressedCovariance:
+        """Return an independent copy, which shares what takes much memory until it changes."""
+        other = copy(self)
+        other.P, other._observer = self.P, deepcopy(self._observer, memo)
+        other._outside, other._postponed = self._outside.copy(), deepcopy(self._postponed, memo)
+        return other
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory that all of it takes."""
+        outside = self._outside
+        return self.P.nbytes + outside.matrix.nbytes + outside.X.nbytes + outside.own.nbytes
+
+    @property
+    def references(self) -> FloatArray:
+        """(n, 3) from where errors are judged: estimates of active landmarks, else y_i°."""
+        points = self._observer.points
+        others = self._others
+        points[others] = self._outside.references[self._slots[others]]
+        return points
+
+    # The step
+
+    def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
+        """Update P and return the error x of pose, calibration and active landmarks."""
+        HP, HPH = self.project(C, rows)
+        postponed, p = self._postponed, self._p
+        H_Phi = C.reshape(-1, p) @ postponed.Phi[:p] - postponed.Phi[self._columns(rows)]
+        # L⁻¹ of all that is multiplied by S⁻¹ = L⁻ᵀ L⁻¹.
+        whitened = _whitened(with_blocks(HPH, R), np.column_stack([HP, H_Phi, r.ravel()]))
+        W, W_Phi, z = np.split(whitened, [len(self.P), whitened.shape[1] - 1], axis=1)
+        self._matrix.subtract_square(W)
+        x: FloatArray = -W.T @ z[:, 0]
+        postponed.correct(W, W_Phi, z[:, 0], self._axes.full_pose(x[:p])[:3])
+        self._outside.matrix.fold(FOLDING)
+        return x
+
+    def activate(self, rows: IntArray) -> None:
+        """See to it that landmarks ``rows`` (m,), of an observation, are active."""
+        missing = rows[self._places[rows] < 0]
+        if len(missing) or len(self.active) > self._most:
+            self._switch(self._chosen(rows))
+            return
+        self._unchecked += 1
+        if self._unchecked >= CHECK_INTERVAL:
+            self._unchecked = 0
+            others = self._others
+            off = self._off(others) + self.postponed_shifts(others)
+            if np.linalg.norm(off, axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
+                self._apply()
+
+    def postponed_shifts(self, rows: IntArray) -> FloatArray:
+        """Return how far the observer has yet to move landmarks (m, 3), metres."""
+        # Not done here: those who look at the map must not change the bits of the estimate.
+        shifts, k = np.zeros((len(rows), 3)), self._axes.point
+        at = np.flatnonzero(self._places[rows] < 0)
+        if len(at) and self._postponed.has_moved:
+            others = rows[at]
+            a = self._off(others)[:, :k]
+            X = self._outside.blocks(self._slots[others])
+            shifts[at, :k] = self._postponed.shifted(a, X) - a
+        return shifts
+
+    def _propagate(self, motion: Motion, J_landmarks: FloatArray) -> None:
+        super()._propagate(motion, J_landmarks)
+        if self._p < self.first:
+            Phi = self._postponed.Phi
+            growth = motion.sensitivity @ Phi[self._p : self.first]
+            Phi[: self._p] += growth
+            Phi[self.first :] += J_landmarks @ growth
+
+    # Landmarks
+
+    def add_seen(self, covariances: FloatArray) -> None:
+        """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3)."""
+        for start in range(0, len(covariances), self._size.most):
+            if len(self.active) > self._most:
+                self._switch(self._chosen(self.active[:0]))
+            super().add_seen(covariances[start : start + self._size.most])
+
+    def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
+        is_active = self._places[rows] >= 0
+        if is_active.all():
+            return super().output(C, rows)
+        m, k, p = len(rows), self._axes.point, self._p
+        with_pose, own = np.empty((m, p, k)), np.empty((m, k, k))
+        with_pose[is_active], own[is_active] = super().output(C[is_active], rows[is_active])
+        to_pose, their_own = self._of_others(rows[~is_active])
+        C = C[~is_active]
+        PC = self.pose @ transpose(C) - transpose(to_pose)
+        with_pose[~is_active] = PC
+        own[~is_active] = C @ PC - to_pose @ transpose(C) + their_own
+        return with_pose, own
+
+    def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same of all together, (p, m k) and (m k, m k)."""
+        if (self._places[rows] >= 0).all():
+            return super().outputs(C, rows)
+        unique, at = np.unique(rows, return_inverse=True)
+        return self.marginal(unique).outputs(C, at)
+
+    def with_pose(self, rows: IntArray, points: FloatArray) -> FloatArray | None:
+        """Return the covariance (p + m k, p + m k) of ε and ã_i, for estimates (m, 3)."""
+        if (self._places[rows] >= 0).all():
+            return super().with_pose(rows, points)
+        return self.marginal(rows).with_pose(np.arange(len(rows)), points)
+
+    def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
+        """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
+        m, k = len(points), self._axes.point
+        slots = self._outside.add_independent(points, covariances[:, :k, :k])
+        self._slots = np.concatenate([self._slots, slots])
+        self._places = np.concatenate([self._places, np.full(m, -1)])
+
+    def remove(self, rows: IntArray) -> None:
+        """Delete the rows and columns of landmarks."""
+        places, slots = self._places[rows], self._slots[rows]
+        columns = JointCovariance._columns(self, places[places >= 0])
+        self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
+        self._postponed.remove(columns)
+        self._outside.remove(slots[slots >= 0])
+        kept = np.ones(len(self._places), dtype=np.bool_)
+        kept[rows] = False
+        number = np.cumsum(kept) - 1
+        self._set_active(number[self.active[kept[self.active]]], int(kept.sum()))
+        self._slots = self._slots[kept]
+
+    # All of it
+
+    def dense(self) -> JointCovariance:
+        """Return the same with all landmarks in P, which the observer has moved."""
+        self._apply()
+        return self.marginal(np.arange(len(self._places)))
+
+    def set_pose(self, covariance: FloatArray, points: FloatArray) -> None:
+        """Take ``covariance`` (p, p) for that of ε, independent of c̃ and of all ã_i."""
+        self._apply(0.0)
+        P = super().of_positions(points[self.active])
+        # Errors of all others are those of their positions now, too.
+        outside, p = self._outside, self._p
+        T = self._all_turning(points[self.active])
+        X = outside.X.copy()
+        X[:, self.first :] -= X[:, :p] @ T.T
+        X[:, :p] = 0.0
+        P[:p] = P[:, :p] = 0.0
+        P[:p, :p] = covariance
+        self.P = sheared(P, self.first, T)
+        outside.X = X
+        self._postponed = PostponedCorrection(self.P, self._axes.point)
+
+    def marginal(self, rows: IntArray) -> JointCovariance:
+        """Return the covariance of pose, calibration and different landmarks (m,) alone."""
+        is_active = self._places[rows] >= 0
+        others = np.flatnonzero(~is_active)
+        others = others[np.argsort(self._slots[rows[others]])]
+        local = np.append(np.arange(self.first), self._columns(rows[is_active]))
+        slots = self._slots[rows[others]]
+        at, postponed = self._outside.rows(slots), self._postponed
+        X, Psi, Phi = self._outside.X[at], postponed.Psi, postponed.Phi[local]
+        own = self._outside.matrix.columns(at)[at] - X @ Psi @ X.T
+        to_local = X @ Phi.T
+        P = np.block([[self.P[np.ix_(local, local)], to_local.T], [to_local, own]])
+        # From η to ξ, and in the order of the rows.
+        P = sheared(P, len(local), self._all_turning(self._outside.references[slots]))
+        order = np.argsort(np.append(np.flatnonzero(is_active), others))
+        joint = copy(self._form)
+        columns = np.append(np.arange(self.first), joint._columns(order))
+        joint.P = P[np.ix_(columns, columns)]
+        return joint
+
+    # Which landmarks are active
+
+    @property
+    def _others(self) -> IntArray:
+        return np.flatnonzero(self._places < 0)
+
+    def _chosen(self, rows: IntArray) -> IntArray:
+        """Return the landmarks to be active when ``rows`` (m,) are seen."""
+        kept = max(self._size.kept, self._size.kept_per_seen * len(rows))
+        everything = np.arange(len(self._places))  # but those that are just being added
+        points = self._observer.points[everything] + self.postponed_shifts(everything)
+        arms = points - self._observer.A[:3, 3]
+        distances = np.einsum('ij,ij->i', arms, arms)
+        near = np.argpartition(distances, min(kept, len(arms)) - 1)[:kept]
+        wanted = np.union1d(rows, near)
+        self._most = max(self._size.most, 2 * len(wanted))
+        with_active = np.union1d(wanted, self.active)
+        return with_active if len(with_active) <= self._most else wanted
+
+    def _switch(self, rows: IntArray) -> None:
+        """Make landmarks active, and no others."""
+        self._release(self.active[~np.isin(self.active, rows)], self._subtract())
+        self._take_in(rows[self._places[rows] < 0])
+        self._postponed = PostponedCorrection(self.P, self._axes.point)
+
+    def _apply(self, tolerance_m: float = 0.5 * REFERENCE_SHIFT_M) -> None:
+        """Do what is postponed; refer to present estimates if references are further off."""
+        Phi = self._subtract(tolerance_m)
+        self._outside.X = self._outside.X @ Phi.T
+        self._postponed = PostponedCorrection(self.P, self._axes.point)
+
+    def _subtract(self, tolerance_m: float = 0.5 * REFERENCE_SHIFT_M) -> FloatArray:
+        """Do the same, but X has yet to become X Φᵀ with the Φ (q, q₀) that is returned."""
+        others, outside, k = self._others, self._outside, self._axes.point
+        slots, Phi = self._slots[others], self._postponed.Phi
+        self._observer.a[others] += self.postponed_shifts(others)
+        outside.subtract(self._postponed.root())
+        self._unchecked = 0
+        off = self._off(others)
+        if np.linalg.norm(off, axis=1).max(initial=0.0) > tolerance_m:
+            angles = self._p - k
+            turns = self._axes.turn_matrix(off)[:, :, :angles].reshape(-1, angles)
+            outside.X, Phi = outside.X @ Phi.T, np.eye(len(Phi))
+            outside.set_references(slots, self._observer.points[others], turns, self.P)
+        return Phi
+
+    def _off(self, others: IntArray) -> FloatArray:
+        """Return how far the observer has landmarks (m,) from their references (m, 3), metres."""
+        off: FloatArray = self._observer.points[others]
+        off -= self._outside.references[self._slots[others]]
+        return off
+
+    def _release(self, rows: IntArray, Phi: FloatArray) -> None:
+        """Let landmarks (m,) not be active any more, and X become X Φᵀ, Φ (q, q₀)."""
+        outside, P, p = self._outside, self.P, self._p
+        new = rows[self._slots[rows] < 0]
+        self._slots = self._slots.copy()
+        self._slots[new] = outside.new_slots(len(new))
+        rows = rows[np.argsort(self._slots[rows])]
+        slots, columns, points = (
+            self._slots[rows],
+            self._columns(rows),
+            self._observer.points[rows],
+        )
+        # η = ξ − T ε with x, with each other and with those that are outside.
+        T = self._all_turning(points)
+        to_x = P[columns] - T @ P[:p]
+        own = to_x[:, columns] - to_x[:, :p] @ T.T
+        to_others = outside.X @ (Phi[columns] - T @ Phi[:p]).T
+        kept = np.delete(np.arange(len(P)), columns)
+        outside.X = outside.X @ Phi[kept].T
+        outside.put(slots, points, to_x[:, kept], symmetric(own), to_others)
+        self.P = P[np.ix_(kept, kept)]
+        self._set_active(self.active[~np.isin(self.active, rows)], len(self._places))
+
+    def _take_in(self, rows: IntArray) -> None:
+        """Make landmarks (m,) active, too."""
+        if not len(rows):
+            return
+        outside, P, p = self._outside, self.P, self._p
+        rows = rows[np.argsort(self._slots[rows])]
+        slots = self._slots[rows]
+        at = outside.rows(slots)
+        # ξ = η + T ε with those that are outside, with x and with each other.
+        T = self._all_turning(outside.references[slots])
+        to_others = outside.matrix.columns(at)
+        to_x = outside.X[at] + T @ P[:p]
+        own = to_others[at] + outside.X[at, :p] @ T.T + T @ to_x[:, :p].T
+        outside.X = np.hstack([outside.X, to_others + outside.X[:, :p] @ T.T])
+        self.P = np.block([[P, to_x.T], [to_x, symmetric(own)]])
+        self._set_active(np.append(self.active, rows), len(self._places))
+        inside = self._slots[self.active]
+        outside.X[outside.rows(inside[inside >= 0])] = 0.0
+
+    def _set_active(self, rows: IntArray, n: int) -> None:
+        self.active, self._places = rows, np.full(n, -1)
+        self._places[rows] = np.arange(len(rows))
+
+    def _of_others(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances with ε (m, k, p) and own (m, k, k) of ξ_i outside."""
+        slots, postponed = self._slots[rows], self._postponed
+        X, T = self._outside.blocks(slots), self._turning(self._outside.references[slots])
+        to_pose = X @ postponed.Phi[: self._p].T
+        turned = T @ transpose(to_pose)
+        own = self._outside.own[slots] - (X @ postponed.Psi) @ transpose(X)
+        own = own + turned + transpose(turned) + T @ self.pose @ transpose(T)
+        return to_pose + T @ self.pose, own
+
+    def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
+        super()._insert(rows, C, covariances)
+        Phi = self._postponed.Phi
+        Phi[self._columns(rows)] = C.reshape(-1, self._p) @ Phi[: self._p]
+
+    def _make_room(self, m: int) -> IntArray:
+        """Append rows and columns for m landmarks; return which landmarks they are."""
+        super()._make_room(m)
+        new = len(self._places) + np.arange(m)
+        self._set_active(np.append(self.active, new), len(self._places) + m)
+        self._slots = np.append(self._slots, np.full(m, -1))
+        self._postponed.extend(self._stride * m)
+        return new
+
+    def _columns(self, rows: IntArray) -> IntArray:
+        return super()._columns(self._places[rows])
+
+
+def _whitened(S: FloatArray, right: FloatArray) -> FloatArray:
+    """Return L⁻¹ b for b (m, …) and S = L Lᵀ (m, m); without the null space of a singular S."""
+    L, is_indefinite = dpotrf(S, lower=1)
+    if is_indefinite:  # by rounding, where all but nothing was known
+        variances, V = np.linalg.eigh(S)
+        known = variances > np.finfo(np.float64).eps * variances[-1]
+        whitened: FloatArray = (V[:, known] / np.sqrt(variances[known])).T @ right
+        return whitened
+    return np.asarray(dtrsm(1.0, L, right, lower=1))

@@ -1,0 +1,74 @@
+"""What corrections of a local state have yet to do to errors that depend on it.
+
+Errors η of landmarks out of view do not move, and are observed only through those of the local
+state x. With X = cov(η, x) at the instant from which on corrections are postponed, a correction
+of x, H x being observed with the covariance S and the residual r, leaves
+
+    cov(η, x) = X Φᵀ,    Φ ← Φ − K H Φ
+    cov(η)    = B − X Ψ Xᵀ,    Ψ ← Ψ + (H Φ)ᵀ S⁻¹ H Φ
+    η̂         moved by  −X g,    g = (H Φ)ᵀ S⁻¹ r,
+
+whatever η is and however many of them there are. On the group, X̂ ← exp(−K r) · X̂, a landmark's
+shift a since its reference becomes D a − J X_i g, with D = exp(ε_Ω) and its left Jacobian J; over
+many corrections D₁ a + T X_i, with a tensor T. See docs/theory.md, Large maps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dpstrf
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry import so3
+
+
+class PostponedCorrection:
+    """Φ (q, q₀), Ψ (q₀, q₀), D (k, k) and T (k, k, q₀) since x had q₀ entries, of covariance P."""
+
+    def __init__(self, P: FloatArray, point: int) -> None:
+        size = len(P)
+        self.Phi: FloatArray = np.eye(size)
+        self.Psi: FloatArray = np.zeros((size, size))
+        self.turn: FloatArray = np.eye(point)
+        self.shift: FloatArray = np.zeros((point, point, size))
+        self.has_moved = False
+        self._deviations = np.sqrt(np.maximum(np.diagonal(P), 0.0))
+
+    def correct(self, W: FloatArray, W_Phi: FloatArray, z: FloatArray, turn: FloatArray) -> None:
+        """Take in a correction which turned the state by ``turn`` (3,), rad.
+
+        With S = L Lᵀ it is given by L⁻¹ H P (m, q), L⁻¹ H Φ (m, q₀) and L⁻¹ r (m,).
+        """
+        self.Phi -= W.T @ W_Phi
+        self.Psi += W_Phi.T @ W_Phi
+        k, g = len(self.turn), W_Phi.T @ z
+        D, J = so3.exp(turn)[:k, :k], so3.left_jacobian(turn)[:k, :k]
+        self.turn = D @ self.turn
+        self.shift = (D @ self.shift.reshape(k, -1)).reshape(self.shift.shape)
+        self.shift -= J[:, :, None] * g
+        self.has_moved = True
+
+    def shifted(self, a: FloatArray, X: FloatArray) -> FloatArray:
+        """Return what shifts a (n, k) have become, of landmarks with X (n, k, q₀)."""
+        T = self.shift.reshape(len(self.turn), -1)
+        moved: FloatArray = a @ self.turn.T + X.reshape(-1, T.shape[1]) @ T.T
+        return moved
+
+    def extend(self, count: int) -> None:
+        """Append entries to x, which do not depend on η so far."""
+        self.Phi = np.concatenate([self.Phi, np.zeros((count, self.Phi.shape[1]))])
+
+    def remove(self, entries: IntArray) -> None:
+        """Remove entries of x."""
+        self.Phi = np.delete(self.Phi, entries, axis=0)
+
+    def root(self) -> FloatArray:
+        """Return F (q₀, r) with F Fᵀ = Ψ up to rounding, r being the rank of Ψ."""
+        # In units of standard deviations, as those of angles and positions differ by far.
+        scaled = self._deviations[:, None] * self.Psi * self._deviations
+        L, order, rank, _ = dpstrf(scaled, lower=1)
+        F = np.zeros((len(scaled), rank))
+        F[order - 1] = np.tril(L)[:, :rank]
+        used = self._deviations > 0.0
+        F[used] /= self._deviations[used, None]
+        return F

@@ -1,0 +1,62 @@
+"""Maps are saved and loaded under a name that the caller gives, where Nav2's types are there."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+from slam_observer_ros import Estimator, LandmarkMap, Settings
+from slam_observer_ros.known_map.map_file import read_map, write_map
+from slam_observer_ros.nodes.services.map_services import MapServices
+from slam_observer_ros.nodes.services.named_map_services import NamedMapServices, path_of
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
+
+HALL = LandmarkMap(np.array([3, 4]), np.array([[1.0, 2, 0], [4, 0, 0]]), None, np.ones(2, int))
+LOADED = SimpleNamespace(RESULT_SUCCESS=0, RESULT_INVALID_MAP_DATA=2, result=None)
+
+
+@pytest.fixture(name='services')
+def fixture_services(monkeypatch):
+    """The callbacks of both services, by name, and the estimator."""
+    monkeypatch.setitem(sys.modules, 'nav2_msgs', Mock())
+    monkeypatch.setitem(sys.modules, 'nav2_msgs.srv', Mock())
+    node, estimator = Mock(), Estimator(Settings())
+    NamedMapServices(node, MapServices(node, ObserverNodeSettings(), estimator, Mock()))
+    calls = {call.args[1]: call.args[2] for call in node.create_service.call_args_list}
+    return SimpleNamespace(
+        save=calls['~/save_map_to'], load=calls['~/load_map_from'], estimator=estimator
+    )
+
+
+def test_a_map_is_loaded_from_and_saved_to_the_file_that_is_named(services, tmp_path):
+    write_map(tmp_path / 'hall.yaml', HALL, None)
+    request = SimpleNamespace(map_url=f'file://{tmp_path}/hall.yaml')
+    assert services.load(request, LOADED).result == LOADED.RESULT_SUCCESS
+    services.estimator.set_pose(np.eye(4))
+    request = SimpleNamespace(map_url=str(tmp_path / 'other.yaml'))
+    assert services.save(request, SimpleNamespace(result=None)).result
+    assert read_map(tmp_path / 'other.yaml').ids.tolist() == [3, 4]
+
+
+def test_what_fails_is_answered(services, tmp_path):
+    request = SimpleNamespace(map_url=str(tmp_path / 'none.yaml'))
+    assert services.load(request, LOADED).result == LOADED.RESULT_INVALID_MAP_DATA
+    assert services.save(request, SimpleNamespace(result=None)).result is False
+    assert not (tmp_path / 'none.yaml').exists()
+
+
+def test_without_nav2_there_are_the_plain_services_alone(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'nav2_msgs', None)
+    monkeypatch.setitem(sys.modules, 'nav2_msgs.srv', None)
+    node = Mock()
+    NamedMapServices(node, Mock())
+    node.create_service.assert_not_called()
+
+
+def test_urls_and_paths():
+    assert path_of('file:///data/my%20hall.yaml') == '/data/my hall.yaml'
+    assert path_of('~/hall.yaml') == '~/hall.yaml'
