@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 import json
 import logging
@@ -155,3 +155,13 @@ def print_table(title: str, rows: Mapping[str, str]) -> None:
         from slam_observer_ros.common.tables import table_of
 
     Console(highlight=False, markup=False).print(table_of(title, rows))
+
+
+def print_columns(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a line for each of ``rows`` on standard output, the first of which is its name."""
+    with leaving_at_once():
+        from rich.console import Console
+
+        from slam_observer_ros.common.tables import columns_of
+
+    Console(highlight=False, markup=False).print(columns_of(title, headings, rows))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,37 @@ def write_tum(trajectory: Trajectory, path: Path) -> Path:
     except OSError as error:
         raise EvaluationError(f"can't write {path}: {error.strerror}") from error
     return path
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM file, of whatever program, with poses in the order of time.
+
+    Raises an EvaluationError that names the line if it is none.
+    """
+    try:
+        lines = path.read_text(encoding='utf-8').splitlines()
+        rows = [
+            _tum_row(place, line)
+            for place, line in enumerate(lines, 1)
+            if line.strip() and not line.lstrip().startswith('#')
+        ]
+    except OSError as error:
+        raise EvaluationError(f"can't read {path}: {error.strerror}") from error
+    except (ValueError, ArithmeticError) as error:
+        raise EvaluationError(f'{path}: no TUM file: {error}') from error
+    table = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 7)
+    if not np.linalg.norm(table[:, 3:], axis=1).all():
+        raise EvaluationError(f'{path}: no TUM file: a quaternion is zero')
+    poses = se3.pose(so3.from_quaternion(table[:, 3:]), table[:, :3])
+    return Trajectory(np.array([row[0] for row in rows], dtype=np.int64), poses)
+
+
+def _tum_row(place: int, line: str) -> tuple[int, list[float]]:
+    """Return stamp, to the nanosecond, and numbers of a line; a ValueError if it is none."""
+    stamp, *rest = line.replace(',', ' ').split()
+    if len(rest) != 7:
+        raise ValueError(f'line {place} has not 8 numbers')
+    return int(Decimal(stamp) * NANOSECONDS_PER_SECOND), [float(word) for word in rest]
 
 
 def _seconds_text(stamp_ns: int) -> str:

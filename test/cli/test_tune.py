@@ -59,6 +59,7 @@ def first(value):
     return value[0] if isinstance(value, list) else value
 
 
+@pytest.mark.timeout(500)  # it replays a minute some eighty times
 def test_noise_that_was_stated_wrong_is_found(slam_observer, tmp_path):
     recording, other = (simulated(tmp_path / f'{seed}.mcap', seed) for seed in (1, 2))
     out = tmp_path / 'tuned.yaml'
@@ -85,6 +86,7 @@ def test_noise_that_was_stated_wrong_is_found(slam_observer, tmp_path):
     assert replayed['configuration_anees'] == pytest.approx(found['held_out']['anees'][1])
 
 
+@pytest.mark.timeout(500)
 def test_what_holds_no_further_is_no_improvement(slam_observer, tmp_path):
     recording, out = simulated(tmp_path / 'run.mcap', 1), tmp_path / 'tuned.yaml'
     right = [

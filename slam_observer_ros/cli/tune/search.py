@@ -18,7 +18,7 @@ FIRST_STEP = math.log(2.0)
 CURVATURE_STEP = 0.2
 """Steps of the search at first, and by which the curvature is measured, as logarithms."""
 
-EVALUATIONS = 15
+EVALUATIONS = 12
 """How often the likelihood is computed at most in the search, for each factor."""
 
 TOLERANCE = 0.03

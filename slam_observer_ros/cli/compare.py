@@ -1,0 +1,151 @@
+"""``slam-observer compare``: gains, settings and other tools on one recording, side by side."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from slam_observer_ros.cli.console import print_columns, print_json
+from slam_observer_ros.cli.options import add_settings_options
+from slam_observer_ros.cli.outputs import add_force_option, check_outputs
+from slam_observer_ros.cli.replay.asked import (
+    add_run_options,
+    Asked,
+    check_smooth,
+    read_asked,
+    without_outputs,
+)
+from slam_observer_ros.cli.replay.run import replayed, select_inputs
+from slam_observer_ros.cli.replay.summary import ACCURACY_ROWS, as_json
+from slam_observer_ros.common.errors import EvaluationError, UsageError
+from slam_observer_ros.evaluation.metrics import trajectory_errors
+from slam_observer_ros.evaluation.plots.drawing import SUFFIXES
+from slam_observer_ros.evaluation.plots.overlay_plot import plot_overlay
+from slam_observer_ros.evaluation.trajectory import read_tum, Trajectory
+from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.settings.input_settings import InputSettings
+
+TUM_SUFFIXES = ('.tum', '.txt')
+FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """One of those that are compared."""
+
+    trajectory: Trajectory
+    figures: Mapping[str, object]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command, and its description."""
+    parser.description = (
+        'Compare gain designs, parameter files and the trajectories of other tools on one '
+        'recording: one table, and one picture.'
+    )
+    parser.add_argument('recording', type=Path, metavar='RECORDING')
+    parser.add_argument(
+        'what',
+        nargs='+',
+        metavar='WHAT',
+        help=f'{", ".join(DESIGNS)}: gains, with the settings given; a parameter file: that in '
+        'place of --config; a .tum or .txt file: a trajectory of any tool, or of batch '
+        '--trajectories',
+    )
+    outputs = parser.add_argument_group('outputs')
+    outputs.add_argument(
+        '--plot', type=Path, metavar='FILE', help=f'picture, of a suffix {", ".join(SUFFIXES)}'
+    )
+    outputs.add_argument('--json', action='store_true', help='print one JSON object')
+    add_force_option(parser)
+    add_run_options(parser)
+    add_settings_options(parser, InputSettings)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run or read each, and put all side by side."""
+    if args.plot is not None and args.plot.suffix.removeprefix('.') not in SUFFIXES:
+        raise UsageError(f'--plot {args.plot}: its suffix is to be one of {", ".join(SUFFIXES)}')
+    check_outputs([args.plot], args.force)
+    if len(set(args.what)) < len(args.what):
+        raise UsageError('each is compared once')
+    asked = {what: _asked(args, what) for what in args.what}
+    truth = _truth(args, read_asked(args))
+    compared = {what: _compared(args, what, asked[what], truth) for what in args.what}
+    if args.plot is not None:
+        plot_overlay(args.plot, *_in_one_frame(compared, truth))
+    _print(args, compared)
+
+
+def _asked(args: argparse.Namespace, what: str) -> Asked | None:
+    """Return the settings of one of those that are to be run; None for a trajectory."""
+    if what in DESIGNS:
+        asked = read_asked(args)
+        asked = replace(asked, settings=replace(asked.settings, gains=what))
+    elif Path(what).suffix in TUM_SUFFIXES:
+        return None
+    else:
+        asked = read_asked(argparse.Namespace(**vars(args) | {'config': what}))
+    check_smooth(args, asked.settings)
+    return asked
+
+
+def _truth(args: argparse.Namespace, asked: Asked) -> Trajectory | None:
+    with Recording(args.recording) as recording:
+        _, _, truth = select_inputs(args, recording, asked)
+    return Trajectory(truth.stamps_ns, truth.poses) if len(truth.stamps_ns) else None
+
+
+def _compared(
+    args: argparse.Namespace, what: str, asked: Asked | None, truth: Trajectory | None
+) -> Compared:
+    if asked is not None:
+        options = without_outputs(args, args.recording)
+        options.tum = Path(what)  # nothing is written there; all poses are kept for it
+        outcome, _ = replayed(options, asked)
+        return Compared(outcome.trajectory, as_json(outcome))
+    trajectory = read_tum(Path(what))
+    if truth is None:
+        return Compared(trajectory, {})
+    try:
+        errors = trajectory_errors(trajectory, truth)
+    except EvaluationError as error:
+        raise EvaluationError(f'{what}: {error}') from error
+    figures = {'ate_rmse_m': errors.ate_rmse_m, 'heading_rmse_rad': errors.heading_rmse_rad}
+    return Compared(trajectory, figures)
+
+
+def _in_one_frame(
+    compared: Mapping[str, Compared], truth: Trajectory | None
+) -> tuple[dict[str, Trajectory], Trajectory | None]:
+    """Return all trajectories in the frame of the truth, or as they are; and the truth."""
+    trajectories = {what: one.trajectory for what, one in compared.items()}
+    if truth is None:
+        return trajectories, None
+    aligned = {
+        what: trajectory.moved(trajectory_errors(trajectory, truth).alignment)
+        for what, trajectory in trajectories.items()
+    }
+    return aligned, truth.during(next(iter(aligned.values())))
+
+
+def _print(args: argparse.Namespace, compared: Mapping[str, Compared]) -> None:
+    rows = {
+        what: {name: one.figures.get(name) for name in FIGURES} for what, one in compared.items()
+    }
+    if args.json:
+        print_json({'recording': str(args.recording), 'compared': rows})
+        return
+    known = [name for name in FIGURES if any(row[name] is not None for row in rows.values())]
+    lines = [[name, *(_text(row[name]) for row in rows.values())] for name in known]
+    print_columns(str(args.recording), ['', *rows], lines)
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ''
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
