@@ -49,6 +49,7 @@ class NoiseFit:
         return f'the stated noise is too small by a factor of {factor:.1f}'
 
     def __str__(self) -> str:
+        """Return the factor, and what is wrong if it is small."""
         factor = self.factor
         if factor is None:
             return 'not known yet'
