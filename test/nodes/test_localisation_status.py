@@ -85,7 +85,9 @@ def innovations(times_as_large, count=200):
     random = np.random.default_rng(0)
     noise = NoiseFit()
     for nis in times_as_large**2 * random.chisquare(4, count):
-        innovation = NormalisedInnovation(np.zeros(2), np.ones(2), float(nis), 4)
+        innovation = NormalisedInnovation(
+            np.zeros(2), np.ones(2), float(nis), 4, np.zeros(2), np.ones(2)
+        )
         noise.add(SimpleNamespace(innovation=innovation))
     return noise
 

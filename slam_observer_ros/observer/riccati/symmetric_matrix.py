@@ -31,7 +31,7 @@ class SymmetricMatrix:
         return self._storage[: self._size, : self._size]
 
     def rows(self, numbers: IntArray) -> FloatArray:
-        """Return some of its rows (q, N); as the matrix is symmetric, its columns transposed."""
+        """Return those of the ``numbers`` (q,), which are as well columns transposed: (q, N)."""
         # Of the storage, which is contiguous: of a view NumPy would copy all first.
         return self._storage.take(numbers, axis=0)[:, : self._size]
 

@@ -1,9 +1,9 @@
 """The Riccati filter for landmarks that may have orientations, as tags do.
 
-Points correct it as ever. Then the orientations seen do, by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the
-coordinates of :mod:`.tag_covariance` that is H x with a constant H, too. Both noises are taken to
-be independent, so one after the other is the same as both at once. Covariances (m, 3, 3) are those
-of rotation vectors, rad².
+The orientations seen correct it by φ_i of R_Â Z_i B̂_iᵀ = exp(φ_i): in the coordinates of
+:mod:`.tag_covariance` that is H x with a constant H, too. Then the points do, as ever. Both noises
+are taken to be independent, so to first order that is the same as both at once. Covariances
+(m, 3, 3) are those of rotation vectors, rad².
 """
 
 from __future__ import annotations
