@@ -34,7 +34,7 @@ from slam_observer_ros.settings.parameter_table import from_parameters
 CHECKOUT = Path(__file__).resolve().parent.parent
 PICTURE = CHECKOUT / 'docs' / 'images' / 'robot.gif'
 CONFIG = CHECKOUT / 'config' / 'wheeled_bearing_range.yaml'
-ROBOT, DURATION_S, FRAME_S, TRAIL_FRAMES = 4, 300.0, 2.5, 30
+ROBOT, DURATION_S, FRAME_S, TRAIL_FRAMES = 4, 360.0, 2.5, 30
 FRAMES_A_SECOND = 10
 SURVEY_SIGMA_M = 0.02
 ROBOT_M = 0.6  # size of the robot's symbol
@@ -133,7 +133,8 @@ def show(
         seen = np.isin(data_set.landmarks.ids, estimator.last_update.ids)
         for point in landmarks[seen]:
             axes.plot(*np.array([centre[:2], point]).T, '-', color='#999999', linewidth=0.8)
-    low, high = landmarks.min(axis=0) - 0.8, landmarks.max(axis=0) + 0.8
+    drawn = np.concatenate([landmarks, turned(run.truth.positions)])
+    low, high = drawn.min(axis=0) - 1.0, drawn.max(axis=0) + 1.0
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
     axes.set_xticks([])
     axes.set_yticks([])
