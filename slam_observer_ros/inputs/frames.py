@@ -90,9 +90,9 @@ class BaseFrame:
             for family, number in zip(detections.families, detections.ids, strict=True)
         ]
         ids, poses = np.array(detections.ids, dtype=np.int64), np.array(found).reshape(-1, 4, 4)
-        event = ObservationEvent(
-            detections.stamp_ns, ids, poses[:, :3, 3], orientations=poses[:, :3, :3]
-        )
+        R = poses[:, :3, :3]
+        R[(np.eye(3) == R).all(axis=(1, 2))] = 0.0  # unknown, as where nobody filled it in
+        event = ObservationEvent(detections.stamp_ns, ids, poses[:, :3, 3], orientations=R)
         return self.observation(event, camera_frame)
 
     def velocity(self, event: VelocityEvent, frame_id: str) -> VelocityEvent:

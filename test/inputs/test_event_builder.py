@@ -22,6 +22,7 @@ from slam_observer_ros.settings.input_settings import InputSettings
 MS = 1_000_000
 V = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])
 WHEEL = se3.from_rpy((0.3, 0.1, 0.0, 0.0, 0.0, np.pi))
+CAMERA = se3.from_rpy((0.2, 0.0, 0.4, -np.pi / 2, 0.0, -np.pi / 2))
 
 
 class Wheel:
@@ -143,6 +144,19 @@ def test_tags_are_those_of_the_sensor_that_a_parameter_names():
     expected = BaseFrame(InputSettings(), everything_placed()).tags(camera)
     base_frame = BaseFrame(InputSettings(sensor_frame='camera'), everything_placed())
     assert_allclose(base_frame.tags(other).points, expected.points)
+
+
+def test_a_tag_on_tf_that_is_exactly_not_turned_has_no_orientation():
+    transforms = TransformBuffer()
+    transforms.insert('base_link', 'camera', 0, CAMERA, is_static=True)
+    unset = se3.pose(np.eye(3), np.array([2.0, 0.0, 0.0]))
+    for child, pose in (('tag_3', unset), ('tag_4', WHEEL)):
+        transforms.insert('camera', child, 0, pose, is_static=True)
+    detections = TagDetections(0, 'camera', (3, 4), ('tag36h11', 'tag36h11'))
+    event = BaseFrame(InputSettings(), transforms).tags(detections)
+    assert_array_equal(event.orientations[0], np.zeros((3, 3)))
+    assert_allclose(event.orientations[1], (CAMERA @ WHEEL)[:3, :3])
+    assert_allclose(event.points, se3.transform(CAMERA, np.stack([unset, WHEEL])[:, :3, 3]))
 
 
 def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used():
