@@ -549,6 +549,13 @@ class Estimator:
         changed = set(changed_names(settings))
         if unused := [name for name in self._state.filter.ignores if name in changed]:
             logger.warning('No effect on %s gains: %s.', settings.gains, ', '.join(unused))
+        filter_ = self._state.filter
+        takes_points = filter_.has_joint_covariance and filter_.orientations is None
+        if settings.use_tag_orientation and takes_points:
+            logger.warning(
+                'use_tag_orientation has no effect with landmark_velocity_stddev: landmarks are '
+                'points that move (set landmark_velocity_stddev: 0.0 for tags at rest).'
+            )
         is_given = any(settings.initial_position) or settings.initial_yaw != 0.0
         if is_given and not settings.set_initial_pose:
             logger.warning(

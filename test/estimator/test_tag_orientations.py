@@ -76,6 +76,14 @@ def test_other_gains_use_the_position_and_say_so(gains, caplog):
     np.testing.assert_array_equal(with_them.pose, without.pose)
 
 
+def test_landmarks_that_may_move_are_points_and_it_is_said(caplog):
+    estimator = Estimator(replace(SETTINGS, landmark_velocity_stddev=0.1))
+    assert estimator._state.filter.orientations is None
+    (message,) = caplog.messages
+    assert message.startswith('use_tag_orientation has no effect')
+    assert 'set landmark_velocity_stddev: 0.0' in message
+
+
 def test_one_in_ten_that_is_flipped_does_no_harm():
     flips = np.flatnonzero(np.random.default_rng(1).random(200) < 0.1)
     estimator = drive(UNSURE, flips=flips)
