@@ -18,7 +18,7 @@ ARGUMENTS = {
     'image': ('/camera/image_rect', 'topic of the rectified image'),
     'camera_info': ('/camera/camera_info', 'topic of its calibration'),
     'tag_family': ('36h11', 'family of the tags, as apriltag_ros names it'),
-    'tag_size': ('0.16', 'edge of the black square, metres'),
+    'tag_size': ('0.16', 'edge of the black square, metres, for detector and observer'),
     'base_frame': ('base_link', 'frame of the robot, in which camera_pose is'),
     'camera_frame': (
         '',
@@ -101,6 +101,7 @@ def generate_launch_description():
                 launch_arguments=[
                     ('params_file', LaunchConfiguration('params_file')),
                     ('landmarks', 'detections'),
+                    ('tag_size', LaunchConfiguration('tag_size')),
                 ],
             ),
             OpaqueFunction(function=start),

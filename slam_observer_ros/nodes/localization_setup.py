@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from slam_observer_ros.nodes.launch_arguments import numbers
+
 ARGUMENTS = {
     'namespace': ('', 'namespace of the robot'),
     'use_sim_time': ('false', 'whether time is that of /clock'),
@@ -16,6 +18,7 @@ ARGUMENTS = {
     'odometry': ('~/odometry', 'topic of the estimate'),
     'pose': ('amcl_pose', 'topic of the pose'),
     'map_file': ('', 'landmarks to be localised among; empty: as params_file says'),
+    'tag_size': ('', 'edge of square tags, metres; empty: as params_file says'),
     'map': ('', 'occupancy grid for a map server, a YAML file; empty: none is started'),
 }
 """Launch arguments beside params_file: default and description."""
@@ -43,6 +46,8 @@ def parameters(given: Mapping[str, str], has_bond: bool) -> dict[str, object]:
     }
     if given['map_file']:
         chosen['map_file'] = given['map_file']
+    if given['tag_size']:
+        (chosen['tag_size'],) = numbers(given, 'tag_size', 1)
     return chosen
 
 

@@ -194,6 +194,21 @@ def test_a_camera_is_mounted_where_its_pose_is_given(nodes):
     assert started['static_transform_publisher']['arguments'][-1] == 'eye'
 
 
+def test_detector_and_observer_have_one_tag_size(nodes, load):
+    observer = nodes('localization.launch.py', tag_size='0.2')['lifecycle_observer_node']
+    assert parameters(observer)['tag_size'] == 0.2
+    names = load('apriltag.launch.py')
+    names['generate_launch_description']()
+    passed_on = dict(names['IncludeLaunchDescription'].call_args.kwargs['launch_arguments'])
+    assert passed_on['tag_size'] is names['LaunchConfiguration'].return_value
+    assert ('tag_size',) in [call.args for call in names['LaunchConfiguration'].call_args_list]
+
+
+def test_a_tag_size_that_is_no_number_ends_the_launch_with_the_reason(nodes):
+    with pytest.raises(RuntimeError, match=r"^tag_size: '16cm' is not 1 numbers"):
+        nodes('localization.launch.py', tag_size='16cm')
+
+
 def test_numbers_of_an_argument_are_counted():
     assert numbers({'pose': '1 2,3'}, 'pose', 3) == [1.0, 2.0, 3.0]
     for written in ('1 2', '1 2 x', ''):
