@@ -1,0 +1,74 @@
+"""Orientations of tags in a recording: with one tag in view they determine the heading."""
+
+from __future__ import annotations
+
+from command_line import CommandLine
+import detector_messages as detector
+import pytest
+import ros_messages as ros
+from rosbags import rosbag2
+from rosbags.rosbag2 import StoragePlugin
+from tag_drives import past_tags, SETTINGS
+
+from slam_observer_ros.geometry import so3
+
+STEPS = 300
+
+
+def detections(seen):
+    """Return a Detection3DArray of tags."""
+    items = [
+        detector.detection(
+            f'tag_{number}',
+            class_id='tag',
+            position=point,
+            quaternion=so3.to_quaternion(Z),
+        )
+        for number, point, Z in zip(seen.ids, seen.points, seen.orientations, strict=True)
+    ]
+    return detector.detections(items, 'base_link', seen.stamp_ns)
+
+
+def record(path):
+    with rosbag2.Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connections = {
+            topic: bag.add_connection(topic, name, typestore=ros.TYPESTORE)
+            for topic, name in (
+                ('/ground_truth/pose', 'geometry_msgs/msg/PoseStamped'),
+                ('/twist', 'geometry_msgs/msg/TwistStamped'),
+                ('/tags', 'vision_msgs/msg/Detection3DArray'),
+            )
+        }
+        for truth, velocity, seen in past_tags(ros.STAMP_NS, STEPS):
+            stamp_ns = seen.stamp_ns
+            for topic, message in (
+                ('/ground_truth/pose', ros.OUTGOING.pose_stamped(stamp_ns, 'world', truth.pose)),
+                ('/twist', ros.twist_stamped(velocity.body_velocity, stamp_ns=stamp_ns)),
+                ('/tags', detections(seen)),
+            ):
+                bag.write(connections[topic], stamp_ns, ros.serialise(message))
+    return path
+
+
+@pytest.fixture
+def heading_error(capsys):
+    """Replay a recording; return the RMS error of the heading, rad."""
+    options = [f'{name}={written(value)}' for name, value in SETTINGS.items()]
+
+    def run(path, use_tag_orientation):
+        chosen = [*options, f'use_tag_orientation={use_tag_orientation}']
+        arguments = [word for option in chosen for word in ('--set', option)]
+        report = CommandLine(capsys).succeed('replay', path, '--json', *arguments).json
+        assert not report['dropped']
+        return report['heading_rmse_rad']
+
+    return run
+
+
+def written(value):
+    return str(list(value)) if isinstance(value, tuple) else str(value)
+
+
+def test_with_one_tag_in_view_its_orientation_determines_the_heading(heading_error, tmp_path):
+    path = record(tmp_path / 'tags')
+    assert heading_error(path, 'true') < 0.5 * heading_error(path, 'false')
