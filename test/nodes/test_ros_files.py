@@ -70,6 +70,10 @@ def test_launch_arguments_that_are_used_are_declared():
             for call in _calls(tree, 'DeclareLaunchArgument')
             if isinstance(call.args[0], ast.Constant)
         }
+        # ARGUMENTS are declared one by one by the loop over that table.
+        for node in tree.body:
+            if isinstance(node, ast.Assign) and node.targets[0].id == 'ARGUMENTS':
+                declared |= {key.value for key in node.value.keys}
         used = {call.args[0].value for call in _calls(tree, 'LaunchConfiguration')}
         assert used <= declared
 
