@@ -110,6 +110,10 @@ def test_noise_that_is_stated_too_large_is_said_without_a_warning():
     assert 'the stated noise is too large by 5' in values['innovations / stated noise']
 
 
+def test_sensors_without_any_noise_are_no_fault():
+    assert str(innovations(0.0)) == '0.00'
+
+
 def test_few_innovations_say_nothing():
     assert innovations(3.0, count=20).factor is None
     assert innovations(3.0, count=20).problem == ''

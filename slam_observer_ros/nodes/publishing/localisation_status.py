@@ -53,7 +53,9 @@ class NoiseFit:
         factor = self.factor
         if factor is None:
             return 'not known yet'
-        hint = f' (the stated noise is too large by {1.0 / factor:.1f})' if factor < 0.5 else ''
+        # Zero is that of sensors without any noise, as a simulation's may be.
+        is_small = 0.0 < factor < 1.0 / TOO_SMALL
+        hint = f' (the stated noise is too large by {1.0 / factor:.1f})' if is_small else ''
         return f'{factor:.2f}{hint}'
 
 
