@@ -219,7 +219,8 @@ class EstimatePublisher:
         ids = self._estimator.landmark_ids
         if np.any(ids >= FLOAT32_ID_LIMIT):
             self._node.get_logger().warning(
-                f"landmark_estimates can't carry ids from {FLOAT32_ID_LIMIT} on; map does",
+                f"landmark_estimates can't carry ids from {FLOAT32_ID_LIMIT} on; "
+                'landmark_map does',
                 once=True,
             )
             return
