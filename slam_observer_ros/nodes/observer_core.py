@@ -150,7 +150,8 @@ class ObserverCore:
         return self._maps.end_in_haste()
 
     def _create_timers(self, publish_rate_hz: float) -> list[Timer]:
-        # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
+        # A steady clock: with use_sim_time the ROS clock may stand still or jump back. Few timers:
+        # from eight on rclpy's EventsExecutor warns of them at every start.
         create = partial(self._node.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         # These two run only while something waits, the others always.
         self._publish_timer = create(1.0 / publish_rate_hz, self._publish_waiting)
@@ -158,13 +159,21 @@ class ObserverCore:
         return [
             self._publish_timer,
             self._retry_timer,
-            create(OVERVIEW_PERIOD_S, self._publisher.publish_overview),
-            create(OVERVIEW_PERIOD_S, self._maps.keep_recent),
+            create(OVERVIEW_PERIOD_S, self._publish_overview),
             create(DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
-            create(CHECK_PERIOD_S, self._localisation.publish),
+            create(CHECK_PERIOD_S, self._check),
             create(KEEP_PERIOD_S, self._kept_pose.keep),
-            *(create(CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
         ]
+
+    def _publish_overview(self) -> None:
+        self._publisher.publish_overview()
+        self._maps.keep_recent()
+
+    def _check(self) -> None:
+        """See whether the robot is localised, and what publishes."""
+        self._localisation.publish()
+        for source in self._inputs:
+            source.check_publishers()
 
     def _publish_new(self, source: str) -> None:
         """Publish what an input has given if it is due, else a little later."""
