@@ -304,9 +304,9 @@ def test_what_else_a_topic_carries_is_answered_with_the_types_that_are_read():
     landmarks, _ = landmarks_input('sensor_msgs/msg/LaserScan')
     landmarks.check_publishers()
     assert landmarks.problem == (
-        "'/landmarks' carries sensor_msgs/msg/LaserScan; PointCloud2 or PointCloud or "
-        'AprilTagDetectionArray or PoseArray or Detection3DArray or ArucoDetection or '
-        'ArucoMarkers is needed'
+        "'/landmarks' carries sensor_msgs/msg/LaserScan; PointCloud2, PointCloud, "
+        'AprilTagDetectionArray, PoseArray, Detection3DArray, ArucoDetection or ArucoMarkers '
+        'is needed'
     )
 
 

@@ -258,7 +258,8 @@ class InputTopic(Generic[MessageT]):
         names = list(self._decoders)
         if len(names) > MAX_FULL_NAMES:
             names = list(dict.fromkeys(name.rpartition('/')[2] for name in names))
-        return ' or '.join(names)
+        *others, last = names
+        return f'{", ".join(others)} or {last}' if others else last
 
     def _find_fault(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
         """Return why no publisher can be heard; empty if all can."""
