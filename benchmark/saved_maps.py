@@ -1,7 +1,7 @@
-"""What correlations in a saved map are worth to the next run, simulated.
+"""What correlations in a saved map are worth to the next run, simulated, and what they take.
 
-``python benchmark/saved_maps.py`` prints the table of docs/localise_in_a_map.md: a robot maps most
-of a loop and saves the map; later it starts somewhere, finds itself in that map, and goes on.
+``python benchmark/saved_maps.py`` prints the tables of docs/localise_in_a_map.md. A robot maps
+most of a loop and saves the map; later it starts somewhere, finds itself in it, and goes on.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import os
 from pathlib import Path
 import sys
 import tempfile
+import time
 
 import numpy as np
 from worlds import drive, Loop, simulated_settings, World
@@ -29,11 +30,12 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.geometry.matrices import diagonal_blocks
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.sensor_models.calibration import without_calibration
 
-MAPPED_S, LOCALISED_S, CHECKPOINT_S = 50.0, 30.0, 2.0
+MAPPED_S, LOCALISED_S, CHECKPOINT_S = 50.0, 60.0, 2.0
 
 LOOPS = {
     '3D stereo': Loop('stereo_inertial', 60.0, MAPPED_S + LOCALISED_S, 20, 6.0, 5),
@@ -41,8 +43,8 @@ LOOPS = {
 }
 """The map is saved before the loop is closed, when its ends know little of each other."""
 
-MODES = ('off', 'uncertain')
 ERRORS = ('correlated', 'independent')
+SIZES = (100, 500, 1000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,36 +52,57 @@ class Job:
     """One run in a saved map."""
 
     loop: str
-    mode: str
     errors: str
     seed: int
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
     parser.add_argument('--seeds', type=int, default=50, help='runs a row')
     args = parser.parse_args()
     os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
-    rows = list(product(LOOPS, MODES, ERRORS))
+    rows = list(product(LOOPS, ERRORS))
     jobs = [Job(*row, seed) for row in rows for seed in range(args.seeds)]
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
         figures = np.array(list(pool.map(run, jobs))).reshape(len(rows), args.seeds, -1)
-    sys.stdout.write('\n'.join(table(rows, figures)) + '\n')
+    sys.stdout.write('\n'.join([*table(rows, figures), '', *file_table()]) + '\n')
 
 
-def table(rows: list[tuple[str, str, str]], figures: FloatArray) -> Iterator[str]:
-    """Yield the lines of the table, for the figures (rows, seeds, 5) of all runs."""
+def table(rows: list[tuple[str, str]], figures: FloatArray) -> Iterator[str]:
+    """Yield the lines of the table, for the figures (rows, seeds, 4) of all runs."""
     yield (
-        '| loop | `localization_mode` | errors of the map | position error | heading error '
-        '| ANEES of the pose | ANEES of pose and landmarks |'
+        '| loop | errors of the map | position error | heading error | ANEES of the pose '
+        '| ANEES of pose and landmarks |'
     )
-    yield '| --- | --- | --- | --- | --- | --- | --- |'
+    yield '| --- | --- | --- | --- | --- | --- |'
     for row, of_runs in zip(rows, figures, strict=True):
         mean = np.nanmean(of_runs, axis=0)
         position_m, turn_rad = np.sqrt(mean[:2])
         errors = f'{100.0 * position_m:.1f} cm | {np.degrees(turn_rad):.2f}°'
         yield f'| {" | ".join(row)} | {errors} | {mean[2]:.2f} | {mean[3]:.2f} |'
+
+
+def file_table() -> Iterator[str]:
+    """Yield the lines of the table of what files take."""
+    yield '| landmarks | file | without correlations | to write | to read |'
+    yield '| --- | --- | --- | --- | --- |'
+    for n in SIZES:
+        root = np.random.default_rng(0).normal(scale=0.01, size=(3 * n, 3 * n + 3))
+        joint, points = root @ root.T, 10.0 * root[:, :3].reshape(n, 9)[:, :3]
+        covariances = diagonal_blocks(joint, 3).copy()
+        known = LandmarkMap(np.arange(n), points, covariances, np.full(n, 9))
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / 'map.yaml'
+            write_map(path, known, None)
+            without_mb = path.stat().st_size / 1e6
+            start_s = time.process_time()
+            write_map(path, replace(known, joint_covariance=joint), None)
+            written_s = time.process_time()
+            read_map(path)
+            read_s = time.process_time()
+            megabytes = f'{path.stat().st_size / 1e6:.1f} MB | {without_mb:.2f} MB'
+        yield f'| {n} | {megabytes} | {written_s - start_s:.1f} s | {read_s - written_s:.1f} s |'
 
 
 def run(job: Job) -> FloatArray:
@@ -94,7 +117,7 @@ def run(job: Job) -> FloatArray:
     frame = frame_of(known, world, settings.two_d_mode)
     if job.errors == 'independent':
         known = replace(known, joint_covariance=None)
-    second = Estimator(replace(settings, localization_mode=job.mode))
+    second = Estimator(replace(settings, localization_mode='uncertain'))
     second.load_map(known)
     figures, due_s = [], MAPPED_S
     for event in world.part(MAPPED_S, MAPPED_S + LOCALISED_S).events:
