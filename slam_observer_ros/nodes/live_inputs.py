@@ -38,11 +38,7 @@ DISCOVERY_S = 1.0
 ROLES: dict[str, tuple[str, str]] = {
     **dict.fromkeys(VELOCITY_DECODERS, ('twist', '')),
     IMU: ('imu', 'use_imu:=true'),
-    **dict.fromkeys(CLOUD_DECODERS, ('landmarks', '')),
-    **{
-        name: ('landmarks', f'landmarks_type:={name.rpartition("/")[2]}')
-        for name in (*DETECTION_DECODERS, APRILTAGS)
-    },
+    **dict.fromkeys((*CLOUD_DECODERS, *DETECTION_DECODERS, APRILTAGS), ('landmarks', '')),
     TRANSFORMS: ('/tf', ''),
 }
 """Types of messages: the node's topic for them, and what has to be set."""

@@ -456,6 +456,12 @@ def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path
         assert 'ignored: base_frame_id, wheel.radius\n' in node.output
 
 
+def test_all_that_a_node_prints_is_its_log(ros, tmp_path):
+    with running('observer_node', tmp_path / 'log', use_imu=True) as node:
+        node.wait_for_output('estimating')
+    assert all(line.startswith('[') for line in node.output.splitlines()), node.output
+
+
 def test_large_ids_are_warned_about(ros, observer):
     maps = ros.collect(PointCloud2, 'landmark_map', LATCHED_QOS)
     ros.collect(PointCloud, 'landmark_estimates')  # for nobody they are not made

@@ -26,6 +26,7 @@ from slam_observer_ros.inputs.event_builder import (
     with_receive_time,
 )
 from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_problem
 from slam_observer_ros.nodes.intake.clock_change import ClockChange
@@ -139,9 +140,11 @@ class EstimatorFeed:
             self._log.warning(reason, f'{reason}: the time of reception is taken instead')
         self._give(self._builder.add(timed, time.monotonic_ns()), name)
 
-    def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
+    def add_observation(
+        self, measured: Measurement[ObservationEvent] | TagDetections, receive_ns: int
+    ) -> None:
         """Take landmarks, unless they are a lidar's scan."""
-        problem = scan_problem(measured.event)
+        problem = scan_problem(measured.event) if isinstance(measured, Measurement) else ''
         if self.is_active and problem:
             self._drop('scan', problem)
         else:
