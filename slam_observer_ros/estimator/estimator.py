@@ -290,8 +290,7 @@ class Estimator:
 
         Unless its frame is that of a loaded map, its covariances are those of its shape alone.
         """
-        is_own_frame = self._localiser.loaded is None or not self.is_localised
-        return map_of(self._state, is_own_frame)
+        return map_of(self._state, self._localiser.loaded if self.is_localised else None)
 
     @property
     def stamp_ns(self) -> int | None:
