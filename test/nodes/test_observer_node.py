@@ -130,8 +130,15 @@ def test_each_input_type_is_found_on_its_topic(ros, observer, twist_class, cloud
         ros.spin_until(
             lambda: poses and abs(poses[-1].pose.pose.position.x - 1.0) < 0.3, 'a run of 1 m'
         )
-    received = re.findall(r"receiving \w+/msg/(\w+) on '/(?:twist|landmarks)'", observer.output)
+    received = re.findall(
+        r"listening for \w+/msg/(\w+) on '/(?:twist|landmarks)'", observer.output
+    )
     assert {twist_class.__name__, cloud_class.__name__} <= set(received)
+
+
+def test_the_log_of_a_start_has_no_lines_but_the_nodes_own(observer):
+    observer.wait_for_output('estimating')
+    assert 'number of timers' not in observer.output
 
 
 def test_incompatible_type_is_reported(ros, observer):
