@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import json
 from pathlib import Path
 import re
 import signal
@@ -165,4 +166,4 @@ def running(name: str, log: Path, *arguments: str, **parameters: object) -> Iter
 
 
 def _yaml(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    return json.dumps(value) if value == '' or isinstance(value, bool | tuple) else str(value)
