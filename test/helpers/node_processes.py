@@ -23,6 +23,11 @@ PATIENCE_S = 30.0
 
 RELIABLE = QoSProfile(depth=5000)
 
+OBSERVERS = {'observer_node', 'lifecycle_observer_node'}
+
+ALL_ARE_USED = {'landmarks_max_wait': 60.0}
+"""Else an observer drops old landmarks when the tests have a busy machine, as it should."""
+
 
 class NodeProcess:
     """A node as a child process, with its output in a file."""
@@ -41,7 +46,8 @@ class NodeProcess:
         self.log = log
         module = ['-m', f'slam_observer_ros.nodes.{name}']
         command = [sys.executable, *(module if program is None else [str(program)]), '--ros-args']
-        for key, value in parameters.items():
+        always = ALL_ARE_USED if name in OBSERVERS else {}
+        for key, value in (always | parameters).items():
             command += ['-p', f'{key}:={_yaml(value)}']
         NodeProcess.started += 1
         with log.open('w') as output:
@@ -160,6 +166,7 @@ def running(name: str, log: Path, *arguments: str, **parameters: object) -> Iter
         yield node
         assert node.stop() == 0, node.output
         assert 'Traceback' not in node.output, node.output
+        assert 'number of timers' not in node.output, 'EventsExecutor finds there are too many'
     finally:
         node.process.kill()
         node.process.wait()

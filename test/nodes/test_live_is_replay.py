@@ -41,7 +41,6 @@ HEARING = {
     'twist_qos': 'reliable',
     'landmarks_qos': 'reliable',
     'queue_depth': 1000,
-    'landmarks_max_wait': 60.0,
     'publish_rate': 200.0,
 }
 
