@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry.matrices import diagonal_blocks
+from slam_observer_ros.geometry.matrices import diagonal_blocks, with_variances_above
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_correlations import MAX_CORRELATED
 from slam_observer_ros.known_map.merging import joint_covariance
 from slam_observer_ros.state.state import State
 
@@ -26,17 +27,31 @@ def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
     if state.is_fixed and loaded is not None:
         return _exact_map(state, rows, loaded)
-    joint = joint_covariance(state, rows, is_own_frame=loaded is None)
+    covariances, joint = _covariances_of(state, rows, loaded is None)
     orientations, sigmas = _orientations_of(state, rows)
     return LandmarkMap(
         state.landmarks.ids[rows],
         state.world_points[rows],
-        None if joint is None else diagonal_blocks(joint, 3).copy(),
+        covariances,
         state.landmarks.counts[rows],
         orientations=orientations,
         orientation_sigmas=sigmas,
         joint_covariance=joint,
     )
+
+
+def _covariances_of(
+    state: State, rows: IntArray, is_own_frame: bool
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return covariances (m, 3, 3) and, unless they are too many, the joint one (3 m, 3 m), m²."""
+    are_many = len(rows) > MAX_CORRELATED
+    if are_many and not is_own_frame:  # of those a map of any size could be loaded
+        of_all = state.landmark_covariances()
+        return None if of_all is None else with_variances_above(0.0, of_all[rows]), None
+    joint = joint_covariance(state, rows, is_own_frame)
+    if joint is None:
+        return None, None
+    return diagonal_blocks(joint, 3).copy(), None if are_many else joint
 
 
 def _exact_map(state: State, rows: IntArray, loaded: LandmarkMap) -> LandmarkMap:

@@ -51,8 +51,8 @@ def as_lines(joint: FloatArray | None, landmarks: Sequence[Mapping[str, Any]]) -
         return []
     if len(landmarks) > MAX_CORRELATED:
         logger.warning(
-            'Correlations between %d landmarks are not saved: with more than %d the map file '
-            'would be too large. Where it is loaded their errors count as independent.',
+            'Correlations between %d landmarks are not saved, more than %d are too many: where '
+            'the map is loaded their errors count as independent.',
             len(landmarks),
             MAX_CORRELATED,
         )

@@ -80,9 +80,9 @@ def joint_covariance(state: State, rows: IntArray, is_own_frame: bool) -> FloatA
     m, axes = len(rows), state.axes
     k, points = axes.point, state.filter.points[rows]
     joint = state.filter.joint
-    with_pose = None if joint is None or m == 0 else joint.with_pose(rows, points)
-    if with_pose is None:
-        return None
+    with_pose = None if joint is None else joint.with_pose(rows, points)
+    if with_pose is None or m == 0:
+        return None if with_pose is None else np.zeros((0, 0))
     # As the square of a root, so that rounding makes no variance negative, however small it is.
     L = _lower_root(with_pose[axes.p :, axes.p :])
     if is_own_frame:

@@ -22,7 +22,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import PLANAR
 from slam_observer_ros.geometry.matrices import diagonal_blocks
-from slam_observer_ros.known_map import map_correlations
+from slam_observer_ros.known_map import export, map_correlations
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.observer.known_points import KnownPoints
@@ -88,7 +88,10 @@ class TestFile:
     ):
         monkeypatch.setattr(map_correlations, 'MAX_CORRELATED', 5)
         path = write(tmp_path / 'map.yaml', a_map(6))
-        assert 'Correlations between 6 landmarks are not saved: with more than 5' in caplog.text
+        assert (
+            'Correlations between 6 landmarks are not saved, more than 5 are too many'
+            in caplog.text
+        )
         assert read_map(path).joint_covariance is None
         caplog.clear()
         assert read_map(write(path, a_map(5))).joint_covariance is not None
@@ -312,6 +315,23 @@ def test_what_is_loaded_can_be_saved(mode, two_d_mode):
     of_known = known.select([known.ids.tolist().index(i) for i in saved.ids])
     assert_allclose(saved.joint_covariance, of_known.joint_covariance, atol=2e-8)
     assert_allclose(saved.covariances, diagonal_blocks(saved.joint_covariance, 3), atol=0.0)
+
+
+@pytest.mark.parametrize('is_loaded', [False, True])
+def test_in_too_large_a_map_only_covariances_are_known_and_the_log_says_so(
+    monkeypatch, caplog, is_loaded
+):
+    monkeypatch.setattr(export, 'MAX_CORRELATED', 5)
+    known = a_map(6)
+    estimator = Estimator(Settings(reorder_window=0.0, confirmations=1))
+    if is_loaded:
+        estimator.load_map(known, np.eye(4), 0.01 * np.eye(6))
+    else:
+        estimator.add(ObservationEvent(0, known.ids, known.world_points))
+    saved = estimator.landmark_map
+    assert saved.joint_covariance is None
+    assert saved.covariances.shape == (6, 3, 3)
+    assert 'Correlations between the 6 landmarks of the map are not saved' in caplog.text
 
 
 def test_in_a_fixed_map_they_stay_as_they_were_whatever_is_seen():
