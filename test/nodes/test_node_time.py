@@ -370,7 +370,6 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
     end_ns = max(event.stamp_ns for event in events)
     # A wide window, since a busy machine may deliver one topic well before the other.
     parameters = {'reorder_window': 1.0, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
-    parameters['landmarks_max_wait'] = 60.0
     with ExitStack() as stack:
         maps, robots = {}, {}
         for name in orders:

@@ -12,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tempfile
 
 import pytest
 import setuptools  # noqa: F401 (provides distutils)
@@ -180,7 +181,8 @@ def test_maps_can_be_read(page, tmp_path):
 
 
 @pages
-def test_python_runs(page):
+def test_python_runs(page, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))  # a page makes a folder that stays
     for block in blocks(page, 'python'):
         exec(compile(block, page.name, 'exec'), {})
 
