@@ -202,6 +202,19 @@ def test_poses_replay_like_a_cloud_without_ids(recordings, estimate, options):
     assert_same(estimate(recordings['poses'], *options), expected)
 
 
+@pytest.mark.parametrize(
+    ('name', 'landmarks_type'),
+    [('poses', 'PoseArray'), ('boxes', 'auto'), ('apriltag', 'auto'), ('apriltag', 'tf')],
+)
+def test_orientations_that_nobody_filled_in_change_nothing(
+    recordings, estimate, name, landmarks_type
+):
+    """Compare what never relinearises, as with ``use_tag_orientation``, and but for rounding."""
+    chosen = ('--set', f'landmarks_type={landmarks_type}', '--set', 'relinearization_interval=0')
+    expected = estimate(recordings[name], *chosen)
+    assert_same(estimate(recordings[name], *chosen, '--set', 'use_tag_orientation=true'), expected)
+
+
 def test_the_nodes_file_says_which_type(recordings, estimate, tmp_path):
     config = tmp_path / 'apriltags.yaml'
     config.write_text('/**: {ros__parameters: {landmarks_type: AprilTagDetectionArray}}')

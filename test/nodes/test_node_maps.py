@@ -393,6 +393,21 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ('parameters', 'reason'),
+    [
+        ({'gains': 'ricati'}, "'gains' takes one of constant, scheduled, riccati, not 'ricati'"),
+        ({'use_sim_time': 'ja'}, "Trying to set parameter 'use_sim_time' to 'ja'"),
+    ],
+)
+def test_with_a_wrong_parameter_the_node_says_why_in_a_line(tmp_path, parameters, reason):
+    node = NodeProcess('observer_node', tmp_path / 'log', **parameters)
+    assert node.wait() == 2
+    last = node.output.splitlines()[-1]
+    assert reason in last
+    assert 'Reason:' not in last
+
+
+@pytest.mark.parametrize(
     ('text', 'reason'),
     [
         (None, r"Couldn't parse params file: '--params-file .*'. Error: Error opening YAML file"),

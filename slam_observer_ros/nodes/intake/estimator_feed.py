@@ -32,6 +32,7 @@ from slam_observer_ros.messages.point_clouds import scan_problem
 from slam_observer_ros.nodes.intake.clock_change import ClockChange
 from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
+from slam_observer_ros.settings.input_settings import ON_TF
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 SOURCES: dict[type[Event], str] = {
@@ -88,6 +89,8 @@ class EstimatorFeed:
         }
         # As they are after remapping, for the log.
         self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
+        if settings.landmarks_type == ON_TF:
+            self._topics['landmarks'] = f"'{node.resolve_topic_name('/tf')}'"
         self.is_active = False
         self.is_paused = False
         self.on_events: Callable[[str], None] = lambda _name: None

@@ -194,7 +194,7 @@ class InputTopic(Generic[MessageT]):
         self._subscription = self._node.create_subscription(
             kind, self.topic, with_info(self._receive), self._qos, raw=True
         )
-        self._node.get_logger().info(f"receiving {type_name} on '{self.topic}'")
+        self._node.get_logger().info(f"listening for {type_name} on '{self.topic}'")
 
     def read_until(self, received_ns: int) -> None:
         """Read what waits, up to what DDS has received at a time, nanoseconds."""
