@@ -69,8 +69,15 @@ def test_each_input_type_is_found_on_its_topic(ros, observer, twist_class, cloud
         ros.spin_until(
             lambda: poses and abs(poses[-1].pose.pose.position.x - 1.0) < 0.3, 'a run of 1 m'
         )
-    received = re.findall(r"receiving \w+/msg/(\w+) on '/(?:twist|landmarks)'", observer.output)
+    received = re.findall(
+        r"listening for \w+/msg/(\w+) on '/(?:twist|landmarks)'", observer.output
+    )
     assert {twist_class.__name__, cloud_class.__name__} <= set(received)
+
+
+def test_the_log_of_a_start_has_no_lines_but_the_nodes_own(observer):
+    observer.wait_for_output('estimating')
+    assert 'number of timers' not in observer.output
 
 
 def test_incompatible_type_is_reported(ros, observer):
@@ -393,6 +400,12 @@ def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path
         node.wait_for_output('estimating')
         assert node.output.count('WARN') == 1
         assert 'ignored: base_frame_id, wheel.radius\n' in node.output
+
+
+def test_all_that_a_node_prints_is_its_log(ros, tmp_path):
+    with running('observer_node', tmp_path / 'log', use_imu=True) as node:
+        node.wait_for_output('estimating')
+    assert all(line.startswith('[') for line in node.output.splitlines()), node.output
 
 
 def test_large_ids_are_warned_about(ros, observer):

@@ -148,6 +148,14 @@ def test_parameter_names_and_values_are_right(page):
         rows[name].check(yaml.safe_load(value))
 
 
+@pytest.mark.parametrize(
+    ('name', 'page'), [('wheeled_robot.yaml', 'my_robot.md'), ('apriltags.yaml', 'apriltags.md')]
+)
+def test_parameter_files_that_are_shown_are_those_that_are_shipped(name, page):
+    shipped = (CHECKOUT / 'config' / name).read_text()
+    assert shipped in blocks(CHECKOUT / 'docs' / page, 'yaml')
+
+
 def test_all_counts_are_explained():
     page = (CHECKOUT / 'docs' / 'topics.md').read_text()
     names = re.findall(r"``'(\w+)'``", Estimator.counts.__doc__)
