@@ -53,6 +53,8 @@ def test_fiducials_on_tf_are_told_from_the_rest_of_it(ros, slam_observer):
         found = slam_observer.succeed('doctor', '--seconds', 2, '--json').json
         is_heard.set()
     ros.node.destroy_timer(timer)
+    for publisher in (tf, static):
+        ros.node.destroy_publisher(publisher)
     topics = {topic['topic']: topic['text'] for topic in found['topics']}
     assert '2 fiducials, as landmarks with -p landmarks_type:=tf' in topics['/tf']
     assert topics['/tf'].endswith('as /tf')
