@@ -80,6 +80,19 @@ def test_it_is_published_when_it_changes():
     assert watched.published == [False, True]
 
 
+def test_that_the_robot_is_lost_and_found_again_is_logged():
+    watched = Watched()
+    log = watched.node.get_logger()
+    assert watched.published == [True]
+    log.info.assert_not_called()
+    watched.estimator.pose_covariance = np.diag((0, 0, 0, 0.4, 0, 0)) ** 2
+    assert watched.published == [True, False]
+    log.warning.assert_called_once_with('not localised any more: position uncertain: σ = 0.40 m')
+    watched.estimator.pose_covariance = np.zeros((6, 6))
+    assert watched.published == [True, False, True]
+    log.info.assert_called_once_with('localised again')
+
+
 def innovations(times_as_large, count=200):
     """Innovations of two landmarks in the plane, so many times as large as is stated."""
     random = np.random.default_rng(0)

@@ -13,6 +13,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT = 300  # observations over which innovations are compared with the noise that is stated
@@ -73,16 +74,24 @@ class LocalisationStatus:
         self._settings = settings
         self._estimator = estimator
         self._noise = noise
+        self._log = ThrottledLog(node)
         self._is_localised: bool | None = None
+        self._was_localised = False
         self._publisher = node.create_publisher(Bool, '~/is_localised', LATCHED_QOS)
 
     def publish(self) -> None:
-        """Publish whether the robot is localised, if that has changed."""
-        level, _ = self._judge(self._deviations())
+        """Publish, and log, whether the robot is localised, if that has changed."""
+        level, message = self._judge(self._deviations())
         is_localised = level != DiagnosticStatus.ERROR and self._estimator.stamp_ns is not None
-        if is_localised != self._is_localised:
-            self._is_localised = is_localised
-            self._publisher.publish(Bool(data=is_localised))
+        if is_localised == self._is_localised:
+            return
+        if self._is_localised:
+            self._log.warning('lost', f'not localised any more: {message}')
+        elif self._was_localised:
+            self._log.info('found', 'localised again')
+        self._is_localised = is_localised
+        self._was_localised |= is_localised
+        self._publisher.publish(Bool(data=is_localised))
 
     def status(self, hardware_id: str) -> DiagnosticStatus:
         """Return the status for /diagnostics."""
