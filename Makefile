@@ -1,8 +1,10 @@
 # `make demo` and `make test` set up all they need, in .venv; the second time they start at once.
+# What only lint and tests need, three times as much, comes when they are first run.
 
 VENV := .venv
 PYTHON_IN_VENV := $(VENV)/bin/python
 READY := $(VENV)/ready-on-$(or $(ROS_DISTRO),$(ROS_WHEELS:%=%-wheels),wheels)
+READY_TO_DEVELOP := $(READY)-to-develop
 
 ifdef ROS_DISTRO
 PIP_LIMITS = "numpy==$$($(PYTHON_IN_VENV) -c 'import numpy; print(numpy.__version__)')"
@@ -16,9 +18,12 @@ ifdef _ROS_WHEELS_BOOTSTRAP_COMPLETE
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
+LOCK = $(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
+	--constraint constraints.txt --custom-compile-command 'make lock'
+
 .DEFAULT_GOAL := help
-.PHONY: help demo robot test lint format pytest colcon docs benchmark benchmark-accuracy venv lock \
-	clean
+.PHONY: help demo robot test lint format pytest colcon docs benchmark benchmark-accuracy venv \
+	develop lock clean
 
 help:  ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | column -t -s:
@@ -31,49 +36,54 @@ robot: $(READY)  ## localise a simulated robot with a camera among AprilTags, as
 
 test: lint pytest colcon  ## everything that a change must pass
 
-lint: $(READY)  ## ruff, mypy --strict, the layers of the architecture
+lint: $(READY_TO_DEVELOP)  ## ruff, mypy --strict, the layers of the architecture
 	$(VENV)/bin/ruff check --no-cache
 	$(VENV)/bin/ruff format --no-cache --check
 	$(VENV)/bin/mypy --cache-dir /dev/null
 	$(VENV)/bin/lint-imports --no-cache
 
-format: $(READY)  ## let ruff mend style and layout
+format: $(READY_TO_DEVELOP)  ## let ruff mend style and layout
 	$(VENV)/bin/ruff check --no-cache --fix
 	$(VENV)/bin/ruff format --no-cache
 
 # The tests of one file share nodes and a ROS domain; those of two have nothing in common.
-pytest: $(READY)  ## the tests alone
+pytest: $(READY_TO_DEVELOP)  ## the tests alone
 	scripts/ensure_chromium.sh
 	$(PYTHON_IN_VENV) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-colcon: $(READY)  ## build, install and test as a ROS workspace does
+colcon: $(READY_TO_DEVELOP)  ## build, install and test as a ROS workspace does
 	scripts/colcon_check.sh $(VENV)
 
-docs: $(READY)  ## rewrite the tables, build the site into site/, check its links
+docs: $(READY_TO_DEVELOP)  ## rewrite the tables, build the site into site/, check its links
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[docs]'
 	$(PYTHON_IN_VENV) scripts/write_docs.py
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
-benchmark-accuracy: $(READY)  ## compare with GTSAM's iSAM2 on real recordings
+benchmark-accuracy: $(READY_TO_DEVELOP)  ## compare with GTSAM's iSAM2 on real recordings
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
 
-benchmark: $(READY)  ## what it costs, as ratios: rewrites docs/performance.md
+benchmark: $(READY_TO_DEVELOP)  ## what it costs, as ratios: rewrites docs/performance.md
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/performance.py --write-docs
 
-venv: $(READY)  ## only set up .venv
+venv: $(READY)  ## only set up .venv, for nodes and command line
 
-lock: $(READY)  ## write requirements.lock, the hashes of what constraints.txt names
+develop: $(READY_TO_DEVELOP)  ## add to it what lint and tests need
+
+lock: $(READY_TO_DEVELOP)  ## write requirements*.lock, the hashes of what constraints.txt names
 	$(PYTHON_IN_VENV) -m pip install --quiet uv
-	$(VENV)/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 \
-		--extra cli --extra cluster --extra rerun --extra test --extra dev --extra ros-jazzy \
-		--constraint constraints.txt \
-		--custom-compile-command 'make lock' --output-file requirements.lock setup.py
+	$(LOCK) --extra cli --extra ros-jazzy --output-file requirements.lock setup.py
+	$(LOCK) --extra cli --extra cluster --extra rerun --extra test --extra dev --extra ros-jazzy \
+		--output-file requirements-develop.lock setup.py
 
 $(READY): setup.py constraints.txt requirements.lock \
 		$(wildcard scripts/setup_venv.sh scripts/build_tf2_msgs.py)
 	scripts/setup_venv.sh $(VENV)
+	touch $@
+
+$(READY_TO_DEVELOP): $(READY) requirements-develop.lock
+	scripts/setup_venv.sh $(VENV) develop
 	touch $@
 
 clean:  ## remove all that make made, but demo_output

@@ -55,7 +55,13 @@ setup(
         ],
         'cluster': ['distributed'],  # runs a batch on the machines of a Dask cluster
         # A ROS installation brings these itself, so nothing here may come with the package.
-        **{f'ros-{ros}': [f'ros-{ros}-{wheel}' for wheel in ROS_WHEELS] for ros in ROS_RELEASES},
+        **{
+            f'ros-{ros}': [
+                *(f'ros-{ros}-{wheel}' for wheel in ROS_WHEELS),
+                'catkin_pkg',  # with which rosidl_adapter reads package.xml, to build tf2_msgs
+            ]
+            for ros in ROS_RELEASES
+        },
         'rerun': ['rerun-sdk>=0.41; python_version >= "3.11"'],  # replay --rerun
         'test': [
             'pytest',  # named in this extra, it is what `colcon test` runs

@@ -3,6 +3,8 @@
 Arguments of localization.launch.py, which is included, may be given as well.
 """
 
+from pathlib import PurePosixPath
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
@@ -16,10 +18,13 @@ SHARE = FindPackageShare('slam_observer_ros')
 ARGUMENTS = {
     'namespace': ('', 'namespace of the robot'),
     'image': ('/camera/image_rect', 'topic of the rectified image'),
-    'camera_info': ('/camera/camera_info', 'topic of its calibration'),
+    'camera_info': ('', "topic of its calibration; empty: camera_info in the image's namespace"),
     'tag_family': ('36h11', 'family of the tags, as apriltag_ros names it'),
-    'tag_size': ('0.16', 'edge of the black square, metres, for detector and observer'),
-    'base_frame': ('base_link', 'frame of the robot, in which camera_pose is'),
+    'base_frame': (
+        '',
+        'frame of the robot, in which camera_pose is; empty: as params_file says, and base_link '
+        'for camera_pose',
+    ),
     'camera_frame': (
         '',
         "the image's frame, to be put at camera_pose; empty: it is on /tf",
@@ -39,7 +44,9 @@ def check(context):
     given = context.launch_configurations
     check_packages('apriltag_ros', *(['tf2_ros'] if given['camera_frame'] else []))
     for name, count in (('tag_size', 1), ('camera_pose', 6)):
-        numbers(given, name, count)
+        values = numbers(given, name, count)
+    if any(values) and not given['camera_frame']:
+        raise RuntimeError("camera_pose needs camera_frame: the frame of the image's header")
 
 
 def start(context):
@@ -53,12 +60,19 @@ def start(context):
         parameters=[{'family': given['tag_family'], 'size': float(given['tag_size'])}],
         remappings=[
             ('image_rect', given['image']),
-            ('camera_info', given['camera_info']),
+            *calibration(given),
             ('/tf', 'tf'),
         ],
         output='screen',
     )
     return [detector, *mount(given)]
+
+
+def calibration(given):
+    """Return the remapping of the calibration: image_transport looks for it beside the image."""
+    if not given['camera_info']:
+        return []
+    return [(str(PurePosixPath(given['image']).with_name('camera_info')), given['camera_info'])]
 
 
 def mount(given):
@@ -69,7 +83,7 @@ def mount(given):
     pose = ['--x', x, '--y', y, '--z', z, '--roll', roll, '--pitch', pitch, '--yaw', yaw]
     body = f'{given["camera_frame"]}_mount'
     return [
-        static_transform(given, pose, given['base_frame'], body),
+        static_transform(given, pose, given['base_frame'] or 'base_link', body),
         static_transform(given, OPTICAL_AXES, body, given['camera_frame']),
     ]
 
@@ -94,6 +108,11 @@ def generate_launch_description():
             *(
                 DeclareLaunchArgument(name, default_value=default, description=description)
                 for name, (default, description) in ARGUMENTS.items()
+            ),
+            # Without a default: one that is wrong would scale the whole map.
+            DeclareLaunchArgument(
+                'tag_size',
+                description='edge of the black square, metres, for detector and observer',
             ),
             OpaqueFunction(function=check),
             IncludeLaunchDescription(

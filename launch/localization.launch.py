@@ -15,10 +15,10 @@ from slam_observer_ros.nodes.launch_arguments import (
     check_file,
     check_optional_file,
     check_packages,
+    is_true,
 )
 from slam_observer_ros.nodes.localization_setup import (
     ARGUMENTS,
-    is_true,
     parameters,
     remappings,
 )
@@ -35,7 +35,7 @@ def start(context):
     common = {
         'namespace': given['namespace'],
         'ros_arguments': ['--log-level', given['log_level']],
-        'respawn': is_true(given['use_respawn']),
+        'respawn': is_true(given, 'use_respawn'),
         'respawn_delay': RESPAWN_DELAY_S,
         'output': 'screen',
     }
@@ -57,9 +57,9 @@ def map_server(given, common):
     if not given['map']:
         return []
     check_packages('nav2_map_server', 'nav2_lifecycle_manager')
-    use_sim_time = {'use_sim_time': is_true(given['use_sim_time'])}
+    use_sim_time = {'use_sim_time': is_true(given, 'use_sim_time')}
     managed = {
-        'autostart': is_true(given['autostart']),
+        'autostart': is_true(given, 'autostart'),
         'node_names': ['map_server', 'observer_node'],
         'bond_timeout': 4.0 if HAS_BOND else 0.0,
     }
@@ -83,7 +83,7 @@ def map_server(given, common):
 
 def generate_launch_description():
     default_parameters = PathJoinSubstitution(
-        [FindPackageShare('slam_observer_ros'), 'config', 'observer.yaml']
+        [FindPackageShare('slam_observer_ros'), 'config', 'wheeled_robot.yaml']
     )
     return LaunchDescription(
         [

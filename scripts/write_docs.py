@@ -41,7 +41,9 @@ BLOCK = re.compile(r'(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end -->)', re.
 NAMESPACE = '/robot'
 SUBSCRIBE_AT_ONCE = ('velocity_type:=Twist', 'landmarks_type:=PointCloud2', 'use_imu:=true')
 OF_EVERY_NODE = ('/rosout', '/parameter_events', '/clock')
-PACKAGES_OF_EVERY_NODE = ('rcl_interfaces/', 'type_description_interfaces/')
+# Whose services are of every node, or, those of nav2_msgs, only there where it is installed: a
+# sentence below the table has these.
+NOT_IN_TABLES = ('rcl_interfaces/', 'type_description_interfaces/', 'nav2_msgs/')
 
 INPUTS = {
     'twist': 'the velocity of the robot in its own frame',
@@ -154,7 +156,7 @@ def interface_of(make_node: Callable[[], Node], *parameters: str) -> Interface:
             {
                 relative_name(service.srv_name, node): Topic(type_name(service.srv_type))
                 for service in node.services
-                if not type_name(service.srv_type).startswith(PACKAGES_OF_EVERY_NODE)
+                if not type_name(service.srv_type).startswith(NOT_IN_TABLES)
             },
         )
     finally:

@@ -42,6 +42,7 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 # UDP alone, where rmw_fastrtps leaves the choice: with LOCALHOST it adds shared memory itself.
 os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+os.environ['TMPDIR'] = str(SCRATCH)  # of processes alone: this one has chosen its own already
 os.environ['ROS_LOG_DIR'] = str(SCRATCH)
 os.environ['HYPOTHESIS_STORAGE_DIRECTORY'] = str(SCRATCH)
 os.environ['MPLBACKEND'] = 'Agg'

@@ -26,6 +26,7 @@ MESSAGE_PACKAGES = {
     'tf2_msgs': 'poses of sensors on /tf',
     'vision_msgs': 'Detection3DArray',
     'apriltag_msgs': 'AprilTagDetectionArray',
+    'aruco_opencv_msgs': 'ArucoDetection',
 }
 
 OPTIONAL_PACKAGES = {

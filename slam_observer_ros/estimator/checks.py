@@ -23,6 +23,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.settings.estimator_settings import Settings
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
@@ -118,18 +119,33 @@ def check_map(landmark_map: LandmarkMap) -> None:
         if landmark_map.covariances is not None:
             _check_array('map covariances', landmark_map.covariances, (n, 3, 3))
             _check_definite('map covariances', landmark_map.covariances)
+        if landmark_map.joint_covariance is not None:
+            _check_array('joint map covariance', landmark_map.joint_covariance, (3 * n, 3 * n))
         if landmark_map.orientations is not None:
             _check_rotations('map orientations', landmark_map.orientations, n)
         if landmark_map.orientation_sigmas is not None:
             _check_array('map orientation sigmas', landmark_map.orientation_sigmas, (n,))
     except InvalidEventError as error:
         raise MapError(str(error)) from error
+    _check_joint(landmark_map)
     if ids.dtype.kind not in 'iu' or np.any((ids < 0) | (ids > MAX_ID)):
         raise MapError(f'map ids: integers from 0 to {MAX_ID} are wanted')
     if np.any(landmark_map.counts < 0):
         raise MapError('map counts: one is negative')
     if len(np.unique(ids)) < n:
         raise MapError('an id is there more than once in the map')
+
+
+def _check_joint(landmark_map: LandmarkMap) -> None:
+    joint, covariances = landmark_map.joint_covariance, landmark_map.covariances
+    if joint is None:
+        return
+    if covariances is None:
+        raise MapError('joint map covariance: it needs the covariances of its landmarks, too')
+    try:
+        check_joint(joint, covariances)
+    except MapError as error:
+        raise MapError(f'joint map covariance: {error}') from error
 
 
 def _check_times(stamp_ns: int, receive_ns: int | None) -> None:

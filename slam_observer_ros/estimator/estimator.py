@@ -290,8 +290,11 @@ class Estimator:
 
         Unless its frame is that of a loaded map, its covariances are those of its shape alone.
         """
-        is_own_frame = self._localiser.loaded is None or not self.is_localised
-        return map_of(self._state, is_own_frame)
+        landmark_map = map_of(self._state, self._localiser.loaded if self.is_localised else None)
+        has_covariances = landmark_map.covariances is not None
+        if has_covariances and landmark_map.joint_covariance is None and not self._state.is_fixed:
+            self._warnings.left_out_correlations(len(landmark_map.ids))
+        return landmark_map
 
     @property
     def stamp_ns(self) -> int | None:

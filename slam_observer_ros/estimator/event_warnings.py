@@ -99,6 +99,14 @@ class EventWarnings:
                 limit,
             )
 
+    def left_out_correlations(self, count: int) -> None:
+        """Warn that a map to be saved is too large for correlations."""
+        text = (
+            f'Correlations between the {count} landmarks of the map are not saved, they are too '
+            'many: where it is loaded their errors count as independent'
+        )
+        self._warn('left_out_correlations', text)
+
     def more_than_max(self, count: int, limit: int) -> None:
         """Warn that one observation has more landmarks than may be kept."""
         text = f'{count} points in one message, and max_landmarks is {limit}: some are always new'

@@ -93,6 +93,13 @@ def diagonal_blocks(matrix: FloatArray, k: int) -> FloatArray:
     return np.lib.stride_tricks.as_strided(matrix, shape, strides)
 
 
+def turned(joint: FloatArray, R: FloatArray) -> FloatArray:
+    """Return a covariance (k n, k n) of n vectors that have been turned by R (k, k), each."""
+    half = (joint.reshape(-1, len(R)) @ R.T).reshape(joint.shape)
+    whole: FloatArray = (half.T.reshape(-1, len(R)) @ R.T).reshape(joint.shape)
+    return whole
+
+
 def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
     """Return covariances (…, d, d) without variances that would drown all others in rounding.
 

@@ -30,6 +30,9 @@ _THREE = 3.0 * _IDENTITY
 # Added to θ²: 0/0 becomes 0 / 1e-300, and any angle above 1e-142 rad keeps all its bits.
 _ZERO_GUARD = 1e-300
 
+QUATERNION_NORM_TOLERANCE = 0.1
+"""How far the norm of a quaternion that is a rotation may be from 1."""
+
 
 def hat(phi: FloatArray) -> FloatArray:
     """Return the skew matrix φ_× (…, 3, 3) with φ_× w = φ × w (7)."""

@@ -7,11 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.observer.known_points import blocks_at, KnownPoints
+from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
-    """n landmarks in one frame; their errors are taken to be independent of each other."""
+    """n landmarks in one frame.
+
+    Their errors are taken to be independent of each other, unless ``joint_covariance`` is there.
+    """
 
     ids: IntArray  # (n,) landmark ids, each one once
     world_points: FloatArray  # (n, 3) positions, metres, in frame_id
@@ -21,6 +26,8 @@ class LandmarkMap:
     # (n, 3, 3) of tags, from their own axes, all zero for points; None if all are points
     orientations: FloatArray | None = None
     orientation_sigmas: FloatArray | None = None  # (n,) of rotation vectors, rad, each axis
+    # (3 n, 3 n) of all positions together, m²; its blocks on the diagonal are the covariances
+    joint_covariance: FloatArray | None = None
 
     def select(self, rows: IntArray | BoolArray) -> LandmarkMap:
         """Return the map of the landmarks at ``rows``."""
@@ -36,6 +43,7 @@ class LandmarkMap:
             self.frame_id,
             part(self.orientations),
             part(self.orientation_sigmas),
+            None if self.joint_covariance is None else blocks_at(self.joint_covariance, rows),
         )
 
     @property
@@ -54,3 +62,15 @@ class LandmarkMap:
         if self.covariances is not None:
             return self.covariances
         return np.tile(sigma_m**2 * np.eye(3), (len(self.ids), 1, 1))
+
+    def points_in(self, T: FloatArray, sigma_m: float) -> KnownPoints:
+        """Return positions and covariances, or :meth:`covariances_or`, in another frame.
+
+        ``T`` (4, 4) leads into it.
+        """
+        covariances, joint = self.covariances_or(sigma_m), self.joint_covariance
+        if joint is not None:
+            # A map's shape says nothing of a motion of everything: that is all but exact, and as
+            # it concerns all landmarks information about it would drown all other in rounding.
+            joint = joint + RESOLUTION_M**2 * np.eye(len(joint))
+        return KnownPoints(self.world_points, covariances, joint).moved(T)

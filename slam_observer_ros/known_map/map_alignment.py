@@ -8,8 +8,8 @@ from slam_observer_ros.common.types import BoolArray, FloatArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.gauge import anchor, JITTER_M2
+from slam_observer_ros.observer.known_points import KnownPoints
 
 MAX_TURN_STD_RAD = 0.2
 """Standard deviation about any axis beyond which landmarks don't determine the attitude.
@@ -24,20 +24,19 @@ CONTRADICTION_SIGMAS = 4.0
 def find_transform(
     source: FloatArray,
     source_covariance: FloatArray,
-    target: FloatArray,
-    target_covariances: FloatArray,
+    target: KnownPoints,
     axes: EstimatedAxes,
 ) -> tuple[FloatArray, BoolArray] | None:
     """Find the transform between the frames of two maps, even if some landmarks are wrong.
 
     Parameters
     ----------
-    source, target : FloatArray
-        (m, 3) landmarks in the robot's own frame, and the same in the other one, metres.
+    source : FloatArray
+        (m, 3) landmarks in the robot's own frame, metres.
     source_covariance : FloatArray
         (p + m k, p + m k) covariance of the pose's error and theirs together, rad² and m².
-    target_covariances : FloatArray
-        (m, 3, 3) covariance of each of them in the other frame, m².
+    target : KnownPoints
+        The same m landmarks in the other frame.
     axes : EstimatedAxes
         Whether they lie in space (k = 3) or in a plane (k = 2).
 
@@ -57,11 +56,12 @@ def find_transform(
         # Align the landmarks that are left.
         rows = np.flatnonzero(np.append(np.ones(p, dtype=np.bool_), np.repeat(agree, k)))
         P = source_covariance[np.ix_(rows, rows)]
-        T = _aligned(source[agree], P[p:, p:], target[agree], target_covariances[agree])
+        known = target.select(agree)
+        T = _aligned(source[agree], P[p:, p:], known)
         # Compare them in the robot's frame: do they determine the attitude, do they agree?
-        R = T[:3, :3]
-        there = block_diagonal((R.T @ target_covariances[agree] @ R)[:, :k, :k])
-        r = (source[agree] - se3.transform(se3.inverse(T), target[agree]))[:, :k]
+        known = known.moved(se3.inverse(T))
+        there = known.covariance_on(axes)
+        r = (source[agree] - known.points)[:, :k]
         if _turn_std_rad(P, G[rows], there, axes) > MAX_TURN_STD_RAD:
             return None
         misfit, doubts = _contradictions(G[rows[p:]], P[p:, p:] + there, r)
@@ -81,13 +81,11 @@ def _improbable(degrees_of_freedom: int) -> float:
     return float(special.chdtri(degrees_of_freedom, both_tails))
 
 
-def _aligned(
-    source: FloatArray, own: FloatArray, target: FloatArray, there: FloatArray
-) -> FloatArray:
+def _aligned(source: FloatArray, own: FloatArray, target: KnownPoints) -> FloatArray:
     """Return the transform (4, 4) that aligns landmarks weighted by how well each is known."""
     variances = np.diagonal(own).reshape(len(source), -1).sum(axis=1)
-    variances = variances + np.trace(there, axis1=1, axis2=2) + JITTER_M2
-    return rigid_alignment(source, target, 1.0 / variances)
+    variances = variances + np.trace(target.covariances, axis1=1, axis2=2) + JITTER_M2
+    return rigid_alignment(source, target.points, 1.0 / variances)
 
 
 def _turn_std_rad(P: FloatArray, G: FloatArray, there: FloatArray, axes: EstimatedAxes) -> float:

@@ -11,7 +11,9 @@ The same format serves saved maps and surveyed ones. A surveyor writes no more t
 ``sigma`` is the standard deviation of each coordinate, metres; a saved map has the whole
 ``covariance`` (m²) instead, ``observations`` (how often each landmark was seen), and in its head
 the ``package_version`` and ``settings`` with which it was made. A tag may have an ``orientation``,
-a quaternion x y z w from its own axes, and its ``orientation_sigma``, rad, about each axis.
+a quaternion x y z w from its own axes, and its ``orientation_sigma``, rad, about each axis. Below
+the landmarks of a saved map a line says how their errors are correlated; see
+:mod:`.map_correlations`.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ from slam_observer_ros.common.yaml_files import (
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.known_map import map_correlations
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -79,7 +82,8 @@ def write_map(
 ) -> None:
     """Write a map, and with which settings it was made, if with any.
 
-    The file appears whole or not at all.
+    The file appears whole or not at all. Correlations between too many landmarks are left out,
+    with a warning.
 
     ``backup`` is a file to be a copy of the one that is replaced, once the new one is written.
 
@@ -98,12 +102,14 @@ def write_map(
             name: list(value) if isinstance(value, tuple) else value
             for name, value in dataclasses.asdict(settings).items()
         }
-    lines = [_on_one_line(landmark) for landmark in _as_mappings(landmark_map)]
+    landmarks = _as_mappings(landmark_map)
+    lines = [f'- {_on_one_line(landmark)}' for landmark in landmarks]
+    lines += map_correlations.as_lines(landmark_map.joint_covariance, landmarks)
     try:
         with unfinished_file(path) as file:
             yaml.safe_dump(head, file, sort_keys=False)
             file.write('landmarks:\n')
-            file.writelines(f'- {line}' for line in lines)
+            file.writelines(lines)
             file.flush()  # and a full disk shows before anything is replaced
             if backup is not None:
                 keep_copy(path, backup)
@@ -196,7 +202,7 @@ def _parse(content: Any) -> LandmarkMap:
     if version != FORMAT_VERSION:
         raise MapError(f'it has version {shown(version)}; this program reads {FORMAT_VERSION}')
     required = ('format', 'version', 'frame', 'landmarks')
-    _check_names('it', content, required, ('package_version', 'settings'))
+    _check_names('it', content, required, ('package_version', 'settings', 'correlations'))
     frame_id, rows = content['frame'], content['landmarks']
     _expect(
         isinstance(frame_id, str) and frame_id != '', f"'frame' is {shown(frame_id)}, not a name"
@@ -206,7 +212,7 @@ def _parse(content: Any) -> LandmarkMap:
     ids = [_landmark_id(row, index) for index, row in enumerate(rows)]
     for landmark_id, times in Counter(ids).items():
         _expect(times == 1, f'landmark {landmark_id} is there {times} times')
-    return LandmarkMap(
+    landmark_map = LandmarkMap(
         np.array(ids, dtype=np.int64),
         np.array([_position(row) for row in rows], dtype=np.float64).reshape(-1, 3),
         _covariances(rows),
@@ -214,6 +220,10 @@ def _parse(content: Any) -> LandmarkMap:
         frame_id,
         *_orientations(rows),
     )
+    if 'correlations' not in content:
+        return landmark_map
+    joint = map_correlations.parse(content['correlations'], rows, landmark_map.covariances)
+    return dataclasses.replace(landmark_map, joint_covariance=joint)
 
 
 def _landmark_id(row: Any, index: int) -> int:

@@ -18,11 +18,18 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 
 MAX_BYTES = 20_000_000
 
+LAYOUTS = "TagSLAM's files, with 'bodies', or apriltag_ros's, with 'tag_bundles'"
+
 COLUMNS = ('id', 'x', 'y', 'z', 'sigma')
 """Of a CSV file, in the order of one without a header; z and sigma may be left out."""
 
-Row = tuple[Any, FloatArray, Any]
-"""Id, position (3,) in the map, and standard deviation in metres, None for the default."""
+UNKNOWN_M = 10.0
+"""Standard deviation of a height that a table does not have."""
+
+Row = tuple[Any, FloatArray, FloatArray]
+"""Id, position (3,) in the map and its standard deviations (3,), metres; NaN is the default."""
+
+DEFAULT_SIGMAS_M = np.full(3, np.nan)
 
 
 def import_map(path: Path, frame_id: str, sigma_m: float) -> LandmarkMap:
@@ -37,8 +44,10 @@ def import_map(path: Path, frame_id: str, sigma_m: float) -> LandmarkMap:
         raise MapError(f"can't read {path}: {error.strerror}") from error
     except (YamlError, UnicodeDecodeError, csv.Error) as error:
         raise MapError(f'{path} is not valid: {error}') from error
-    except (MapError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (MapError, KeyError, ValueError) as error:
         raise MapError(f'{path}: {_reason(error)}') from error
+    except (TypeError, AttributeError) as error:  # a value in place of a list or mapping
+        raise MapError(f'{path}: it is not laid out as {LAYOUTS}') from error
     if not rows:
         raise MapError(f'{path}: there are no landmarks in it')
     return _as_map(path, rows, frame_id, sigma_m)
@@ -49,24 +58,39 @@ def _reason(error: Exception) -> str:
 
 
 def _csv_rows(path: Path) -> list[Row]:
-    with path.open(encoding='utf-8', newline='') as file:
-        lines = [[cell.strip() for cell in line] for line in csv.reader(file) if line]
-    lines = [line for line in lines if not line[0].startswith('#')]
+    with path.open(encoding='utf-8-sig', newline='') as file:  # with a mark, as Excel writes it
+        reader = csv.reader(file)
+        lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if line]
+    lines = [(number, line) for number, line in lines if not line[0].startswith('#')]
     names = list(COLUMNS)
-    if lines and not _is_number(lines[0][0]):
-        names = [cell.lower() for cell in lines.pop(0)]
-    rows = []
-    for number, line in enumerate(lines, 1):
-        cells = dict(zip(names, line, strict=False))
-        try:
-            position = [float(cells['x']), float(cells['y']), float(cells.get('z') or 0.0)]
-            sigma_m = float(cells['sigma']) if cells.get('sigma') else None
-            rows.append((int(cells['id']), np.array(position), sigma_m))
-        except KeyError as error:
-            raise MapError(f'there is no column {error}; it needs id, x and y') from error
-        except ValueError as error:
-            raise MapError(f'landmark {number}: {error}') from error
-    return rows
+    if lines and not _is_number(lines[0][1][0]):
+        names = [cell.lower() for cell in lines.pop(0)[1]]
+    if missing := {'id', 'x', 'y'} - set(names):
+        raise MapError(f"there is no column '{min(missing)}'; it needs id, x and y, with commas")
+    return [_csv_row(number, dict(zip(names, line, strict=False))) for number, line in lines]
+
+
+def _csv_row(number: int, cells: Mapping[str, str]) -> Row:
+    x, y, z, sigma_m = (_number(number, cells, name) for name in ('x', 'y', 'z', 'sigma'))
+    if x is None or y is None:
+        raise MapError(f'line {number}: it needs id, x and y, with commas between them')
+    try:
+        landmark_id = int(cells['id'])
+    except ValueError as error:
+        raise MapError(f"line {number}: the id '{cells['id']}' is no whole number") from error
+    sigma_m = np.nan if sigma_m is None else sigma_m
+    sigmas_m = np.array([sigma_m, sigma_m, UNKNOWN_M if z is None else sigma_m])
+    return landmark_id, np.array([x, y, z or 0.0]), sigmas_m
+
+
+def _number(line: int, cells: Mapping[str, str], name: str) -> float | None:
+    """Return the number in a column; None if there is nothing."""
+    text = cells.get(name)
+    if not text:
+        return None
+    if not _is_number(text) or not np.isfinite(float(text)):
+        raise MapError(f"line {line}: {name} is '{text}', which is not a finite number")
+    return float(text)
 
 
 def _is_number(text: str) -> bool:
@@ -85,10 +109,7 @@ def _yaml_rows(path: Path) -> list[Row]:
         return [row for body in content for row in _tagslam_rows(body)]
     if isinstance(content, Mapping) and 'tag_bundles' in content:
         return [row for bundle in content['tag_bundles'] for row in _bundle_rows(bundle)]
-    raise MapError(
-        "it has neither 'bodies', as TagSLAM, nor 'tag_bundles', as apriltag_ros; tables are "
-        'named .csv'
-    )
+    raise MapError(f'it is not laid out as {LAYOUTS}; tables are named .csv')
 
 
 def _tagslam_rows(named: Mapping[str, Any]) -> list[Row]:
@@ -98,7 +119,7 @@ def _tagslam_rows(named: Mapping[str, Any]) -> list[Row]:
         return []
     in_map = _tagslam_pose(body['pose']) if 'pose' in body else np.eye(4)
     return [
-        (tag['id'], (in_map @ _tagslam_pose(tag['pose']))[:3, 3], None)
+        (tag['id'], (in_map @ _tagslam_pose(tag['pose']))[:3, 3], DEFAULT_SIGMAS_M)
         for tag in body.get('tags') or ()
         if 'pose' in tag
     ]
@@ -115,7 +136,7 @@ def _tagslam_pose(written: Mapping[str, Any]) -> FloatArray:
 
 def _bundle_rows(bundle: Mapping[str, Any]) -> list[Row]:
     return [
-        (tag['id'], np.array([float(tag.get(axis, 0.0)) for axis in 'xyz']), None)
+        (tag['id'], np.array([float(tag.get(axis, 0.0)) for axis in 'xyz']), DEFAULT_SIGMAS_M)
         for tag in bundle['layout']
     ]
 
@@ -129,9 +150,10 @@ def _as_map(path: Path, rows: list[Row], frame_id: str, sigma_m: float) -> Landm
         if ids.count(landmark_id) > 1:
             raise MapError(f'{path}: landmark {landmark_id} is there more than once')
     points = np.array([position for _, position, _ in rows])
-    sigmas_m = np.array([sigma_m if sigma is None else sigma for _, _, sigma in rows])
-    if not np.isfinite(points).all() or not (np.isfinite(sigmas_m) & (sigmas_m >= 0.0)).all():
-        raise MapError(f'{path}: a position or sigma is not finite, or sigma is negative')
-    covariances = sigmas_m[:, None, None] ** 2 * np.eye(3)
+    sigmas_m = np.array([sigmas for _, _, sigmas in rows])
+    sigmas_m[np.isnan(sigmas_m)] = sigma_m
+    if not np.isfinite(points).all() or not (sigmas_m >= 0.0).all():
+        raise MapError(f'{path}: a position is not finite, or sigma is negative')
+    covariances = sigmas_m[:, :, None] ** 2 * np.eye(3)
     counts = np.zeros(len(ids), dtype=np.int64)
     return LandmarkMap(np.array(ids, dtype=np.int64), points, covariances, counts, frame_id)

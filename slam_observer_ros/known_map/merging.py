@@ -11,24 +11,24 @@ from __future__ import annotations
 from contextlib import suppress
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import orth, solve_triangular
 
 from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.matrices import (
-    block_diagonal,
-    diagonal_blocks,
-    transpose,
-)
+from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import find_transform
 from slam_observer_ros.observer.gauge import JITTER_M2
+from slam_observer_ros.observer.known_points import KnownPoints
 from slam_observer_ros.state.state import State
 
 ROUNDING = 1e-14
 """Least variance that is distinguished from zero, as a share of the sum of all variances."""
+
+RANK_TOLERANCE = 1e-8
+"""Share of its largest singular value below which G has none: few landmarks leave turns open."""
 
 
 def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray | None) -> None:
@@ -38,7 +38,9 @@ def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray |
     and m²; None for an exact pose.
     """
     state.set_pose(state.observer.pose, pose_covariance)
-    _complete(state, known)
+    if state.settings.localization_mode != 'fixed':
+        state.filter.add_known(_in_reference_frame(state, known))
+    _complete(state, known, known)
 
 
 def enter_map(state: State, known: LandmarkMap) -> bool:
@@ -55,45 +57,43 @@ def enter_map(state: State, known: LandmarkMap) -> bool:
     if found is None:
         return False
     state.observer.reference_pose, agree = found
-    # Landmarks that agree are merged, …
-    merged = shared[agree]
-    _merge(state, rows[merged], known.select(merged))
-    # … others removed, as are all that the map does not have where it does not grow, …
+    # Landmarks that agree are merged, others removed, as are all that the map does not have where
+    # it does not grow, …
     if state.settings.localization_mode == 'off':
         state.remove(rows[shared[~agree]])
     else:
-        state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[merged]))
-    # … and those that only the map has are added.
+        state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[shared[agree]]))
     _renumber(state, known)
-    _complete(state, known)
+    # … and those that only the map has are added.
+    _merge(state, known)
     return True
 
 
-def shape_covariances(state: State, rows: IntArray) -> FloatArray | None:
-    """Return covariances (m, 3, 3) of landmarks ``rows`` in a frame of their own, world axes, m².
+def joint_covariance(state: State, rows: IntArray, is_own_frame: bool) -> FloatArray | None:
+    """Return the covariance (3 m, 3 m) of landmarks ``rows`` together, world axes, m².
 
-    A map's frame starts where the robot did, and all landmarks share the error of how they lie to
-    that pose. Who loads the map knows it by its landmarks alone: what remains is the error of
-    its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None
-    where the gains know no covariances.
+    A frame of one's own starts where the robot did, and all landmarks share the error of how they
+    lie to that pose. Who loads the map knows it by its landmarks alone: what remains is the error
+    of its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None
+    where the gains know no joint covariance.
     """
     m, axes = len(rows), state.axes
-    k, R = axes.point, state.observer.reference_pose[:3, :3]
-    joint, points = state.filter.joint, state.filter.points[rows]
-    with_pose = None if joint is None or m == 0 else joint.with_pose(rows, points)
-    if with_pose is None:
-        of_all = state.landmark_covariances()
-        return None if of_all is None else of_all[rows]
-    P = with_pose[axes.p :, axes.p :]
-    G = axes.output_matrix(points - points.mean(axis=0)).reshape(m * k, -1)
-    whitened = solve_triangular(_lower_root(P), G, lower=True, check_finite=False)
-    information = whitened.T @ whitened
-    G_each = G.reshape(m, k, -1)
-    common = G_each @ np.linalg.pinv(information, hermitian=True) @ transpose(G_each)
-    own = np.zeros((m, 3, 3))
-    own[:, :k, :k] = diagonal_blocks(P, k) - common
-    world: FloatArray = R @ own @ R.T
-    return world
+    k, points = axes.point, state.filter.points[rows]
+    joint = state.filter.joint
+    with_pose = None if joint is None else joint.with_pose(rows, points)
+    if with_pose is None or m == 0:
+        return None if with_pose is None else np.zeros((0, 0))
+    # As the square of a root, so that rounding makes no variance negative, however small it is.
+    L = _lower_root(with_pose[axes.p :, axes.p :])
+    if is_own_frame:
+        G = axes.output_matrix(points - points.mean(axis=0)).reshape(m * k, -1)
+        Q = orth(solve_triangular(L, G, lower=True, check_finite=False), RANK_TOLERANCE)
+        L -= (L @ Q) @ Q.T
+    root = np.zeros((m, 3, m * k))
+    root[:, :k] = L.reshape(m, k, m * k)
+    world_root = (state.observer.reference_pose[:3, :3] @ root).reshape(3 * m, m * k)
+    P: FloatArray = world_root @ world_root.T
+    return P
 
 
 def _lower_root(P: FloatArray) -> FloatArray:
@@ -113,9 +113,8 @@ def _find_frame(
     covariance = state.filter.joint_covariance(rows)
     if covariance is None:
         covariance = _of_constant_gains(state, rows)
-    covariances = known.covariances_or(state.settings.map_noise)
-    points = state.filter.points[rows]
-    return find_transform(points, covariance, known.world_points, covariances, axes)
+    target = known.points_in(np.eye(4), state.settings.map_noise)
+    return find_transform(state.filter.points[rows], covariance, target, axes)
 
 
 def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
@@ -128,12 +127,15 @@ def _of_constant_gains(state: State, rows: IntArray) -> FloatArray:
     return covariance
 
 
-def _merge(state: State, rows: IntArray, known: LandmarkMap) -> None:
-    """Correct the estimate by what a map knows of the landmarks at ``rows``."""
-    targets, covariances = _in_reference_frame(state, known)
-    r = state.filter.points[rows] - targets
-    state.filter.anchor(rows, r, covariances)
-    state.landmarks.counts[rows] += _counts(known, state)
+def _merge(state: State, known: LandmarkMap) -> None:
+    """Correct the estimate by what a map knows of landmarks that both have; add its others."""
+    rows = state.landmarks.rows_of(known.ids)
+    merged, others = np.flatnonzero(rows >= 0), np.flatnonzero(rows < 0)
+    rows, is_exact = rows[merged], state.settings.localization_mode == 'fixed'
+    taken = merged if is_exact else np.append(merged, others)
+    state.filter.enter_map(rows, _in_reference_frame(state, known.select(taken)))
+    state.landmarks.counts[rows] += _counts(known.select(merged), state)
+    _complete(state, known, known.select(others))
 
 
 def _counts(known: LandmarkMap, state: State) -> IntArray:
@@ -149,17 +151,13 @@ def _renumber(state: State, known: LandmarkMap) -> None:
     state.landmarks.renumber(own, np.max(taken, initial=0) + 1 + np.arange(len(own)))
 
 
-def _complete(state: State, known: LandmarkMap) -> None:
-    """Append what a map has beyond the estimate, now that both are in one frame."""
-    observer, mode = state.observer, state.settings.localization_mode
-    new = known.select(state.landmarks.rows_of(known.ids) < 0)
-    observer.set_reference(observer.points)
-    state.landmarks.add_known(new.ids, _counts(new, state))
+def _complete(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
+    """Go on in a map, ``added`` the part of it that the state did not have."""
+    mode = state.settings.localization_mode
+    state.landmarks.add_known(added.ids, _counts(added, state))
     state.is_mapping = mode == 'off'
     if mode == 'fixed':
         _fix(state, known)
-    else:
-        state.filter.add_known(*_in_reference_frame(state, new))
     _take_orientations(state, known)
     state.forget_past('the pose in the loaded map was found')
 
@@ -179,13 +177,11 @@ def _fix(state: State, known: LandmarkMap) -> None:
     """Put the landmarks exactly where the map has them, and leave them there."""
     order = np.argsort(known.ids)
     rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
-    y_ref, covariances = _in_reference_frame(state, known.select(rows))
-    state.fix_landmarks(y_ref, covariances)
+    exact = _in_reference_frame(state, known.select(rows))
+    state.fix_landmarks(exact.points, exact.covariances)
 
 
-def _in_reference_frame(state: State, known: LandmarkMap) -> tuple[FloatArray, FloatArray]:
-    """Return positions (m, 3) and covariances (m, 3, 3) of a map in the frame of P°."""
+def _in_reference_frame(state: State, known: LandmarkMap) -> KnownPoints:
+    """Return what a map knows of positions in the frame of P°."""
     back = se3.inverse(state.observer.reference_pose)
-    R = back[:3, :3]
-    covariances: FloatArray = R @ known.covariances_or(state.settings.map_noise) @ R.T
-    return se3.transform(back, known.world_points), covariances
+    return known.points_in(back, state.settings.map_noise)

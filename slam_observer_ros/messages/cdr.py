@@ -18,8 +18,11 @@ Buffer: TypeAlias = bytes | bytearray | memoryview
 ENCAPSULATION_BYTES = 4
 MAX_PADDING_BYTES = 3
 
+_UINT16 = {'<': struct.Struct('<H'), '>': struct.Struct('>H')}
+_INT32 = {'<': struct.Struct('<i'), '>': struct.Struct('>i')}
 _UINT32 = {'<': struct.Struct('<I'), '>': struct.Struct('>I')}
 _STAMP = {'<': struct.Struct('<iI'), '>': struct.Struct('>iI')}
+_INT64 = {'<': np.dtype('<i8'), '>': np.dtype('>i8')}
 _FLOAT32 = {'<': np.dtype('<f4'), '>': np.dtype('>f4')}
 _FLOAT64 = {'<': np.dtype('<f8'), '>': np.dtype('>f8')}
 
@@ -53,6 +56,16 @@ class CdrReader:
         """Read one byte (uint8 or bool)."""
         return self._raw[self._take(1, 1)]
 
+    def uint16(self) -> int:
+        """Read a uint16."""
+        value: int = _UINT16[self._byte_order].unpack_from(self._raw, self._take(2, 2))[0]
+        return value
+
+    def int32(self) -> int:
+        """Read an int32."""
+        value: int = _INT32[self._byte_order].unpack_from(self._raw, self._take(4, 4))[0]
+        return value
+
     def uint32(self) -> int:
         """Read a uint32; also the length of a sequence."""
         value: int = _UINT32[self._byte_order].unpack_from(self._raw, self._take(4, 4))[0]
@@ -78,6 +91,13 @@ class CdrReader:
     def header(self) -> tuple[int, str]:
         """Read a std_msgs/Header: stamp in nanoseconds and frame id."""
         return self.stamp_ns(), self.string()
+
+    def int64(self, count: int) -> IntArray:
+        """Read ``count`` int64 values, shape (count,)."""
+        if count == 0:  # CDR puts no alignment bytes before an empty sequence.
+            return np.zeros(0, dtype=np.int64)
+        start = self._take(8 * count, alignment=8)
+        return np.frombuffer(self._raw, _INT64[self._byte_order], count, start).astype(np.int64)
 
     def float64(self, count: int) -> FloatArray:
         """Read ``count`` float64 values, shape (count,)."""

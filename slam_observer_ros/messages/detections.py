@@ -15,14 +15,10 @@ import numpy as np
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
-from slam_observer_ros.messages.point_clouds import without_unmeasured
-from slam_observer_ros.messages.poses_and_velocities import (
-    PoseMessage,
-    QUATERNION_NORM_TOLERANCE,
-)
+from slam_observer_ros.messages.observed_poses import observed_poses, orientations_of
+from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 
 _POSE = 7
 _COVARIANCE = 36
@@ -54,10 +50,7 @@ def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
     poses = reader.float64(_POSE * reader.uint32()).reshape(-1, _POSE)
     reader.finish()
     ids = np.full(len(poses), UNKNOWN_ID, dtype=np.int64)
-    event = ObservationEvent(
-        stamp_ns, ids, poses[:, :3], orientations=orientations_of(poses[:, 3:])
-    )
-    return Measurement(frame_id, without_unmeasured(event))
+    return observed_poses(frame_id, stamp_ns, ids, poses)
 
 
 def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
@@ -74,18 +67,8 @@ def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
     reader.finish()
     ids = np.array([landmark_id for landmark_id, _, _ in detections], dtype=np.int64)
     poses = np.array([pose for _, pose, _ in detections]).reshape(-1, _POSE)
-    whole = np.array([covariance for _, _, covariance in detections]).reshape(-1, 6, 6)
-    covariances, turns = whole[:, :3, :3], whole[:, 3:, 3:]
-    is_known = len(whole) > 0 and bool(covariances.any(axis=(1, 2)).all())
-    event = ObservationEvent(
-        stamp_ns,
-        ids,
-        poses[:, :3],
-        covariances if is_known else None,
-        orientations=orientations_of(poses[:, 3:]),
-        orientation_covariances=turns if turns.any() else None,
-    )
-    return Measurement(frame_id, without_unmeasured(event))
+    covariances = np.array([covariance for _, _, covariance in detections]).reshape(-1, 6, 6)
+    return observed_poses(frame_id, stamp_ns, ids, poses, covariances)
 
 
 def decode_apriltags(raw: Buffer, _receive_stamp_ns: int = 0) -> TagDetections:
@@ -121,21 +104,6 @@ def observed_tags(
         _observation(frame_id, stamp_ns, list(group))
         for (frame_id, stamp_ns), group in groupby(seen, key=_camera_and_stamp)
     ]
-
-
-def orientations_of(quaternions: FloatArray) -> FloatArray | None:
-    """Return rotations (m, 3, 3) of quaternions (m, 4) xyzw, zero where they are unknown.
-
-    So is one that is exactly no turn, as messages have it that nobody filled in. None if all are.
-    """
-    with np.errstate(invalid='ignore', over='ignore'):
-        norms = np.linalg.norm(quaternions, axis=1)
-        known = (np.abs(norms - 1.0) < QUATERNION_NORM_TOLERANCE) & quaternions[:, :3].any(axis=1)
-    if not known.any():
-        return None
-    R = np.zeros((len(quaternions), 3, 3))
-    R[known] = so3.from_quaternion(quaternions[known])
-    return R
 
 
 def no_tags(tag_frame_prefix: str, frames: Iterable[str]) -> str:
@@ -205,10 +173,10 @@ def _read_result(reader: CdrReader) -> tuple[str, FloatArray, FloatArray]:
 def _read_apriltag(reader: CdrReader) -> tuple[int, str]:
     """Read an apriltag_msgs/AprilTagDetection: id and family."""
     family = reader.string()
-    landmark_id = reader.uint32()
-    reader.uint32()  # hamming distance
+    landmark_id = reader.int32()
+    reader.int32()  # hamming distance
     reader.float32(2)  # goodness, decision margin
     reader.float64(_CORNERS + _HOMOGRAPHY)
-    if landmark_id >= 2**31:
-        raise MessageError(f'negative tag id {landmark_id - 2**32}')
+    if landmark_id < 0:
+        raise MessageError(f'negative tag id {landmark_id}')
     return landmark_id, family

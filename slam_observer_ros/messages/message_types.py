@@ -11,6 +11,11 @@ from typing import TypeAlias
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.detections import decode_detections, decode_pose_array
+from slam_observer_ros.messages.fiducial_arrays import (
+    decode_aruco_detection,
+    decode_aruco_markers,
+    decode_isaac_apriltags,
+)
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import decode_point_cloud, decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import (
@@ -30,7 +35,6 @@ IMU = 'sensor_msgs/msg/Imu'  # an angular velocity
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'  # poses of sensors, and landmarks if they are fiducials
 APRILTAGS = 'apriltag_msgs/msg/AprilTagDetectionArray'  # ids of fiducials that /tf has
 POSE_ARRAY = 'geometry_msgs/msg/PoseArray'  # landmarks without ids; it may hold other things
-DETECTIONS = 'vision_msgs/msg/Detection3DArray'  # landmarks with ids or without
 
 VelocityDecoder: TypeAlias = Callable[[Buffer, int], Measurement[VelocityEvent]]
 """From the serialised message and its receive time, which only unstamped messages use."""
@@ -56,9 +60,13 @@ CLOUD_DECODERS: dict[str, ObservationDecoder] = {
 
 DETECTION_DECODERS: dict[str, ObservationDecoder] = {
     POSE_ARRAY: decode_pose_array,
-    DETECTIONS: decode_detections,
+    'vision_msgs/msg/Detection3DArray': decode_detections,
+    'isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray': decode_isaac_apriltags,
+    'aruco_opencv_msgs/msg/ArucoDetection': decode_aruco_detection,
+    'ros2_aruco_interfaces/msg/ArucoMarkers': decode_aruco_markers,
+    'aruco_interfaces/msg/ArucoMarkers': decode_aruco_markers,
 }
-"""Types, beside clouds, that give landmark observations."""
+"""Types, beside clouds, that give landmark observations by themselves."""
 
 POSE_DECODERS: dict[str, PoseDecoder] = {
     'geometry_msgs/msg/PoseStamped': decode_pose_stamped,

@@ -96,11 +96,6 @@ def is_measured(points: FloatArray) -> BoolArray:
     return measured
 
 
-def without_unmeasured(event: ObservationEvent) -> ObservationEvent:
-    """Return an observation without the points that weren't measured."""
-    return event.select(is_measured(event.points))
-
-
 def scan_problem(event: ObservationEvent) -> str:
     """Return why a message's observation is a lidar's scan, not landmarks; empty if it isn't."""
     unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))

@@ -10,13 +10,10 @@ from numpy.typing import NDArray
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.geometry import so3
 from slam_observer_ros.messages.cdr import CdrBlockReader
 from slam_observer_ros.messages.message_types import ODOMETRY
-from slam_observer_ros.messages.poses_and_velocities import (
-    pose_matrices,
-    PoseMessage,
-    QUATERNION_NORM_TOLERANCE,
-)
+from slam_observer_ros.messages.poses_and_velocities import pose_matrices, PoseMessage
 
 _NEARLY = 1.0 - 1e-9
 """Of a limit: what is below that is below the limit, however it is rounded."""
@@ -85,7 +82,7 @@ def decode_poses(message_type: str, data: NDArray[np.uint8]) -> PoseBlock:
     with np.errstate(over='ignore'):
         norms = np.sqrt((block.quaternions**2).sum(axis=1))
     # Written so that NaN is refused too.
-    if not (np.abs(norms - 1.0) < _NEARLY * QUATERNION_NORM_TOLERANCE).all():
+    if not (np.abs(norms - 1.0) < _NEARLY * so3.QUATERNION_NORM_TOLERANCE).all():
         raise MessageError('a quaternion is no rotation, or nearly none')
     return block
 

@@ -20,8 +20,6 @@ from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.measurement import Measurement
 
 _ANGULAR_FIRST = np.array([3, 4, 5, 0, 1, 2])
-QUATERNION_NORM_TOLERANCE = 0.1
-"""How far the norm of a quaternion that is a rotation may be from 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,5 +216,5 @@ def _quaternion_problem(quaternion: FloatArray) -> str:
     """Return why a quaternion is no rotation; empty if it is one."""
     norm = math.hypot(*quaternion)  # which does not overflow
     # Written so that NaN is refused too.
-    is_turn = abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
+    is_turn = abs(norm - 1.0) < so3.QUATERNION_NORM_TOLERANCE
     return '' if is_turn else f'quaternion of norm {norm:.3g}, not 1'

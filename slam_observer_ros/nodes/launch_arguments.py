@@ -41,6 +41,14 @@ def check_packages(*names: str) -> None:
             raise RuntimeError(f'{name} is not installed: {install_command(name)}') from error
 
 
+def is_true(given: Mapping[str, str], name: str) -> bool:
+    """Return what a launch argument says; raise a RuntimeError if that is neither yes nor no."""
+    written = given[name].lower()
+    if written not in ('true', '1', 'false', '0'):
+        raise RuntimeError(f"{name}: '{given[name]}' is neither true nor false")
+    return written in ('true', '1')
+
+
 def numbers(given: Mapping[str, str], name: str, count: int) -> list[float]:
     """Return the numbers of a launch argument; raise a RuntimeError unless there are ``count``."""
     words = given[name].replace(',', ' ').split()
@@ -49,5 +57,6 @@ def numbers(given: Mapping[str, str], name: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count:
-        raise RuntimeError(f"{name}: '{given[name]}' is not {count} numbers")
+        wanted = 'a number' if count == 1 else f'{count} numbers'
+        raise RuntimeError(f"{name}: '{given[name]}' is not {wanted}")
     return values

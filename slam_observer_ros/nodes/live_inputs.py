@@ -6,7 +6,7 @@ The program of ``slam-observer doctor``: ``python -m slam_observer_ros.nodes.liv
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import json
 import sys
 import time
@@ -20,7 +20,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
-from slam_observer_ros.messages.detections import decode_apriltags
+from slam_observer_ros.messages.detections import decode_apriltags, observed_tags
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
@@ -29,8 +29,9 @@ from slam_observer_ros.messages.message_types import (
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
-from slam_observer_ros.messages.poses_and_velocities import decode_imu
+from slam_observer_ros.messages.poses_and_velocities import decode_imu, decode_transforms
 from slam_observer_ros.nodes.message_classes import message_class
+from slam_observer_ros.settings.input_settings import InputSettings
 
 DISCOVERY_S = 1.0
 """Time after which publishers have been found."""
@@ -38,11 +39,7 @@ DISCOVERY_S = 1.0
 ROLES: dict[str, tuple[str, str]] = {
     **dict.fromkeys(VELOCITY_DECODERS, ('twist', '')),
     IMU: ('imu', 'use_imu:=true'),
-    **dict.fromkeys(CLOUD_DECODERS, ('landmarks', '')),
-    **{
-        name: ('landmarks', f'landmarks_type:={name.rpartition("/")[2]}')
-        for name in (*DETECTION_DECODERS, APRILTAGS)
-    },
+    **dict.fromkeys((*CLOUD_DECODERS, *DETECTION_DECODERS, APRILTAGS), ('landmarks', '')),
     TRANSFORMS: ('/tf', ''),
 }
 """Types of messages: the node's topic for them, and what has to be set."""
@@ -65,15 +62,25 @@ class HeardTopic:
     problem: str = ''
     messages: int = 0
     last: bytes = b''
+    fiducials: set[int] = field(default_factory=set)
+
+    @property
+    def role(self) -> str:
+        """The node's topic for this one."""
+        is_static = self.type_name == TRANSFORMS and self.name.endswith('/tf_static')
+        return '/tf_static' if is_static else ROLES[self.type_name][0]
 
     def take(self, raw: bytes) -> None:
         """Take in a message."""
         self.messages += 1
         self.last = raw
+        if self.type_name == TRANSFORMS:
+            for seen in observed_tags(decode_transforms(raw), InputSettings.tag_frame_prefix):
+                self.fiducials |= set(seen.event.ids.tolist())
 
     def text(self, seconds: float) -> str:
         """Say what comes at which rate, and how the node gets it."""
-        role, setting = ROLES[self.type_name]
+        role, setting = self.role, ROLES[self.type_name][1]
         remapping = '' if self.name == f'/{role.lstrip("/")}' else f'-r {role}:={self.name}'
         needed = ' '.join(part for part in (remapping, setting and f'-p {setting}') if part)
         rate = f'{self.messages / seconds:.1f} Hz' if self.messages else 'no message'
@@ -82,6 +89,8 @@ class HeardTopic:
         return ', '.join(part for part in found if part)
 
     def _content(self) -> str:
+        if self.fiducials:
+            return f'{len(self.fiducials)} fiducials, as landmarks with -p landmarks_type:=tf'
         decode = _DECODERS.get(self.type_name)
         if not self.messages or decode is None:
             return ''
@@ -118,7 +127,7 @@ def main() -> int:
         {
             'topic': topic.name,
             'type': topic.type_name,
-            'role': ROLES[topic.type_name][0],
+            'role': topic.role,
             'rate_hz': topic.messages / seconds,
             'text': topic.text(seconds),
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from slam_observer_ros.nodes.launch_arguments import numbers
+from slam_observer_ros.nodes.launch_arguments import is_true, numbers
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of the robot'),
@@ -17,6 +17,7 @@ ARGUMENTS = {
     'imu': ('imu', 'topic of the angular velocity'),
     'odometry': ('~/odometry', 'topic of the estimate'),
     'pose': ('amcl_pose', 'topic of the pose'),
+    'base_frame': ('', 'frame of the robot; empty: as params_file says'),
     'map_file': ('', 'landmarks to be localised among; empty: as params_file says'),
     'tag_size': ('', 'edge of square tags, metres; empty: as params_file says'),
     'map': ('', 'occupancy grid for a map server, a YAML file; empty: none is started'),
@@ -28,11 +29,6 @@ EXECUTABLE, NAME = 'lifecycle_observer_node', 'observer_node'
 BOND_PERIOD_S = 0.25
 
 
-def is_true(written: str) -> bool:
-    """Return what a launch argument says."""
-    return written.lower() in ('true', '1')
-
-
 def parameters(given: Mapping[str, str], has_bond: bool) -> dict[str, object]:
     """Return the parameters beside those of params_file.
 
@@ -40,12 +36,11 @@ def parameters(given: Mapping[str, str], has_bond: bool) -> dict[str, object]:
     """
     is_managed = bool(given['map'])
     chosen: dict[str, object] = {
-        'use_sim_time': is_true(given['use_sim_time']),
-        'autostart_node': is_true(given['autostart']) and not is_managed,
+        'use_sim_time': is_true(given, 'use_sim_time'),
+        'autostart_node': is_true(given, 'autostart') and not is_managed,
         'bond_heartbeat_period': BOND_PERIOD_S if is_managed and has_bond else 0.0,
     }
-    if given['map_file']:
-        chosen['map_file'] = given['map_file']
+    chosen |= {name: given[name] for name in ('base_frame', 'map_file') if given[name]}
     if given['tag_size']:
         (chosen['tag_size'],) = numbers(given, 'tag_size', 1)
     return chosen

@@ -37,6 +37,11 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
         self._refuse_impossible_transitions()
         if read_settings(self, ManagedNodeSettings).autostart_node:
             self._start_by_itself()
+        else:
+            self.get_logger().info(
+                'not configured: waiting for its transitions, by a lifecycle manager or '
+                'ros2 lifecycle set'
+            )
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Create all parts."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from functools import cache
 import importlib
+from importlib.util import find_spec
 import os
 from typing import Any
 
@@ -20,8 +21,14 @@ def message_class(type_name: str) -> Any:
         return getattr(importlib.import_module(f'{package}.msg'), name)
     except ImportError as error:
         raise ParameterError(
-            f'{type_name} needs the package {package}: {install_command(package)}'
+            f'{type_name} needs the package {package}: {install_command(package)}, or source the '
+            'workspace that has it'
         ) from error
+
+
+def is_installed(type_name: str) -> bool:
+    """Return whether the package of a message type is there; it is not imported."""
+    return find_spec(type_name.partition('/')[0]) is not None
 
 
 def install_command(package: str) -> str:

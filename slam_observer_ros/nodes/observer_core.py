@@ -152,19 +152,27 @@ class ObserverCore:
     def _create_timers(self, publish_rate_hz: float) -> list[Timer]:
         # A steady clock: with use_sim_time the ROS clock may stand still or jump back.
         create = partial(self._node.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        # These two run only while something waits, the others always.
+        # One of each period: rclpy's executor warns of a clock with eight timers or more. The
+        # first two run only while something waits, the others always.
         self._publish_timer = create(1.0 / publish_rate_hz, self._publish_waiting)
         self._retry_timer = create(RETRY_PERIOD_S, self._retry)
         return [
             self._publish_timer,
             self._retry_timer,
-            create(OVERVIEW_PERIOD_S, self._publisher.publish_overview),
-            create(OVERVIEW_PERIOD_S, self._maps.keep_recent),
+            create(CHECK_PERIOD_S, self._check),
+            create(OVERVIEW_PERIOD_S, self._publish_overview),
             create(DIAGNOSTICS_PERIOD_S, self._diagnostics.publish),
-            create(CHECK_PERIOD_S, self._localisation.publish),
             create(KEEP_PERIOD_S, self._kept_pose.keep),
-            *(create(CHECK_PERIOD_S, source.check_publishers) for source in self._inputs),
         ]
+
+    def _check(self) -> None:
+        for source in self._inputs:
+            source.check_publishers()
+        self._localisation.publish()
+
+    def _publish_overview(self) -> None:
+        self._publisher.publish_overview()
+        self._maps.keep_recent()
 
     def _publish_new(self, source: str) -> None:
         """Publish what an input has given if it is due, else a little later."""

@@ -83,7 +83,7 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
     try:
         node = make_node()
     except REFUSALS as error:
-        get_logger('slam_observer_ros').fatal(str(error))
+        get_logger('slam_observer_ros').fatal(_reason(error))
         return 2
     has_ended = threading.Event()
     if hasattr(node, 'end_in_haste'):
@@ -101,6 +101,14 @@ def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:
         exit_code = _destroy(node)
         has_ended.set()
     return exit_code
+
+
+def _reason(error: Exception) -> str:
+    """Return what is wrong, without the words that rclpy has around it."""
+    text = str(error)
+    if isinstance(error, SlamObserverError):
+        return text
+    return text.partition('Reason: ')[2].rpartition(': ')[0] or text
 
 
 def _executor() -> Executor:

@@ -15,6 +15,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.observer.known_points import KnownPoints
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
@@ -95,9 +96,9 @@ class Filter:
         """Append landmarks seen for the first time at ``points``."""
         self.observer.add_landmarks(points)
 
-    def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Append landmarks that a map has at ``y_ref`` (m, 3), reference frame."""
-        self.observer.add_reference_landmarks(y_ref)
+    def add_known(self, known: KnownPoints) -> None:
+        """Append landmarks that a map knows, reference frame; their errors may be correlated."""
+        self.observer.add_reference_landmarks(known.points)
 
     def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
         """Take landmarks for new ones, seen for the first time at ``points``."""
@@ -132,6 +133,19 @@ class Filter:
         ``r`` (m, 3) is estimated minus known, reference frame; covariances are of the known ones.
         """
         raise NotImplementedError
+
+    def enter_map(self, rows: IntArray, known: KnownPoints) -> None:
+        """Move the estimate to where a map has landmarks ``rows`` (m,), and append its others.
+
+        ``known`` (m + …) are these m in the reference frame, then the others. Where the filter
+        knows no joint covariance the map's errors are taken to be independent.
+        """
+        m = len(rows)
+        of_rows, others = (known.select(part) for part in np.split(np.arange(len(known)), [m]))
+        r = self.points[rows] - of_rows.points
+        self.anchor(rows, r, of_rows.covariances)
+        self.observer.set_reference(self.observer.points)
+        self.add_known(others)
 
     # What is known of the errors
 

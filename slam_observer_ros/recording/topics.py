@@ -10,7 +10,7 @@ from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
-    DETECTIONS,
+    DETECTION_DECODERS,
     IMU,
     ODOMETRY,
     POSE_ARRAY,
@@ -198,7 +198,7 @@ _IMU = _Role('Imu', '--imu', (IMU,), False, lambda _name: 0)
 _LANDMARKS = _Role(
     'landmark',
     '--landmarks-topic',
-    (*CLOUD_DECODERS, DETECTIONS, APRILTAGS),
+    (*CLOUD_DECODERS, APRILTAGS, *(name for name in DETECTION_DECODERS if name != POSE_ARRAY)),
     False,
     _landmark_rank,
     types_by_name=(POSE_ARRAY, TRANSFORMS),

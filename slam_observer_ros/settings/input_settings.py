@@ -37,8 +37,8 @@ class InputSettings:
     )
     landmarks_type: str = parameter(
         AUTO,
-        'Message type on landmarks; auto takes the type found on the topic, in the node only if '
-        'it is a cloud or PoseArray; tf takes fiducials that a detector publishes on /tf',
+        'Message type on landmarks; auto takes the type found on the topic, tf takes fiducials '
+        'that a detector publishes on /tf',
         choices=(
             AUTO,
             'PointCloud',
@@ -46,6 +46,8 @@ class InputSettings:
             'PoseArray',
             'Detection3DArray',
             'AprilTagDetectionArray',
+            'ArucoDetection',
+            'ArucoMarkers',
             ON_TF,
         ),
         basic=True,

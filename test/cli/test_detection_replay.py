@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 import re
 
 from command_line import CommandLine
@@ -75,12 +76,23 @@ def apriltags(seen):
     return detector.apriltags(seen_tags, CAMERA_FRAME, seen.stamp_ns)
 
 
+def markers(build, seen):
+    found = [
+        (int(number), point, detector.NO_TURN)
+        for number, point in zip(seen.ids, seen.points, strict=True)
+    ]
+    return build(found, CAMERA_FRAME, seen.stamp_ns)
+
+
 MESSAGES = {
     '/landmarks': cloud,
     '/nameless': lambda seen: cloud(seen, ids=-1),
     '/poses': lambda seen: detector.pose_array(seen.points, CAMERA_FRAME, seen.stamp_ns),
     '/boxes': boxes,
     '/detections': apriltags,
+    '/aruco_detections': partial(markers, detector.aruco_detection),
+    '/aruco_markers': partial(markers, detector.aruco_markers),
+    '/tag_detections': partial(markers, detector.isaac_apriltags),
     '/tf': lambda seen: tags(seen, 'tag36h11:'),
     '/tags/tf': lambda seen: tags(seen, 'dock'),
 }
@@ -121,6 +133,9 @@ def recordings(tmp_path_factory):
         'poses': ['/poses'],
         'boxes': ['/boxes'],
         'apriltag': ['/detections', '/tf'],
+        'aruco_opencv': ['/aruco_detections'],
+        'ros2_aruco': ['/aruco_markers', '/poses'],
+        'isaac': ['/tag_detections'],
         'two': ['/detections', '/boxes'],
         'unplaced': ['/detections'],
     }
@@ -163,6 +178,12 @@ def assert_same(actual, expected):
         ('apriltag', ('--set', 'landmarks_type=AprilTagDetectionArray')),
         ('apriltag', ('--set', 'landmarks_type=tf')),
         ('apriltag', ('--landmarks-topic', '/tf')),
+        ('aruco_opencv', ()),
+        ('aruco_opencv', ('--set', 'landmarks_type=ArucoDetection')),
+        ('ros2_aruco', ()),
+        ('ros2_aruco', ('--set', 'landmarks_type=ArucoMarkers')),
+        ('isaac', ()),
+        ('isaac', ('--set', 'landmarks_type=AprilTagDetectionArray')),
         ('all', ('--landmarks-topic', '/detections')),
         ('all', ('--landmarks-topic', '/tags/tf', '--tag-frame-prefix', 'dock')),
         ('all', ('--set', 'landmarks_type=tf', '--landmarks-topic', '/tags/tf',
@@ -179,6 +200,19 @@ def test_detections_with_ids_replay_like_a_cloud(recordings, estimate, name, opt
 def test_poses_replay_like_a_cloud_without_ids(recordings, estimate, options):
     expected = estimate(recordings['all'], '--landmarks-topic', '/nameless')
     assert_same(estimate(recordings['poses'], *options), expected)
+
+
+@pytest.mark.parametrize(
+    ('name', 'landmarks_type'),
+    [('poses', 'PoseArray'), ('boxes', 'auto'), ('apriltag', 'auto'), ('apriltag', 'tf')],
+)
+def test_orientations_that_nobody_filled_in_change_nothing(
+    recordings, estimate, name, landmarks_type
+):
+    """But for rounding."""
+    chosen = ('--set', f'landmarks_type={landmarks_type}')
+    expected = estimate(recordings[name], *chosen)
+    assert_same(estimate(recordings[name], *chosen, '--set', 'use_tag_orientation=true'), expected)
 
 
 def test_the_nodes_file_says_which_type(recordings, estimate, tmp_path):

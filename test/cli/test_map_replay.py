@@ -86,6 +86,8 @@ def test_a_run_finds_its_place_in_the_map_of_another_one(slam_observer, tmp_path
     report = slam_observer('replay', second, '--load-map', saved, *SETTINGS, '--json').json
     assert report['ate_rmse_m'] < report['unaligned_rmse_m'] < 0.15
     known, after = read_map(saved), read_map(again)
+    assert known.joint_covariance is not None
+    assert after.joint_covariance is not None
     assert set(known.ids) <= set(after.ids)
     assert (len(after.ids) > len(known.ids)) == (mode == 'off')
 

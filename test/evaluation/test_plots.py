@@ -106,13 +106,14 @@ def test_configuration(tmp_path: Path, estimate: Trajectory, truth: Trajectory) 
     assert {rgb(BLUE), rgb(RED), rgb(GREEN)} <= colours(path)
 
 
-@pytest.mark.parametrize('height_m', [0.0, 3.0], ids=['flat', 'space'])
+@pytest.mark.parametrize('height_m', [0.0, 1.0, 3.0], ids=['flat', 'low', 'space'])
 def test_legend_of_a_configuration_covers_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, height_m: float
 ) -> None:
     saved: list[Figure] = []
     monkeypatch.setattr(simulation_plots, 'save', lambda figure, _path: saved.append(figure))
     poses = se3.exp(SECONDS[:, None] * np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0]))
+    poses[:, :3, 3] += [0.0, -5.0, min(height_m, 2.0)]
     circle = Trajectory((SECONDS * 1e9).astype(np.int64), poses)
     points = LANDMARKS + np.array([0.0, 0.0, height_m]) * np.array([[1.0], [-1.0], [1.0], [-1.0]])
     tracks = np.tile(points, (200, 1, 1))
@@ -124,6 +125,7 @@ def test_legend_of_a_configuration_covers_nothing(
     drawn = axes.get_tightbbox()
     assert drawn is not None
     assert not legend.get_window_extent().overlaps(drawn)
+    assert 0.0 <= drawn.x0 < drawn.x1 <= figure.bbox.width, 'all labels are whole'
     names = [text.get_text() for text in legend.get_texts()]
     assert {'start', 'end', 'landmark estimates on their way'} <= set(names)
     # As the picture in the first run's page: the scene is not lost in an empty figure.

@@ -28,6 +28,22 @@ DEFINITIONS = {
     'apriltag_msgs/msg/AprilTagDetectionArray': (
         'std_msgs/Header header\nAprilTagDetection[] detections\n'
     ),
+    'isaac_ros_apriltag_interfaces/msg/AprilTagDetection': (
+        'string family\nint32 id\ngeometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n'
+        'geometry_msgs/PoseWithCovarianceStamped pose\n'
+    ),
+    'isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray': (
+        'std_msgs/Header header\nAprilTagDetection[] detections\n'
+    ),
+    'aruco_opencv_msgs/msg/MarkerPose': 'uint16 marker_id\ngeometry_msgs/Pose pose\n',
+    'aruco_opencv_msgs/msg/BoardPose': 'string board_name\ngeometry_msgs/Pose pose\n',
+    'aruco_opencv_msgs/msg/ArucoDetection': (
+        'std_msgs/Header header\nMarkerPose[] markers\nBoardPose[] boards\n'
+    ),
+    **dict.fromkeys(
+        ('aruco_interfaces/msg/ArucoMarkers', 'ros2_aruco_interfaces/msg/ArucoMarkers'),
+        'std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses\n',
+    ),
 }
 
 for type_name, text in DEFINITIONS.items():
@@ -95,3 +111,56 @@ def apriltags(
     ]  # fmt: skip
     header = ros.header(frame_id, stamp_ns)
     return ros.make('apriltag_msgs/msg/AprilTagDetectionArray', header, seen)
+
+
+Markers = Iterable[tuple[int, Sequence[float], Sequence[float]]]
+"""Of each its id, position and quaternion."""
+
+
+def aruco_markers(
+    markers: Markers,
+    frame_id: str,
+    stamp_ns: int = ros.STAMP_NS,
+    package: str = 'ros2_aruco_interfaces',
+) -> object:
+    """ros2_aruco_interfaces/ArucoMarkers, or the same of another package."""
+    ids, positions, quaternions = zip(*markers, strict=True) if markers else ((), (), ())
+    poses = list(map(ros.pose, positions, quaternions))
+    header = ros.header(frame_id, stamp_ns)
+    return ros.make(f'{package}/msg/ArucoMarkers', header, np.array(ids, dtype=np.int64), poses)
+
+
+def aruco_detection(
+    markers: Markers, frame_id: str, stamp_ns: int = ros.STAMP_NS, boards: Sequence[str] = ()
+) -> object:
+    """aruco_opencv_msgs/ArucoDetection, with boards of these names."""
+    package = 'aruco_opencv_msgs/msg'
+    found = [
+        ros.make(f'{package}/MarkerPose', number, ros.pose(position, quaternion))
+        for number, position, quaternion in markers
+    ]
+    placed = [
+        ros.make(f'{package}/BoardPose', name, ros.pose((9.0, 9.0, 9.0), NO_TURN))
+        for name in boards
+    ]
+    header = ros.header(frame_id, stamp_ns)
+    return ros.make(f'{package}/ArucoDetection', header, found, placed)
+
+
+def isaac_apriltags(
+    markers: Markers,
+    frame_id: str,
+    stamp_ns: int = ros.STAMP_NS,
+    covariance: np.ndarray | None = None,
+) -> object:
+    """isaac_ros_apriltag_interfaces/AprilTagDetectionArray, of one pose covariance (6, 6)."""
+    package = 'isaac_ros_apriltag_interfaces/msg'
+    whole = np.zeros(36) if covariance is None else covariance.ravel()
+    header, pixel = ros.header(frame_id, stamp_ns), ros.make('geometry_msgs/msg/Point', 1, 2, 0)
+    seen = []
+    for number, *where in markers:
+        pose = ros.make('geometry_msgs/msg/PoseWithCovariance', ros.pose(*where), whole)
+        stamped = ros.make('geometry_msgs/msg/PoseWithCovarianceStamped', header, pose)
+        tag = 'tag36h11', number, pixel, [pixel] * 4, stamped
+        seen.append(ros.make(f'{package}/AprilTagDetection', *tag))
+    return ros.make(f'{package}/AprilTagDetectionArray', header, seen)

@@ -61,7 +61,12 @@ def test_a_table_with_names(load):
 def test_a_table_without_names(load):
     found = load('7,1.5,-2\n8,9,1,0.5,0.1\n', 'tags.csv')
     assert_allclose(found.world_points, [[1.5, -2.0, 0.0], [9.0, 1.0, 0.5]])
+    assert_allclose(found.covariances[0], np.diag([0.0004, 0.0004, 100.0]))  # height not known
     assert_allclose(found.covariances[1], 0.01 * np.eye(3))
+
+
+def test_a_table_that_excel_has_saved(load):
+    assert load('\ufeffid,x,y\r\n7,1.5,-2\r\n', 'tags.csv').ids.tolist() == [7]
 
 
 @pytest.mark.parametrize('text', [TAGSLAM, TAGSLAM.replace('bodies:', '')])
@@ -89,18 +94,22 @@ def test_what_was_imported_can_be_saved_and_loaded(load, tmp_path):
     [
         ('', 'tags.csv', 'there are no landmarks in it'),
         ('id,y\n7,1\n', 'tags.csv', "there is no column 'x'; it needs id, x and y"),
-        ('7,1,two\n', 'tags.csv', 'landmark 1: could not convert string to float'),
+        ('id;x;y\n7;1;2\n', 'tags.csv', 'it needs id, x and y, with commas'),
+        ('7 1 2\n', 'tags.csv', 'there is no column|line 1: it needs id, x and y, with commas'),
+        ('id,x,y\n7,1,two\n', 'tags.csv', "line 2: y is 'two', which is not a finite number"),
+        ('7.5,1,2\n', 'tags.csv', "line 1: the id '7.5' is no whole number"),
         ('7,1,2\n7,1,2\n', 'tags.csv', 'landmark 7 is there more than once'),
         ('-7,1,2\n', 'tags.csv', 'the id -7 is not one from 0 to'),
-        ('7,1,nan\n', 'tags.csv', 'not finite'),
+        ('7,1,nan\n', 'tags.csv', 'not a finite number'),
         ('7,1,2,3,-0.1\n', 'tags.csv', 'sigma is negative'),
-        ('format: other\n', 'tags.yaml', "neither 'bodies', as TagSLAM, nor 'tag_bundles'"),
+        ('format: other\n', 'tags.yaml', 'it is not laid out as TagSLAM'),
         (TAGSLAM.replace('rotation', 'turn'), 'tags.yaml', "'rotation' is missing"),
         (TAGSLAM.replace('x: 2.0', 'x: two'), 'tags.yaml', 'could not convert string'),
         (TAGSLAM.replace('id: 3', 'id: three'), 'tags.yaml', "the id 'three' is not one"),
-        ('bodies: [1, 2]\n', 'tags.yaml', 'tags.yaml: '),
+        ('bodies: [1, 2]\n', 'tags.yaml', 'it is not laid out as TagSLAM'),
+        (BUNDLE.replace('y: -0.5', 'y: .nan'), 'tags.yaml', 'not finite'),
         ('bodies: {a: [}\n', 'tags.yaml', 'is not valid'),
-        ('tag_bundles: 3\n', 'tags.yaml', 'tags.yaml: '),
+        ('tag_bundles: 3\n', 'tags.yaml', 'it is not laid out as TagSLAM'),
         ('\x00', 'tags.csv', 'tags.csv'),
     ],
 )

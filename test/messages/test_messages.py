@@ -442,6 +442,9 @@ DECODERS = {
 }
 
 
+MARKERS = [(7, (1.0, 2.0, 3.0), (0.0, 0.0, 0.6, 0.8))]
+
+
 def example_messages() -> dict[str, bytes]:
     """One message of each type that is decoded."""
     pose = ros.pose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
@@ -462,6 +465,10 @@ def example_messages() -> dict[str, bytes]:
         detector.pose_array([(1.0, 2.0, 3.0)], 'camera'),
         detector.detections([detector.detection('7', 'post_3', np.eye(3))], 'camera'),
         detector.apriltags([('tag36h11', 5)], 'camera'),
+        detector.aruco_markers(MARKERS, 'camera'),
+        detector.aruco_markers(MARKERS, 'camera', package='aruco_interfaces'),
+        detector.aruco_detection(MARKERS, 'camera', boards=['dock']),
+        detector.isaac_apriltags(MARKERS, 'camera'),
         ros.make('geometry_msgs/msg/PoseStamped', header, pose),
         ros.make('geometry_msgs/msg/PoseWithCovarianceStamped', header, uncertain),
         transform,

@@ -190,8 +190,24 @@ def test_a_camera_is_mounted_where_its_pose_is_given(nodes):
     started = nodes('apriltag.launch.py', tag_size='0.2')
     assert set(started) == {'apriltag_node'}
     assert parameters(started['apriltag_node'])['size'] == 0.2
-    started = nodes('apriltag.launch.py', camera_frame='eye', camera_pose='0.2 0 0.4 0 0.1 0')
+    started = nodes(
+        'apriltag.launch.py', tag_size='0.2', camera_frame='eye', camera_pose='0.2 0 0.4 0 0.1 0'
+    )
     assert started['static_transform_publisher']['arguments'][-1] == 'eye'
+
+
+def test_a_calibration_is_heard_where_image_transport_looks_for_it(nodes):
+    beside = nodes('apriltag.launch.py', tag_size='0.2')['apriltag_node']
+    assert not [old for old, _ in beside['remappings'] if 'camera_info' in old]
+    elsewhere = nodes(
+        'apriltag.launch.py', tag_size='0.2', image='/eye/image_rect', camera_info='/eye/raw/info'
+    )['apriltag_node']
+    assert ('/eye/camera_info', '/eye/raw/info') in elsewhere['remappings']
+
+
+def test_the_observer_has_the_base_frame_that_is_given(nodes):
+    observer = nodes('localization.launch.py', base_frame='base_footprint')
+    assert parameters(observer['lifecycle_observer_node'])['base_frame'] == 'base_footprint'
 
 
 def test_detector_and_observer_have_one_tag_size(nodes, load):
@@ -205,8 +221,22 @@ def test_detector_and_observer_have_one_tag_size(nodes, load):
 
 
 def test_a_tag_size_that_is_no_number_ends_the_launch_with_the_reason(nodes):
-    with pytest.raises(RuntimeError, match=r"^tag_size: '16cm' is not 1 numbers"):
+    with pytest.raises(RuntimeError, match=r"^tag_size: '16cm' is not a number"):
         nodes('localization.launch.py', tag_size='16cm')
+
+
+def test_a_pose_of_a_camera_without_its_frame_is_refused(load):
+    names = load('apriltag.launch.py')
+    names['check'].__globals__['check_packages'] = MagicMock()
+    given = {'tag_size': '0.2', 'camera_frame': '', 'camera_pose': '0.2 0 0.4 0 0 0'}
+    with pytest.raises(RuntimeError, match='camera_pose needs camera_frame'):
+        names['check'](SimpleNamespace(launch_configurations=given))
+
+
+@pytest.mark.parametrize('name', ['autostart', 'use_respawn', 'use_sim_time'])
+def test_what_is_neither_true_nor_false_ends_the_launch_with_the_reason(nodes, name):
+    with pytest.raises(RuntimeError, match=f"^{name}: 'yes' is neither true nor false"):
+        nodes('localization.launch.py', **{name: 'yes'})
 
 
 def test_numbers_of_an_argument_are_counted():

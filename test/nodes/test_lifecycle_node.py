@@ -53,6 +53,7 @@ def test_managed_node_estimates_only_while_it_is_active(ros, tmp_path):
     arguments = ('-r', '__ns:=/managed')
     with running('lifecycle_observer_node', tmp_path / 'log', *arguments) as node:
         assert manager.state == State.PRIMARY_STATE_UNCONFIGURED
+        assert 'waiting for its transitions' in node.output
         assert not ros.node.get_publishers_info_by_topic('/managed/observer_node/odometry')
         assert manager.change(Transition.TRANSITION_CONFIGURE)
         assert manager.state == State.PRIMARY_STATE_INACTIVE

@@ -107,7 +107,7 @@ def test_noise_that_is_stated_too_large_is_said_without_a_warning():
     status = Watched(noise=innovations(0.2)).status
     assert status.level == OK
     values = {value.key: value.value for value in status.values}
-    assert 'the stated noise is too large by 5' in values['innovations / stated noise']
+    assert 'the stated noise is too large by a factor of 5' in values['innovations / stated noise']
 
 
 def test_sensors_without_any_noise_are_no_fault():

@@ -16,7 +16,9 @@ from slam_observer_ros.nodes.services.named_map_services import NamedMapServices
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 HALL = LandmarkMap(np.array([3, 4]), np.array([[1.0, 2, 0], [4, 0, 0]]), None, np.ones(2, int))
-LOADED = SimpleNamespace(RESULT_SUCCESS=0, RESULT_INVALID_MAP_DATA=2, result=None)
+LOADED = SimpleNamespace(
+    RESULT_SUCCESS=0, RESULT_MAP_DOES_NOT_EXIST=1, RESULT_INVALID_MAP_DATA=2, result=None
+)
 
 
 @pytest.fixture(name='services')
@@ -28,7 +30,10 @@ def fixture_services(monkeypatch):
     NamedMapServices(node, MapServices(node, ObserverNodeSettings(), estimator, Mock()))
     calls = {call.args[1]: call.args[2] for call in node.create_service.call_args_list}
     return SimpleNamespace(
-        save=calls['~/save_map_to'], load=calls['~/load_map_from'], estimator=estimator
+        save=calls['~/save_map_to'],
+        load=calls['~/load_map_from'],
+        estimator=estimator,
+        log=node.get_logger.return_value,
     )
 
 
@@ -44,9 +49,21 @@ def test_a_map_is_loaded_from_and_saved_to_the_file_that_is_named(services, tmp_
 
 def test_what_fails_is_answered(services, tmp_path):
     request = SimpleNamespace(map_url=str(tmp_path / 'none.yaml'))
-    assert services.load(request, LOADED).result == LOADED.RESULT_INVALID_MAP_DATA
+    assert services.load(request, LOADED).result == LOADED.RESULT_MAP_DOES_NOT_EXIST
     assert services.save(request, SimpleNamespace(result=None)).result is False
     assert not (tmp_path / 'none.yaml').exists()
+    (tmp_path / 'notes.yaml').write_text('no map')
+    request = SimpleNamespace(map_url=str(tmp_path / 'notes.yaml'))
+    assert services.load(request, LOADED).result == LOADED.RESULT_INVALID_MAP_DATA
+
+
+def test_a_url_of_another_kind_is_refused_with_what_is_taken(services):
+    request = SimpleNamespace(map_url='package://my_robot/maps/hall.yaml')
+    assert services.load(request, LOADED).result == LOADED.RESULT_MAP_DOES_NOT_EXIST
+    assert services.save(request, SimpleNamespace(result=None)).result is False
+    services.log.error.assert_called_with(
+        "map_url takes a path or a file:// URL, not 'package://my_robot/maps/hall.yaml'"
+    )
 
 
 def test_without_nav2_there_are_the_plain_services_alone(monkeypatch):

@@ -5,16 +5,18 @@ from __future__ import annotations
 from contextlib import ExitStack
 import importlib.util
 import inspect
+import sys
 import time
 from types import SimpleNamespace
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
+import detector_messages as detector
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Pose, PoseArray, Twist, TwistStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from node_processes import NodeProcess, running
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 import rclpy
 from rclpy.duration import Duration
@@ -28,6 +30,7 @@ from sensor_msgs.msg import Imu, PointCloud2
 from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.events import FIRST_AUTOMATIC_ID, ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.message_types import IMU, ODOMETRY
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.messages.poses_and_velocities import decode_twist
@@ -45,6 +48,7 @@ SECOND = 1_000_000_000
 STEP_NS = SECOND // 20
 STEPS = 30
 V = np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0])
+MARKER = (7, (1.0, 2.0, 3.0), detector.NO_TURN)
 WRONG_TURN = np.array([0.0, 0.0, -0.8, 1.0, 0.0, 0.0])
 
 
@@ -232,14 +236,78 @@ def test_that_the_velocities_of_an_odometry_are_missing_is_said_until_they_come(
     assert not source.problem
 
 
-def test_a_detection_type_that_is_found_under_auto_is_said_how_to_read():
-    node = Mock()
+def landmarks_input(type_name, feed=None, **settings):
+    """Return the input of landmarks, and a node on whose topic somebody publishes a type."""
+    node = MagicMock()
+    node.create_subscription.return_value.handle.take_message.return_value = None
     node.resolve_topic_name.side_effect = lambda topic: f'/{topic}'
-    publisher = Mock(topic_type='apriltag_msgs/msg/AprilTagDetectionArray', qos_profile=QOS)
+    node.get_clock.return_value.now.return_value.nanoseconds = 0
+    publisher = Mock(topic_type=type_name, qos_profile=QOS)
     node.get_publishers_info_by_topic.return_value = [publisher]
-    _, landmarks = open_inputs(node, ObserverNodeSettings(), Mock())
+    _, landmarks = open_inputs(node, ObserverNodeSettings(**settings), feed or Mock())
+    return landmarks, node
+
+
+DETECTIONS = {
+    message.__msgtype__: message
+    for message in (
+        detector.detections([detector.detection('7')], 'camera'),
+        detector.apriltags([('tag36h11', 7)], 'camera'),
+        detector.isaac_apriltags([MARKER], 'camera'),
+        detector.aruco_detection([MARKER], 'camera'),
+        detector.aruco_markers([MARKER], 'camera'),
+        detector.aruco_markers([MARKER], 'camera', package='aruco_interfaces'),
+    )
+}
+
+
+@pytest.mark.parametrize('type_name', DETECTIONS)
+def test_a_detection_type_that_is_found_names_its_package_if_that_is_missing(
+    type_name, monkeypatch
+):
+    package, _, name = type_name.split('/')
+    monkeypatch.setitem(sys.modules, f'{package}.msg', None)
+    landmarks, node = landmarks_input(type_name)
     landmarks.check_publishers()
-    assert landmarks.problem.endswith('; set landmarks_type: AprilTagDetectionArray')
+    node.create_subscription.assert_not_called()
+    assert f'{type_name} needs the package {package}: apt install ros-' in landmarks.problem
+    assert package.replace('_', '-') in landmarks.problem
+    monkeypatch.setitem(sys.modules, f'{package}.msg', SimpleNamespace(**{name: object}))
+    landmarks.check_publishers()
+    node.create_subscription.assert_called_once()
+    assert landmarks.problem.startswith("no message yet on '/landmarks'")
+
+
+@pytest.mark.parametrize('type_name', DETECTIONS)
+def test_detections_are_found_on_the_topic_and_read(type_name, monkeypatch):
+    package, _, name = type_name.split('/')
+    monkeypatch.setitem(sys.modules, f'{package}.msg', SimpleNamespace(**{name: object}))
+    feed = Mock()
+    landmarks, node = landmarks_input(type_name, feed)
+    landmarks.check_publishers()
+    receive = node.create_subscription.call_args.args[2]
+    receive(ros_messages.serialise(DETECTIONS[type_name]), {'received_timestamp': 0})
+    (measured, _), _ = feed.add_observation.call_args
+    ids = measured.ids if isinstance(measured, TagDetections) else measured.event.ids
+    assert_array_equal(ids, [7])
+
+
+def test_no_package_of_a_detector_is_imported_unasked(monkeypatch):
+    for package in {name.partition('/')[0] for name in DETECTIONS}:
+        monkeypatch.setitem(sys.modules, package, None)
+    landmarks, node = landmarks_input('sensor_msgs/msg/PointCloud2')
+    landmarks.check_publishers()
+    node.create_subscription.assert_called_once()
+
+
+def test_what_else_a_topic_carries_is_answered_with_the_types_that_are_read():
+    landmarks, _ = landmarks_input('sensor_msgs/msg/LaserScan')
+    landmarks.check_publishers()
+    assert landmarks.problem == (
+        "'/landmarks' carries sensor_msgs/msg/LaserScan; PointCloud2, PointCloud, "
+        'AprilTagDetectionArray, PoseArray, Detection3DArray, ArucoDetection or ArucoMarkers '
+        'is needed'
+    )
 
 
 def test_an_odometry_without_an_attitude_has_a_velocity():
@@ -316,9 +384,9 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
     ):
         sender.send(('base_link', 'camera', se3.pose(np.eye(3), np.array([0.0, 0.0, 1.0]))))
         ros.wait_for_subscriber(sender.dynamic, robot.twist, poses)
-        start_ns = time.time_ns()
-        for step in range(10):
-            stamp = start_ns + step * STEP_NS
+
+        def send():
+            stamp = time.time_ns()
             robot.send(VelocityEvent(stamp, np.zeros(6)))
             sender.send(
                 ('camera', 'tag36h11:3', se3.pose(np.eye(3), np.array([2.0, 0.0, 0.0]))),
@@ -329,9 +397,9 @@ def test_poses_without_ids_and_fiducials_on_tf_are_landmarks(ros, tmp_path):
             point = Pose(position=MESSAGES.point(np.ones(3)))
             header = MESSAGES.header(stamp, 'base_link')
             poses.publish(PoseArray(header=header, poses=[point]))
-            ros.spin_for(0.03)
-        ros.spin_until(lambda: len(seen(maps)) == 2, 'two fiducials')
-        ros.spin_until(lambda: len(seen(nameless_maps)) == 1, 'a landmark without id')
+
+        ros.spin_until(lambda: len(seen(maps)) == 2 or send(), 'two fiducials')
+        ros.spin_until(lambda: len(seen(nameless_maps)) == 1 or send(), 'a landmark without id')
     assert set(seen(maps)) == {3, 11}
     assert_allclose(seen(maps)[3], [2.0, 0.0, 1.0], atol=1e-6)
     assert_allclose(seen(maps)[11], [0.0, 3.0, 1.0], atol=1e-6)
@@ -371,7 +439,11 @@ def seen(maps):
 
 def test_optional_packages_are_named_when_they_are_missing(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_DISTRO', 'kilted')
-    packages = {'Detection3DArray': 'vision_msgs', 'AprilTagDetectionArray': 'apriltag_msgs'}
+    packages = {
+        'Detection3DArray': 'vision_msgs',
+        'AprilTagDetectionArray': 'apriltag_msgs',
+        'ArucoDetection': 'aruco_opencv_msgs',
+    }
     nodes = {
         package: NodeProcess('observer_node', tmp_path / package, landmarks_type=landmarks_type)
         for landmarks_type, package in packages.items()
@@ -500,11 +572,7 @@ def test_a_second_publisher_of_velocities_or_of_the_odometry_is_named(ros, tmp_p
 
 
 def test_another_type_of_cloud_than_is_asked_for_is_said_by_its_own_name():
-    node = Mock()
-    node.resolve_topic_name.side_effect = lambda topic: f'/{topic}'
-    publisher = Mock(topic_type='sensor_msgs/msg/PointCloud2', qos_profile=QOS)
-    node.get_publishers_info_by_topic.return_value = [publisher]
-    _, landmarks = open_inputs(node, ObserverNodeSettings(landmarks_type='PoseArray'), Mock())
+    landmarks, _ = landmarks_input('sensor_msgs/msg/PointCloud2', landmarks_type='PoseArray')
     landmarks.check_publishers()
     assert landmarks.problem.endswith('PoseArray is needed; set landmarks_type: PointCloud2')
 

@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from node_processes import client, NodeProcess, running
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
@@ -24,6 +24,7 @@ from std_srvs.srv import Trigger
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.matrices import diagonal_blocks
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
@@ -145,7 +146,9 @@ def test_saved_killed_loaded_and_localised(ros, robot, tmp_path):
         assert answer.message == f"saved 50 landmarks in frame 'map' to {path}"
     finally:
         first.stop(signal.SIGKILL)
-    assert_allclose(read_map(path).world_points, robot.points, atol=5 * NOISE_M)
+    saved = read_map(path)
+    assert_allclose(saved.world_points, robot.points, atol=5 * NOISE_M)
+    assert_array_equal(diagonal_blocks(saved.joint_covariance, 3), saved.covariances)
     elsewhere = se3.exp(np.array([0.1, -0.2, 2.0, 3.0, -2.0, 0.5]))
     # For some time a client takes the killed node for alive; a new one never hears of it.
     with (
@@ -387,6 +390,21 @@ def test_what_cannot_be_done_is_answered_with_the_reason(ros, robot, tmp_path):
             lambda: any('pose in the loaded map' in m.status[0].message for m in diagnostics),
             'a diagnostic that says so',
         )
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'reason'),
+    [
+        ({'gains': 'ricati'}, "'gains' takes one of constant, scheduled, riccati, not 'ricati'"),
+        ({'use_sim_time': 'ja'}, "Trying to set parameter 'use_sim_time' to 'ja'"),
+    ],
+)
+def test_with_a_wrong_parameter_the_node_says_why_in_a_line(tmp_path, parameters, reason):
+    node = NodeProcess('observer_node', tmp_path / 'log', **parameters)
+    assert node.wait() == 2
+    last = node.output.splitlines()[-1]
+    assert reason in last
+    assert 'Reason:' not in last
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.nodes.intake.load_shedding import LoadShedding, Waiting
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 pytestmark = pytest.mark.ros
 
@@ -26,6 +27,7 @@ QUEUED_S = 100 / 30
 """How old the output is where a full queue of clouds is waited for, seconds."""
 
 V = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])
+DEFAULT = {'landmarks_max_wait': ObserverNodeSettings.landmarks_max_wait}
 
 
 def seen_by(frame_id):
@@ -106,7 +108,9 @@ def test_an_overloaded_node_drops_landmarks_and_its_output_stays_new(ros, tmp_pa
     log = tmp_path / 'log'
     statuses = ros.collect(DiagnosticArray, '/diagnostics')
     with (
-        running('observer_node', log, '-r', '__ns:=/loaded', twist_qos='reliable') as node,
+        running(
+            'observer_node', log, '-r', '__ns:=/loaded', **DEFAULT, twist_qos='reliable'
+        ) as node,
         Robot(ros, namespace='/loaded') as robot,
     ):
         sent = drive(ros, robot, duration_s=5.0, count=200)
@@ -133,7 +137,7 @@ def test_map_to_odom_is_never_in_the_past_while_the_node_is_loaded(ros, tmp_path
     ros.node.create_subscription(TFMessage, '/driven/tf', receive, 100)
     sender = TransformSender(ros, '/driven')
     with (
-        running('observer_node', tmp_path / 'log', *own_topics('/driven')),
+        running('observer_node', tmp_path / 'log', *own_topics('/driven'), **DEFAULT),
         Robot(ros, namespace='/driven') as robot,
     ):
         ros.wait_for_subscriber(sender.dynamic)

@@ -246,6 +246,7 @@ def test_diagnostics_report_rates_ages_drops_and_times(ros, tmp_path):
         values = of_a_robot_under_way()[-1]
         assert float(values['/watched/twist age [s]']) < 30.0
         assert values['known landmarks seen last'] == '4'
+        assert 0.0 <= float(values['last observation age [s]']) < 1.0
         assert float(values['processing time, mean [ms]']) > 0.0
         assert int(values['used: observation']) > 5
         assert values['calibration: velocity_delay'].endswith(' s')

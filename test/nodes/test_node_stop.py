@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 import re
 import signal
@@ -50,6 +51,16 @@ CASES = {
 }
 
 
+@contextmanager
+def hang_up(handler):
+    """Start processes that do this on SIGHUP, unless they want something else."""
+    before = signal.signal(signal.SIGHUP, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture
 def ros(ros_domain_id):
     """Give a client that has not heard of nodes which ended without a word."""
@@ -61,7 +72,8 @@ def ros(ros_domain_id):
 def processes(tmp_path_factory):
     """Start all nodes at once: each takes a second to start."""
     folder = tmp_path_factory.mktemp('logs')
-    started = {case: NodeProcess(CASES[case][0], folder / case) for case in CASES}
+    with hang_up(signal.SIG_DFL):  # also where nohup has started the tests
+        started = {case: NodeProcess(CASES[case][0], folder / case) for case in CASES}
     yield started
     for node in started.values():
         node.process.kill()
@@ -125,11 +137,8 @@ def test_a_signal_within_a_long_observation_stops_a_node_in_time_with_its_map(
 
 
 def test_a_node_that_is_to_outlive_its_terminal_does(tmp_path):
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
+    with hang_up(signal.SIG_IGN):
         node = NodeProcess('observer_node', tmp_path / 'log')
-    finally:
-        signal.signal(signal.SIGHUP, before)
     node.wait_for_output('estimating')
     status = Path(f'/proc/{node.process.pid}/status').read_text()
     ignored = int(re.search(r'^SigIgn:\s*(\w+)$', status, re.MULTILINE)[1], 16)

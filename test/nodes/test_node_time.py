@@ -250,7 +250,7 @@ class AnotherClock:
         self.transforms = TransformBuffer()
         settings = ObserverNodeSettings(**parameters)
         self.node = Mock()
-        self.node.resolve_topic_name = '/{}'.format
+        self.node.resolve_topic_name = lambda name: f'/{name.lstrip("/")}'
         self.estimator = Estimator(Settings(reorder_window=0.0))
         base_frame = BaseFrame(settings, self.transforms)
         self.feed = EstimatorFeed(self.node, settings, self.estimator, base_frame)
@@ -307,6 +307,15 @@ def test_nothing_is_recommended_that_is_done_already():
     assert len(uncorrected.feed.clock_problems()) == 2
 
 
+def test_fiducials_have_the_clock_of_tf():
+    robot = AnotherClock(100 * SECOND, landmarks_type='tf')
+    robot.send_all()
+    assert [text.partition(' are ')[0] for text in robot.feed.clock_problems()] == [
+        "stamps on '/twist'",
+        "stamps on '/tf'",
+    ]
+
+
 def test_until_the_offset_of_its_clock_is_known_what_an_input_says_is_dropped_and_counted():
     robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
     robot.send_all()
@@ -361,7 +370,6 @@ def test_late_and_shuffled_messages_lead_to_the_same_state(ros, tmp_path):
     end_ns = max(event.stamp_ns for event in events)
     # A wide window, since a busy machine may deliver one topic well before the other.
     parameters = {'reorder_window': 1.0, 'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
-    parameters['landmarks_max_wait'] = 60.0
     with ExitStack() as stack:
         maps, robots = {}, {}
         for name in orders:

@@ -1,4 +1,4 @@
-"""``observer_node`` over real DDS: what comes in, what goes out, and that a replay agrees."""
+"""``observer_node`` over real DDS: what comes in and what goes out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from node_processes import NodeProcess, running
 import numpy as np
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import (
@@ -29,13 +29,11 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
-from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.publishing.pose_broadcaster import DISCOVERY_S
 from slam_observer_ros.nodes.qos import LATCHED_QOS
-from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros
@@ -57,65 +55,6 @@ def observer(ros, shared_observer):
     return shared_observer
 
 
-def as_received(event):
-    """Return the event after the trip through a message: points are float32 there."""
-    if isinstance(event, VelocityEvent):
-        return event
-    raw = serialize_message(
-        MESSAGES.point_cloud2(event.stamp_ns, 'base_link', event.ids, event.points)
-    )
-    return decode_point_cloud2(raw).event
-
-
-def test_replay_of_what_was_received_gives_the_same_bits(ros, tmp_path):
-    scenario = Scenario(
-        duration=3.0,
-        velocity_rate=50.0,
-        observation_rate=25.0,
-        field_of_view=200.0,
-        landmark_count=12,
-        point_noise=0.05,
-        angular_velocity_noise=0.05,
-        linear_velocity_noise=0.1,
-        late_fraction=0.3,
-        max_lateness=0.1,
-    )
-    odometry = ros.collect(Odometry, '/replayed/observer_node/odometry')
-    maps = ros.collect(PointCloud2, '/replayed/landmark_map', LATCHED_QOS)
-    # A wide window, since a busy machine may deliver one topic well before the other.
-    parameters = {'reorder_window': 1.0, 'publish_rate': 200.0, 'queue_depth': 1000}
-    parameters['landmarks_max_wait'] = 60.0
-    parameters |= {'twist_qos': 'reliable', 'landmarks_qos': 'reliable'}
-    arguments = ('-r', '__ns:=/replayed')
-    with (
-        running('observer_node', tmp_path / 'log', *arguments, **parameters),
-        Robot(ros, namespace='/replayed') as robot,
-    ):
-        events = robot.run(scenario)
-        last_ns = max(event.stamp_ns for event in events) - 1_000_000_000
-        ros.spin_until(lambda: maps and stamp_ns(maps[-1]) >= last_ns, 'the last map')
-
-    # In order and without a window, the replay shows the state at every stamp.
-    replay = Estimator(Settings(reorder_window=0.0))
-    poses, known = {}, {}
-    for event in sorted(map(as_received, events), key=_order):
-        assert replay.add(event)
-        poses[event.stamp_ns] = MESSAGES.pose(replay.pose)
-        known[event.stamp_ns] = (replay.landmark_ids, replay.world_points.astype(np.float32))
-    assert len(odometry) > 5
-    for message in odometry:
-        assert message.pose.pose == poses[stamp_ns(message)]
-    for message in maps:
-        published = decode_point_cloud2(serialize_message(message)).event
-        ids, points = known[published.stamp_ns]
-        assert_array_equal(published.ids, ids)
-        assert_array_equal(published.points, points)
-
-
-def _order(event):
-    return event.stamp_ns, isinstance(event, ObservationEvent)
-
-
 @pytest.mark.parametrize(
     ('twist_class', 'cloud_class'),
     [(Twist, PointCloud), (TwistStamped, PointCloud2), (Odometry, PointCloud2)],
@@ -130,8 +69,15 @@ def test_each_input_type_is_found_on_its_topic(ros, observer, twist_class, cloud
         ros.spin_until(
             lambda: poses and abs(poses[-1].pose.pose.position.x - 1.0) < 0.3, 'a run of 1 m'
         )
-    received = re.findall(r"receiving \w+/msg/(\w+) on '/(?:twist|landmarks)'", observer.output)
+    received = re.findall(
+        r"listening for \w+/msg/(\w+) on '/(?:twist|landmarks)'", observer.output
+    )
     assert {twist_class.__name__, cloud_class.__name__} <= set(received)
+
+
+def test_the_log_of_a_start_has_no_lines_but_the_nodes_own(observer):
+    observer.wait_for_output('estimating')
+    assert 'number of timers' not in observer.output
 
 
 def test_incompatible_type_is_reported(ros, observer):
@@ -454,6 +400,12 @@ def test_parameters_of_other_nodes_in_the_same_file_are_left_alone(ros, tmp_path
         node.wait_for_output('estimating')
         assert node.output.count('WARN') == 1
         assert 'ignored: base_frame_id, wheel.radius\n' in node.output
+
+
+def test_all_that_a_node_prints_is_its_log(ros, tmp_path):
+    with running('observer_node', tmp_path / 'log', use_imu=True) as node:
+        node.wait_for_output('estimating')
+    assert all(line.startswith('[') for line in node.output.splitlines()), node.output
 
 
 def test_large_ids_are_warned_about(ros, observer):

@@ -12,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tempfile
 
 import pytest
 import setuptools  # noqa: F401 (provides distutils)
@@ -147,6 +148,14 @@ def test_parameter_names_and_values_are_right(page):
         rows[name].check(yaml.safe_load(value))
 
 
+@pytest.mark.parametrize(
+    ('name', 'page'), [('wheeled_robot.yaml', 'my_robot.md'), ('apriltags.yaml', 'apriltags.md')]
+)
+def test_parameter_files_that_are_shown_are_those_that_are_shipped(name, page):
+    shipped = (CHECKOUT / 'config' / name).read_text()
+    assert shipped in blocks(CHECKOUT / 'docs' / page, 'yaml')
+
+
 def test_all_counts_are_explained():
     page = (CHECKOUT / 'docs' / 'topics.md').read_text()
     names = re.findall(r"``'(\w+)'``", Estimator.counts.__doc__)
@@ -172,7 +181,8 @@ def test_maps_can_be_read(page, tmp_path):
 
 
 @pages
-def test_python_runs(page):
+def test_python_runs(page, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))  # a page makes a folder that stays
     for block in blocks(page, 'python'):
         exec(compile(block, page.name, 'exec'), {})
 

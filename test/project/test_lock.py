@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 import re
 
+import pytest
+
 CHECKOUT = Path(__file__).parents[2]
+LOCKS = ('requirements.lock', 'requirements-develop.lock')
 
 
 def pins(text: str) -> dict[str, set[str]]:
@@ -17,12 +20,14 @@ def pins(text: str) -> dict[str, set[str]]:
     return found
 
 
-def test_the_locked_versions_are_those_of_the_constraints():
-    locked = pins((CHECKOUT / 'requirements.lock').read_text())
+@pytest.mark.parametrize('name', LOCKS)
+def test_the_locked_versions_are_those_of_the_constraints(name):
+    locked = pins((CHECKOUT / name).read_text())
     constraints = pins((CHECKOUT / 'constraints.txt').read_text())
     assert locked == {name: constraints.get(name) for name in locked}
 
 
-def test_each_has_a_hash():
-    for entry in re.split(r'\n(?=[a-z])', (CHECKOUT / 'requirements.lock').read_text())[1:]:
+@pytest.mark.parametrize('name', LOCKS)
+def test_each_has_a_hash(name):
+    for entry in re.split(r'\n(?=[a-z])', (CHECKOUT / name).read_text())[1:]:
         assert '--hash=sha256:' in entry, entry

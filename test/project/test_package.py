@@ -98,6 +98,13 @@ def test_all_distributions_and_middlewares_are_tried():
     assert {f'ros-{name}' for name in wheels} <= set(setup.extras_require)
 
 
+def test_docs_ros_org_shows_the_pages():
+    _kind, content = yaml.safe_load_all((CHECKOUT / 'rosdoc2.yaml').read_text())
+    # Where rosdoc2 looks for it: among the settings it would be ignored.
+    (builder,) = content['builders']
+    assert (CHECKOUT / builder['sphinx']['user_doc_dir'] / 'index.md').is_file()
+
+
 def test_launch_config_and_rviz_files_are_installed(monkeypatch):
     monkeypatch.chdir(CHECKOUT)
     data_files = dict(run_setup('setup.py', stop_after='init').data_files)

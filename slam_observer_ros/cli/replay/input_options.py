@@ -37,9 +37,9 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         ('--velocity-topic', 'Twist, TwistStamped, TwistWithCovarianceStamped or Odometry'),
         (
             '--landmarks-topic',
-            'PointCloud or PointCloud2 with ids, Detection3DArray or AprilTagDetectionArray; if '
-            'named here or called landmarks, also clouds without ids and PoseArray; if named, /tf '
-            'with fiducials',
+            'PointCloud or PointCloud2 with ids, Detection3DArray, AprilTagDetectionArray, '
+            'ArucoDetection or ArucoMarkers; if named here or called landmarks, also clouds '
+            'without ids and PoseArray; if named, /tf with fiducials',
         ),
         ('--imu', 'take the angular velocity from this Imu, the linear one as before'),
         (

@@ -128,7 +128,7 @@ def plot_configuration(
         axes.set_aspect('equal')
     else:
         limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
-        axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.35)
+        axes.set_box_aspect(np.ptp(limits, axis=1), zoom=1.25)
     legend_below(figure, axes, columns=4)
     return save(figure, path)
 
@@ -142,7 +142,7 @@ def _space_height_in(spans_m: FloatArray) -> float:
 def _space_view(figure: Figure) -> Any:
     # matplotlib's three-dimensional axes carry no types, hence Any.
     axes: Any = figure.add_subplot(projection='3d', elev=32.0, azim=-58.0)
-    axes.set_zlabel('z [m]')
+    axes.set_zlabel('z [m]', labelpad=-2.0)
     axes.zaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color('white')

@@ -40,6 +40,9 @@ INITIAL_BIAS_M = 1.5
 QUEUE_DEPTH = 10_000
 """More than the simulator sends, so that an observer on a slow machine falls behind, no more."""
 
+LANDMARKS_MAX_WAIT_S = 60.0
+"""Long, for the same reason: landmarks that have waited are used."""
+
 STALL_LIMIT_S = 30.0
 LAST_MESSAGES_S = 0.5
 STOP_LIMIT_S = 10.0
@@ -145,6 +148,7 @@ def _observer(options: argparse.Namespace, folder: Path) -> NodeContext:
         twist_qos='reliable',
         landmarks_qos='reliable',
         queue_depth=QUEUE_DEPTH,
+        landmarks_max_wait=LANDMARKS_MAX_WAIT_S,
         publish_rate=PUBLISH_RATE_HZ,
         use_sim_time=_is_simulated_time(options),
     )

@@ -10,18 +10,13 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.messages.detections import (
-    decode_apriltags,
-    decode_pose_array,
-)
+from slam_observer_ros.messages.detections import decode_apriltags
 from slam_observer_ros.messages.message_types import (
     APRILTAGS,
     CLOUD_DECODERS,
     DETECTION_DECODERS,
     IMU,
-    ObservationDecoder,
     ODOMETRY,
-    POSE_ARRAY,
     TRANSFORMS,
     VELOCITY_DECODERS,
 )
@@ -36,6 +31,7 @@ from slam_observer_ros.nodes.intake.warning_decoders import (
     OdometryDecoder,
     TagDecoder,
 )
+from slam_observer_ros.nodes.message_classes import is_installed, message_class
 from slam_observer_ros.settings.input_settings import AUTO, ON_TF, POSE_DIFFERENCES
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
@@ -83,13 +79,10 @@ def _landmark_input(
     if settings.landmarks_type == ON_TF:
         name, take = '/tf', feed.add_observations
         decoders = {TRANSFORMS: TagDecoder(node, settings.tag_frame_prefix)}
-    elif settings.landmarks_type == 'AprilTagDetectionArray':
-        take, decoders = partial(feed.add, 'landmarks'), {APRILTAGS: decode_apriltags}
-    elif settings.landmarks_type == AUTO:
-        # Not detections: their package, which need not be installed, would be imported unasked.
-        decoders = _cloud_decoders(node) | {POSE_ARRAY: decode_pose_array}
     else:
-        decoders = _chosen(_cloud_decoders(node) | DETECTION_DECODERS, settings.landmarks_type)
+        decoders = _chosen(_landmark_decoders(node), settings.landmarks_type)
+        if not any(map(is_installed, decoders)):
+            message_class(next(iter(decoders)))  # raises, and says what to install
     qos = _qos(settings.landmarks_qos, settings.queue_depth)
     topic = InputTopic(node, name, decoders, take, qos, settings.landmarks_max_wait)
     topic.is_shared = True
@@ -100,8 +93,9 @@ def _landmark_input(
     return topic
 
 
-def _cloud_decoders(node: Node) -> dict[str, ObservationDecoder]:
-    return {message_type: CloudDecoder(node, message_type) for message_type in CLOUD_DECODERS}
+def _landmark_decoders(node: Node) -> dict[str, Any]:
+    clouds = {message_type: CloudDecoder(node, message_type) for message_type in CLOUD_DECODERS}
+    return clouds | {APRILTAGS: decode_apriltags} | DETECTION_DECODERS
 
 
 def _chosen(decoders: Mapping[str, ValueT], type_choice: str) -> dict[str, ValueT]:

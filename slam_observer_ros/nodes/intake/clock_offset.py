@@ -50,7 +50,7 @@ class ClockOffset:
             return ''
         advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
         if is_simulated:
-            advice = 'does what publishes it use /clock, and does this machine keep up with it'
+            advice = 'see whether their publisher uses /clock, and this machine keeps up with it'
         late = ''
         if (self.offset_ns or 0) < 0:
             late = ', or what publishes them is that late: then make it faster; otherwise'

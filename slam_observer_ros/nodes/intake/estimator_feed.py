@@ -26,11 +26,13 @@ from slam_observer_ros.inputs.event_builder import (
     with_receive_time,
 )
 from slam_observer_ros.inputs.frames import BaseFrame
+from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_problem
 from slam_observer_ros.nodes.intake.clock_change import ClockChange
 from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
+from slam_observer_ros.settings.input_settings import ON_TF
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 SOURCES: dict[type[Event], str] = {
@@ -87,6 +89,8 @@ class EstimatorFeed:
         }
         # As they are after remapping, for the log.
         self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
+        if settings.landmarks_type == ON_TF:
+            self._topics['landmarks'] = f"'{node.resolve_topic_name('/tf')}'"
         self.is_active = False
         self.is_paused = False
         self.on_events: Callable[[str], None] = lambda _name: None
@@ -139,9 +143,11 @@ class EstimatorFeed:
             self._log.warning(reason, f'{reason}: the time of reception is taken instead')
         self._give(self._builder.add(timed, time.monotonic_ns()), name)
 
-    def add_observation(self, measured: Measurement[ObservationEvent], receive_ns: int) -> None:
+    def add_observation(
+        self, measured: Measurement[ObservationEvent] | TagDetections, receive_ns: int
+    ) -> None:
         """Take landmarks, unless they are a lidar's scan."""
-        problem = scan_problem(measured.event)
+        problem = scan_problem(measured.event) if isinstance(measured, Measurement) else ''
         if self.is_active and problem:
             self._drop('scan', problem)
         else:

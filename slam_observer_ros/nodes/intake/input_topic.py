@@ -13,7 +13,7 @@ from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.intake.backlog import Backlog
@@ -26,6 +26,8 @@ DISCOVERY_S = 5.0
 
 Where an announcement was lost, as on a busy machine, DDS repeats it after 3 s only.
 """
+
+MAX_FULL_NAMES = 3  # of message types in a log line
 
 MessageT = TypeVar('MessageT')
 Decoder = Callable[[Buffer, int], MessageT]
@@ -146,7 +148,7 @@ class InputTopic(Generic[MessageT]):
         if self._fault:
             return self._fault
         if self.received == 0:
-            wanted = self._type_name or ' or '.join(self._decoders)
+            wanted = self._type_name or self._wanted
             return f"no message yet on '{self.topic}' ({wanted})"
         age_s = self.age_s or 0.0
         if age_s > DISCOVERY_S:
@@ -161,13 +163,14 @@ class InputTopic(Generic[MessageT]):
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         found = {publisher.topic_type for publisher in publishers}
         usable = [name for name in self._decoders if name in found]
+        missing = ''
         if usable and self._type_name not in usable:
             # A topic has one type at a time, and the executor lets go of the old one after this.
             if self._subscription is None:
-                self._subscribe(usable[0])
+                missing = self._subscribe_if_installed(usable[0])
             else:
                 self.close()
-        self._fault = self._find_fault(publishers, usable)
+        self._fault = missing or self._find_fault(publishers, usable)
         if problem := self.problem:
             self._log.warning(self.topic, problem)
 
@@ -177,12 +180,21 @@ class InputTopic(Generic[MessageT]):
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
+    def _subscribe_if_installed(self, type_name: str) -> str:
+        """Subscribe to what was found on the topic; return which package that would need."""
+        try:
+            self._subscribe(type_name)
+        except ParameterError as error:
+            return f"'{self.topic}' can't be heard: {error}"
+        return ''
+
     def _subscribe(self, type_name: str) -> None:
+        kind = message_class(type_name)
         self._type_name = type_name
         self._subscription = self._node.create_subscription(
-            message_class(type_name), self.topic, with_info(self._receive), self._qos, raw=True
+            kind, self.topic, with_info(self._receive), self._qos, raw=True
         )
-        self._node.get_logger().info(f"receiving {type_name} on '{self.topic}'")
+        self._node.get_logger().info(f"listening for {type_name} on '{self.topic}'")
 
     def read_until(self, received_ns: int) -> None:
         """Read what waits, up to what DDS has received at a time, nanoseconds."""
@@ -240,9 +252,18 @@ class InputTopic(Generic[MessageT]):
                 return received_ns
         return int(clock.now().nanoseconds)
 
+    @property
+    def _wanted(self) -> str:
+        """The types that are read, by their short names where there are many."""
+        names = list(self._decoders)
+        if len(names) > MAX_FULL_NAMES:
+            names = list(dict.fromkeys(name.rpartition('/')[2] for name in names))
+        *others, last = names
+        return f'{", ".join(others)} or {last}' if others else last
+
     def _find_fault(self, publishers: list[TopicEndpointInfo], usable: list[str]) -> str:
         """Return why no publisher can be heard; empty if all can."""
-        wanted = ' or '.join(self._decoders)
+        wanted = self._wanted
         if not publishers:
             return f"nothing publishes on '{self.topic}' ({wanted} is needed)"
         if not usable:

@@ -55,7 +55,11 @@ class NoiseFit:
             return 'not known yet'
         # Zero is that of sensors without any noise, as a simulation's may be.
         is_small = 0.0 < factor < 1.0 / TOO_SMALL
-        hint = f' (the stated noise is too large by {1.0 / factor:.1f})' if is_small else ''
+        hint = (
+            f' (the stated noise is too large by a factor of {1.0 / factor:.1f})'
+            if is_small
+            else ''
+        )
         return f'{factor:.2f}{hint}'
 
 

@@ -43,7 +43,7 @@ class KeptPose:
         except SlamObserverError as error:
             reason = str(error)
         if reason:
-            self._logger.warning(f'the pose of the last time is not used: {reason}')
+            self._logger.warning(f'the pose kept in pose_file is not used: {reason}')
             return
         x, y, z = stored.pose[:3, 3].tolist()
         self._logger.info(f'the robot is where it was: ({x:.2f}, {y:.2f}, {z:.2f}) m')
@@ -67,7 +67,9 @@ class KeptPose:
 
     def _reason_against(self, stored: StoredPose) -> str:
         age_s = time.time() - stored.time_s
-        if not 0.0 <= age_s <= self._settings.pose_file_max_age:
+        if age_s < 0.0:
+            return f"by this machine's clock it was kept {-age_s:.0f} s from now"
+        if age_s > self._settings.pose_file_max_age:
             return f'it is {age_s:.0f} s old (pose_file_max_age)'
         if stored.frame_id != self._settings.map_frame:
             return f"it is in frame '{stored.frame_id}', not '{self._settings.map_frame}'"

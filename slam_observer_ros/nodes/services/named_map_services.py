@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import importlib
 from typing import Any
 from urllib.parse import unquote, urlparse
@@ -9,7 +10,8 @@ from urllib.parse import unquote, urlparse
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from slam_observer_ros.nodes.services.map_services import MapServices
+from slam_observer_ros.common.errors import MapError, SlamObserverError
+from slam_observer_ros.nodes.services.map_services import absolute, MapServices
 
 SAVE, LOAD = '~/save_map_to', '~/load_map_from'
 
@@ -22,6 +24,7 @@ class NamedMapServices:
 
     def __init__(self, node: Node, maps: MapServices) -> None:
         self._maps = maps
+        self._log = node.get_logger()
         try:
             types = importlib.import_module('nav2_msgs.srv')
         except ImportError:  # the services of std_srvs do the same, with the parameter map_path
@@ -30,18 +33,38 @@ class NamedMapServices:
         node.create_service(types.LoadMap, LOAD, self._load)
 
     def _save(self, request: Any, response: Any) -> Any:
-        answer = self._maps.save_to(path_of(request.map_url), Trigger.Response())
-        response.result = answer.success
+        response.result = self._succeeds(self._maps.save_to, request.map_url)
         return response
 
     def _load(self, request: Any, response: Any) -> Any:
-        answer = self._maps.load_from(path_of(request.map_url), Trigger.Response())
-        failure = response.RESULT_INVALID_MAP_DATA
-        response.result = response.RESULT_SUCCESS if answer.success else failure
+        if self._succeeds(self._maps.load_from, request.map_url):
+            response.result = response.RESULT_SUCCESS
+        elif _is_there(request.map_url):
+            response.result = response.RESULT_INVALID_MAP_DATA
+        else:
+            response.result = response.RESULT_MAP_DOES_NOT_EXIST
         return response
+
+    def _succeeds(self, act: Callable[..., Trigger.Response], map_url: str) -> bool:
+        try:
+            path = path_of(map_url)
+        except MapError as error:
+            self._log.error(str(error))
+            return False
+        return bool(act(path, Trigger.Response()).success)
+
+
+def _is_there(map_url: str) -> bool:
+    try:
+        return absolute(path_of(map_url)).exists()
+    except SlamObserverError:
+        return False
 
 
 def path_of(map_url: str) -> str:
-    """Return the path that a URL of a file, or a plain path, names."""
+    """Return the path that a URL of a file, or a plain path, names; MapError for another URL."""
     parts = urlparse(map_url)
-    return unquote(parts.path) if parts.scheme == 'file' else map_url
+    path = unquote(parts.path) if parts.scheme == 'file' else map_url
+    if '://' in path:
+        raise MapError(f"map_url takes a path or a file:// URL, not '{map_url}'")
+    return path

@@ -343,8 +343,8 @@ class CompressedCovariance(JointCovariance):
         own = own + turned + transpose(turned) + T @ self.pose @ transpose(T)
         return to_pose + T @ self.pose, own
 
-    def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
-        super()._insert(rows, C, covariances)
+    def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        super()._insert(rows, C, noise)
         Phi = self._postponed.Phi
         Phi[self._columns(rows)] = C.reshape(-1, self._p) @ Phi[: self._p]
 

@@ -168,15 +168,20 @@ class JointCovariance:
 
     def add_seen(self, covariances: FloatArray) -> None:
         """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3)."""
-        self._insert(self._make_room(len(covariances)), self._moving(covariances), covariances)
+        rows, noise = self._make_room(len(covariances)), self._noise(covariances)
+        self._insert(rows, self._moving(rows), noise)
 
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
-        self._insert(self._make_room(len(points)), self._turning(points), covariances)
+        self.add_correlated(points, self._noise(covariances))
+
+    def add_correlated(self, points: FloatArray, covariance: FloatArray) -> None:
+        """Append landmarks (m,) likewise, but with errors of a joint covariance (m k, m k)."""
+        self._insert(self._make_room(len(points)), self._turning(points), covariance)
 
     def relocate(self, rows: IntArray, covariances: FloatArray) -> None:
         """Take landmarks (m,) for newly seen ones, with covariances (m, 3, 3)."""
-        self._insert(rows, self._moving(covariances), covariances)
+        self._insert(rows, self._moving(covariances), self._noise(covariances))
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
@@ -190,6 +195,12 @@ class JointCovariance:
         G[: self._p] = np.eye(self._p)
         G[self._columns(rows)] = self._moving(rows).reshape(-1, self._p)
         return G
+
+    def embedded(self, rows: IntArray, values: FloatArray) -> FloatArray:
+        """Return (…, q) with ``values`` (m k, q) at the positions of landmarks, zero elsewhere."""
+        M = np.zeros((len(self.P), values.shape[1]))
+        M[self._columns(rows)] = values
+        return M
 
     # Other coordinates
 
@@ -208,12 +219,17 @@ class JointCovariance:
         P[: self._p, : self._p] = covariance
         self.set_of_positions(P, points)
 
-    def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
-        # ξ_i = C_i ε + noise of these covariances
-        k, columns, C = self._axes.point, self._columns(rows), C.reshape(-1, self._p)
+    def _noise(self, covariances: FloatArray) -> FloatArray:
+        """Return the covariance (m k, m k) of independent points, given theirs (m, 3, 3)."""
+        k = self._axes.point
+        return block_diagonal(covariances[:, :k, :k])
+
+    def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        # ξ_i = C_i ε + noise of this covariance (m k, m k)
+        columns, C = self._columns(rows), C.reshape(-1, self._p)
         CP = C @ self.P[: self._p]
         self.P[columns], self.P[:, columns] = CP, CP.T
-        own = CP[:, : self._p] @ C.T + block_diagonal(covariances[:, :k, :k])
+        own = CP[:, : self._p] @ C.T + noise
         self.P[np.ix_(columns, columns)] = 0.5 * (own + own.T)
 
     def _make_room(self, m: int) -> IntArray:

@@ -54,8 +54,8 @@ class MovingLandmarksCovariance(JointCovariance):
         J = np.stack([self._turning(points), self._turning(u)], axis=1)
         self._propagate(motion, J.reshape(-1, self._p))
 
-    def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
-        super()._insert(rows, C, covariances)
+    def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        super()._insert(rows, C, noise)
         # Of their velocities nothing is known yet.
         columns = self._columns(rows) + self._axes.point
         self.P[columns] = self.P[:, columns] = 0.0

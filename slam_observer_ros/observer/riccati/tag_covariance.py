@@ -76,8 +76,8 @@ class TagCovariance(JointCovariance):
         columns = self._turn_columns(rows)
         return self.P[columns], self.P[np.ix_(columns, columns)]
 
-    def _insert(self, rows: IntArray, C: FloatArray, covariances: FloatArray) -> None:
-        super()._insert(rows, C, covariances)
+    def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        super()._insert(rows, C, noise)
         self.forget_turns(rows)
 
     def _turn_columns(self, rows: IntArray) -> IntArray:

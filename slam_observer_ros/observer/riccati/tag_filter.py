@@ -13,6 +13,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose, with_blocks
+from slam_observer_ros.observer.known_points import KnownPoints
 from slam_observer_ros.observer.orientations import (
     flip_verdicts,
     LandmarkOrientations,
@@ -123,10 +124,10 @@ class RiccatiTagFilter(RiccatiFilter):
         super().add(points, covariances)
         self.orientations.add(len(points))
 
-    def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
+    def add_known(self, known: KnownPoints) -> None:
         """Append landmarks of a map, as yet without orientation."""
-        super().add_known(y_ref, covariances)
-        self.orientations.add(len(y_ref))
+        super().add_known(known)
+        self.orientations.add(len(known))
 
     def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
         """Take landmarks for new ones, without orientation."""

@@ -37,6 +37,7 @@ from slam_observer_ros.geometry.matrices import (
 )
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
+from slam_observer_ros.observer.known_points import KnownPoints
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled.core import Core, regression
@@ -111,10 +112,10 @@ class ScheduledFilter(Filter):
         y_ref, noise = self.observer.y_ref[-len(points) :], self.observer.turned(covariances)
         self._postponed.add(self._output_matrix(y_ref), self._noise(noise))
 
-    def add_known(self, y_ref: FloatArray, covariances: FloatArray) -> None:
-        """Append landmarks (m,) as certain as the map has them."""
-        super().add_known(y_ref, covariances)
-        N = self._noise(covariances)
+    def add_known(self, known: KnownPoints) -> None:
+        """Append landmarks (m,) as certain as the map has each of them."""
+        super().add_known(known)
+        N = self._noise(known.covariances)
         self._postponed.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
 
     def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:

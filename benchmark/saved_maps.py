@@ -1,0 +1,181 @@
+"""What correlations in a saved map are worth to the next run, simulated, and what they take.
+
+``python benchmark/saved_maps.py`` prints the tables of docs/localise_in_a_map.md. A robot maps
+most of a loop and saves the map; later it starts somewhere, finds itself in it, and goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import product
+import multiprocessing
+import os
+from pathlib import Path
+import sys
+import tempfile
+import time
+
+import numpy as np
+from worlds import drive, Loop, simulated_settings, World
+
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.evaluation.configuration_error import ConfigurationError
+from slam_observer_ros.evaluation.consistency import normalised_squared_errors
+from slam_observer_ros.evaluation.metrics import pose_errors
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.alignment import rigid_alignment
+from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.geometry.matrices import diagonal_blocks
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_file import read_map, write_map
+from slam_observer_ros.sensor_models.calibration import without_calibration
+
+MAPPED_S, LOCALISED_S, CHECKPOINT_S = 50.0, 60.0, 2.0
+
+LOOPS = {
+    '3D stereo': Loop('stereo_inertial', 60.0, MAPPED_S + LOCALISED_S, 20, 6.0, 5),
+    'wheeled': Loop('wheeled_bearing_range', 60.0, MAPPED_S + LOCALISED_S, 20, 6.0, 5),
+}
+"""The map is saved before the loop is closed, when its ends know little of each other."""
+
+ERRORS = ('correlated', 'independent')
+SIZES = (100, 500, 1000)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One run in a saved map."""
+
+    loop: str
+    errors: str
+    seed: int
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
+    parser.add_argument('--seeds', type=int, default=50, help='runs a row')
+    args = parser.parse_args()
+    os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
+    rows = list(product(LOOPS, ERRORS))
+    jobs = [Job(*row, seed) for row in rows for seed in range(args.seeds)]
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
+        figures = np.array(list(pool.map(run, jobs))).reshape(len(rows), args.seeds, -1)
+    sys.stdout.write('\n'.join([*table(rows, figures), '', *file_table()]) + '\n')
+
+
+def table(rows: list[tuple[str, str]], figures: FloatArray) -> Iterator[str]:
+    """Yield the lines of the table, for the figures (rows, seeds, 4) of all runs."""
+    yield (
+        '| loop | errors of the map | position error | heading error | ANEES of the pose '
+        '| ANEES of pose and landmarks |'
+    )
+    yield '| --- | --- | --- | --- | --- | --- |'
+    for row, of_runs in zip(rows, figures, strict=True):
+        mean = np.nanmean(of_runs, axis=0)
+        position_m, turn_rad = np.sqrt(mean[:2])
+        errors = f'{100.0 * position_m:.1f} cm | {np.degrees(turn_rad):.2f}°'
+        yield f'| {" | ".join(row)} | {errors} | {mean[2]:.2f} | {mean[3]:.2f} |'
+
+
+def file_table() -> Iterator[str]:
+    """Yield the lines of the table of what files take."""
+    yield '| landmarks | file | without correlations | to write | to read |'
+    yield '| --- | --- | --- | --- | --- |'
+    for n in SIZES:
+        root = np.random.default_rng(0).normal(scale=0.01, size=(3 * n, 3 * n + 3))
+        joint, points = root @ root.T, 10.0 * root[:, :3].reshape(n, 9)[:, :3]
+        covariances = diagonal_blocks(joint, 3).copy()
+        known = LandmarkMap(np.arange(n), points, covariances, np.full(n, 9))
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / 'map.yaml'
+            write_map(path, known, None)
+            without_mb = path.stat().st_size / 1e6
+            start_s = time.process_time()
+            write_map(path, replace(known, joint_covariance=joint), None)
+            written_s = time.process_time()
+            read_map(path)
+            read_s = time.process_time()
+            megabytes = f'{path.stat().st_size / 1e6:.1f} MB | {without_mb:.2f} MB'
+        yield f'| {n} | {megabytes} | {written_s - start_s:.1f} s | {read_s - written_s:.1f} s |'
+
+
+def run(job: Job) -> FloatArray:
+    """Return squared errors of position and heading, m² and rad², and the NEES of two kinds."""
+    loop = LOOPS[job.loop]
+    settings = without_calibration(simulated_settings(loop.config))
+    world = drive(loop, settings, job.seed)
+    first = Estimator(settings)
+    for event in world.part(0.0, MAPPED_S).events:
+        first.add(event)
+    known = saved(first.landmark_map)
+    frame = frame_of(known, world, settings.two_d_mode)
+    if job.errors == 'independent':
+        known = replace(known, joint_covariance=None)
+    second = Estimator(replace(settings, localization_mode='uncertain'))
+    second.load_map(known)
+    figures, due_s = [], MAPPED_S
+    for event in world.part(MAPPED_S, MAPPED_S + LOCALISED_S).events:
+        second.add(event)
+        is_due = isinstance(event, ObservationEvent) and event.stamp_ns >= due_s * 1e9
+        if is_due and second.is_localised:
+            figures.append(compared(second, world, frame, event.stamp_ns))
+            due_s += CHECKPOINT_S
+    return np.mean(figures, axis=0)
+
+
+def saved(landmark_map: LandmarkMap) -> LandmarkMap:
+    """Return a map as it comes out of a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'map.yaml'
+        write_map(path, landmark_map, None)
+        return read_map(path)
+
+
+def frame_of(known: LandmarkMap, world: World, two_d_mode: bool) -> FloatArray:
+    """Return the map's frame (4, 4) in the world: what its landmarks say, by their covariance."""
+    axes, truth = axes_of(two_d_mode), world.landmarks.world_points[known.ids]
+    joint, k = known.joint_covariance, axes.point
+    if joint is None:
+        raise ValueError('the map has no joint covariance')
+    n = len(known.ids)
+    P = joint.reshape(n, 3, n, 3)[:, :k, :, :k].reshape(n * k, n * k)
+    # Of the error of a map's shape P says that it is at right angles to p directions.
+    N = np.linalg.eigh(P)[1][:, : axes.p]
+    T = rigid_alignment(truth, known.world_points)
+    for _ in range(5):
+        errors = (known.world_points - se3.transform(T, truth))[:, :k].ravel()
+        G = axes.output_matrix(known.world_points).reshape(-1, axes.p)
+        T = se3.exp(axes.full_pose(np.linalg.solve(N.T @ G, N.T @ errors))) @ T
+    return T
+
+
+def compared(
+    estimator: Estimator, world: World, frame: FloatArray, stamp_ns: int
+) -> tuple[float, float, float, float]:
+    """Return what :func:`run` does, of one instant."""
+    pose = frame @ world.truth.poses[np.searchsorted(world.truth.stamps_ns, stamp_ns)]
+    truth = world.landmarks.world_points
+    error = pose_errors(estimator.pose, pose)
+    nees, freedom = normalised_squared_errors(error, estimator.pose_covariance)
+    configuration = ConfigurationError()
+    configuration.add(
+        stamp_ns,
+        estimator.pose,
+        estimator.landmark_ids,
+        estimator.world_points,
+        pose,
+        replace(world.landmarks, world_points=se3.transform(frame, truth)),
+        estimator.configuration_covariance,
+    )
+    squares = float(np.sum(error[3:] ** 2)), float(error[2] ** 2)
+    return *squares, float(nees / freedom), configuration.anees or float('nan')
+
+
+if __name__ == '__main__':
+    main()
