@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import replace
+import itertools
 import time
 from unittest.mock import Mock
 
@@ -409,18 +410,29 @@ def test_looped_recording_without_simulated_time_begins_path_and_tf_again(ros, t
         Robot(ros, namespace=namespace) as robot,
     ):
         ros.wait_for_subscriber(sender.dynamic)
-        for start_ns in (100 * SECOND, 50 * SECOND):
-            for step in range(40):
-                stamp = start_ns + step * SECOND // 20
-                sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=stamp)
-                robot.send(VelocityEvent(stamp, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
-                ros.spin_for(0.01)
-        ros.spin_until(lambda: paths and stamp_ns(paths[-1]) < 60 * SECOND, 'the second run')
+
+        def send(stamp):
+            sender.send(('odom', 'base_link', np.eye(4)), stamp_ns=stamp)
+            robot.send(VelocityEvent(stamp, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])))
+            ros.spin_for(0.01)
+
+        for stamp in range(100 * SECOND, 102 * SECOND, SECOND // 20):
+            send(stamp)
+        # Held up on its way, the beginning may seem to be of the first run, late.
+        again = itertools.count(50 * SECOND, SECOND // 20)
         ros.spin_until(
-            lambda: any(stamp_ns(t) < 60 * SECOND for t in corrections(transforms)), 'its /tf'
+            lambda: (paths and stamp_ns(paths[-1]) < 100 * SECOND) or send(next(again)),
+            'the second run',
+        )
+        ros.spin_until(
+            lambda: (
+                any(stamp_ns(t) < 100 * SECOND for t in corrections(transforms))
+                or send(next(again))
+            ),
+            'its /tf',
         )
     stamps = [stamp_ns(pose) for pose in paths[-1].poses]
-    assert max(stamps) < 60 * SECOND, 'the path still has poses of the first run'
+    assert max(stamps) < 100 * SECOND, 'the path still has poses of the first run'
     assert node.output.count('The clock has jumped') == 1
 
 
