@@ -163,7 +163,7 @@ class RiccatiTagFilter(RiccatiFilter):
         self.joint.copy_turns(of_new, new)
         seen = self._settings.max_rejections
         tags.put_known(new, tags.B[of_new], tags.map_sigmas[of_new], seen)
-        # … and those that both have, B̂_i B̂_jᵀ = exp(ω_i − ω_j), unless they contradict
+        # … and those that both have, B̂_i B̂_jᵀ = exp(ω_i − ω_j), unless they are contradictory.
         rows, copies = rows[in_map & own], copies[in_map & own]
         omega = self.axes.turns(so3.log(tags.B[rows] @ transpose(tags.B[copies])))
         R = RESOLUTION_RAD**2 * np.tile(np.eye(self.axes.turn), (len(rows), 1, 1))
