@@ -7,7 +7,7 @@ most of a loop and saves the map; later it starts somewhere, finds itself in it,
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
@@ -19,6 +19,8 @@ import tempfile
 import time
 
 import numpy as np
+from odometry import Event
+import tags
 from worlds import drive, Loop, simulated_settings, World
 
 from slam_observer_ros.common.types import FloatArray
@@ -27,15 +29,18 @@ from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import normalised_squared_errors
 from slam_observer_ros.evaluation.metrics import pose_errors
 from slam_observer_ros.events import ObservationEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.geometry.matrices import diagonal_blocks
+from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
 from slam_observer_ros.sensor_models.calibration import without_calibration
 
 MAPPED_S, LOCALISED_S, CHECKPOINT_S = 50.0, 60.0, 2.0
+
+TAGS = '3D, tags'
+TAG_CASE, TAGS_IN_VIEW = tags.Case('', sigma_rad=0.05), 2
 
 LOOPS = {
     '3D stereo': Loop('stereo_inertial', 60.0, MAPPED_S + LOCALISED_S, 20, 6.0, 5),
@@ -62,7 +67,7 @@ def main() -> None:
     parser.add_argument('--seeds', type=int, default=50, help='runs a row')
     args = parser.parse_args()
     os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
-    rows = list(product(LOOPS, ERRORS))
+    rows = list(product((*LOOPS, TAGS), ERRORS))
     jobs = [Job(*row, seed) for row in rows for seed in range(args.seeds)]
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn')) as pool:
         figures = np.array(list(pool.map(run, jobs))).reshape(len(rows), args.seeds, -1)
@@ -107,26 +112,36 @@ def file_table() -> Iterator[str]:
 
 def run(job: Job) -> FloatArray:
     """Return squared errors of position and heading, m² and rad², and the NEES of two kinds."""
-    loop = LOOPS[job.loop]
-    settings = without_calibration(simulated_settings(loop.config))
-    world = drive(loop, settings, job.seed)
+    if job.loop == TAGS:
+        world, events = tags.drive_past_tags(TAG_CASE, TAGS_IN_VIEW, job.seed)
+        settings = tags.settings_of(TAG_CASE, world)
+        turned = tags.tilted_tags(len(world.landmarks.ids), tags.orientation_rng(job.seed))
+    else:
+        settings = without_calibration(simulated_settings(LOOPS[job.loop].config))
+        world, turned = drive(LOOPS[job.loop], settings, job.seed), None
+        events = world.events
     first = Estimator(settings)
-    for event in world.part(0.0, MAPPED_S).events:
+    for event in between(events, 0.0, MAPPED_S):
         first.add(event)
     known = saved(first.landmark_map)
-    frame = frame_of(known, world, settings.two_d_mode)
+    frame = frame_of(known, world.landmarks.world_points, turned, settings.two_d_mode)
     if job.errors == 'independent':
         known = replace(known, joint_covariance=None)
     second = Estimator(replace(settings, localization_mode='uncertain'))
     second.load_map(known)
     figures, due_s = [], MAPPED_S
-    for event in world.part(MAPPED_S, MAPPED_S + LOCALISED_S).events:
+    for event in between(events, MAPPED_S, MAPPED_S + LOCALISED_S):
         second.add(event)
         is_due = isinstance(event, ObservationEvent) and event.stamp_ns >= due_s * 1e9
         if is_due and second.is_localised:
             figures.append(compared(second, world, frame, event.stamp_ns))
             due_s += CHECKPOINT_S
     return np.mean(figures, axis=0)
+
+
+def between(events: Sequence[Event], from_s: float, to_s: float) -> list[Event]:
+    """Return the events of a part of a run that begins at stamp 0."""
+    return [event for event in events if from_s <= event.stamp_ns * 1e-9 <= to_s]
 
 
 def saved(landmark_map: LandmarkMap) -> LandmarkMap:
@@ -137,20 +152,26 @@ def saved(landmark_map: LandmarkMap) -> LandmarkMap:
         return read_map(path)
 
 
-def frame_of(known: LandmarkMap, world: World, two_d_mode: bool) -> FloatArray:
-    """Return the map's frame (4, 4) in the world: what its landmarks say, by their covariance."""
-    axes, truth = axes_of(two_d_mode), world.landmarks.world_points[known.ids]
-    joint, k = known.joint_covariance, axes.point
-    if joint is None:
-        raise ValueError('the map has no joint covariance')
-    n = len(known.ids)
-    P = joint.reshape(n, 3, n, 3)[:, :k, :, :k].reshape(n * k, n * k)
+def frame_of(
+    known: LandmarkMap, true_points: FloatArray, turned: FloatArray | None, two_d_mode: bool
+) -> FloatArray:
+    """Return the map's frame (4, 4) in the world: what its landmarks say, by their covariance.
+
+    Of all landmarks by id: ``true_points`` (…, 3), and how tags are ``turned`` (…, 3, 3).
+    """
+    axes, truth, at = axes_of(two_d_mode), true_points[known.ids], known.tags
+    P = known.landmarks_in(np.eye(4), 0.0).joint_on(axes)
     # Of the error of a map's shape P says that it is at right angles to p directions.
     N = np.linalg.eigh(P)[1][:, : axes.p]
     T = rigid_alignment(truth, known.world_points)
     for _ in range(5):
-        errors = (known.world_points - se3.transform(T, truth))[:, :k].ravel()
+        errors = (known.world_points - se3.transform(T, truth))[:, : axes.point].ravel()
         G = axes.output_matrix(known.world_points).reshape(-1, axes.p)
+        if turned is not None and known.orientations is not None:
+            there = T[:3, :3] @ turned[known.ids[at]]
+            turns = axes.turns(so3.log(known.orientations[at] @ transpose(there)))
+            errors = np.append(errors, turns)
+            G = np.vstack([G, np.tile(np.eye(axes.turn, axes.p), (len(at), 1))])
         T = se3.exp(axes.full_pose(np.linalg.solve(N.T @ G, N.T @ errors))) @ T
     return T
 

@@ -24,6 +24,7 @@ from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.sensor_models.calibration import without_calibration
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.tag_orientations import flipped
 
 MAX_SEEN = (1, 2, 5)
@@ -86,8 +87,8 @@ def drive_past_tags(case: Case, max_seen: int, seed: int) -> tuple[World, list[E
     """Drive past tags, and return what is seen of them: poses, if the case has orientations."""
     loop = Loop('stereo_inertial', 60.0, 120.0, 20, 5.0, 5, max_seen=max_seen)
     world = drive(loop, without_calibration(simulated_settings(loop.config)), seed)
-    rng = np.random.default_rng(seed + 99)
-    tags = so3.exp(TAG_TILT_RAD * rng.standard_normal((loop.landmarks, 3)))
+    rng = orientation_rng(seed)
+    tags = tilted_tags(loop.landmarks, rng)
     flip_rng = np.random.default_rng([seed, loop.landmarks])
     events: list[Event] = []
     for event in world.events:
@@ -102,21 +103,35 @@ def drive_past_tags(case: Case, max_seen: int, seed: int) -> tuple[World, list[E
     return world, events
 
 
+def orientation_rng(seed: int) -> np.random.Generator:
+    """Return what draws how the tags are turned, and then the noise of what is seen of that."""
+    return np.random.default_rng(seed + 99)
+
+
+def tilted_tags(count: int, rng: np.random.Generator) -> FloatArray:
+    """Return how the tags are turned (count, 3, 3), the first that ``rng`` draws."""
+    return so3.exp(TAG_TILT_RAD * rng.standard_normal((count, 3)))
+
+
 def true_pose(world: World, stamp_ns: int) -> FloatArray:
     """Return the pose (4, 4) at the stamp of an event."""
     pose: FloatArray = world.truth.poses[np.searchsorted(world.truth.stamps_ns, stamp_ns)]
     return pose
 
 
-def score(case: Case, world: World, events: Sequence[Event]) -> FloatArray:
-    """Return errors of configuration, m, and heading, rad, and ANEES of both and the pose."""
-    settings = replace(
+def settings_of(case: Case, world: World) -> Settings:
+    """Return the settings of an estimator for a case."""
+    return replace(
         world.settings,
         use_tag_orientation=case.sigma_rad > 0.0,
         orientation_noise=case.sigma_rad or world.settings.orientation_noise,
         relinearization_interval=world.settings.relinearization_interval * case.relinearises,
     )
-    estimator, configuration = Estimator(settings), ConfigurationError()
+
+
+def score(case: Case, world: World, events: Sequence[Event]) -> FloatArray:
+    """Return errors of configuration, m, and heading, rad, and ANEES of both and the pose."""
+    estimator, configuration = Estimator(settings_of(case, world)), ConfigurationError()
     errors, covariances = [], []
     for event in events:
         estimator.add(event)

@@ -120,7 +120,8 @@ def check_map(landmark_map: LandmarkMap) -> None:
             _check_array('map covariances', landmark_map.covariances, (n, 3, 3))
             _check_definite('map covariances', landmark_map.covariances)
         if landmark_map.joint_covariance is not None:
-            _check_array('joint map covariance', landmark_map.joint_covariance, (3 * n, 3 * n))
+            size = 3 * (n + len(landmark_map.tags))
+            _check_array('joint map covariance', landmark_map.joint_covariance, (size, size))
         if landmark_map.orientations is not None:
             _check_rotations('map orientations', landmark_map.orientations, n)
         if landmark_map.orientation_sigmas is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, Immutable
+from slam_observer_ros.common.types import FloatArray, Immutable, IntArray
 from slam_observer_ros.geometry import so3
 
 
@@ -17,8 +17,8 @@ class EstimatedAxes(Immutable):
         EstimatedAxes of the pose error ε = (Ω, v), and how many these are.
     point : int
         Leading axes of a point, 2 or 3.
-    turn : int
-        Leading axes of ε that are turns, 1 or 3: about z, or about all.
+    turn, turned : int, IntArray
+        Leading axes of ε that are turns, 1 or 3, and which: about z, or about all.
 
     """
 
@@ -27,6 +27,7 @@ class EstimatedAxes(Immutable):
         self.p: int = pose.stop - pose.start
         self.point = point
         self.turn: int = 3 - pose.start
+        self.turned: IntArray = np.arange(pose.start, 3)
         self._turned = slice(pose.start, 3)
         self._shape = (-1, point, self.p)
         turns = np.concatenate([-so3.hat(np.eye(3)), np.zeros((3, 3, 3))], axis=2)

@@ -27,31 +27,41 @@ def map_of(state: State, loaded: LandmarkMap | None) -> LandmarkMap:
     rows = rows[np.linalg.norm(state.observer.u[rows], axis=1) < MOVING_SPEED]
     if state.is_fixed and loaded is not None:
         return _exact_map(state, rows, loaded)
-    covariances, joint = _covariances_of(state, rows, loaded is None)
-    orientations, sigmas = _orientations_of(state, rows)
-    return LandmarkMap(
+    landmark_map = LandmarkMap(
         state.landmarks.ids[rows],
         state.world_points[rows],
-        covariances,
+        None,
         state.landmarks.counts[rows],
-        orientations=orientations,
-        orientation_sigmas=sigmas,
-        joint_covariance=joint,
+        orientations=_orientations_of(state, rows),
     )
+    return _with_covariances(landmark_map, state, rows, loaded is None)
 
 
-def _covariances_of(
-    state: State, rows: IntArray, is_own_frame: bool
-) -> tuple[FloatArray | None, FloatArray | None]:
-    """Return covariances (m, 3, 3) and, unless they are too many, the joint one (3 m, 3 m), m²."""
-    are_many = len(rows) > MAX_CORRELATED
-    if are_many and not is_own_frame:  # of those a map of any size could be loaded
-        of_all = state.landmark_covariances()
-        return None if of_all is None else with_variances_above(0.0, of_all[rows]), None
-    joint = joint_covariance(state, rows, is_own_frame)
-    if joint is None:
-        return None, None
-    return diagonal_blocks(joint, 3).copy(), None if are_many else joint
+def _with_covariances(
+    landmark_map: LandmarkMap, state: State, rows: IntArray, is_own_frame: bool
+) -> LandmarkMap:
+    """Return the map of landmarks ``rows`` with what is known of its errors.
+
+    That is, unless there are too many, the joint covariance, too.
+    """
+    n, tags, sigmas = len(rows), landmark_map.tags, np.zeros(len(rows))
+    if n > MAX_CORRELATED and not is_own_frame:  # of those a map of any size could be loaded
+        joint, of_all = None, state.landmark_covariances()
+        covariances = None if of_all is None else with_variances_above(0.0, of_all[rows])
+    else:
+        joint = joint_covariance(state, rows, rows[tags], is_own_frame)
+        covariances = None if joint is None else diagonal_blocks(joint[: 3 * n, : 3 * n], 3).copy()
+    if joint is not None:
+        of_turns = diagonal_blocks(joint[3 * n :, 3 * n :], 3)
+        sigmas[tags] = np.sqrt(np.maximum(np.linalg.eigvalsh(of_turns)[:, -1], 0.0))
+    elif len(tags):
+        sigmas[tags] = state.filter.orientation_sigmas(rows[tags])
+    return replace(
+        landmark_map,
+        covariances=covariances,
+        orientation_sigmas=sigmas if len(tags) else None,
+        joint_covariance=None if n > MAX_CORRELATED else joint,
+    )
 
 
 def _exact_map(state: State, rows: IntArray, loaded: LandmarkMap) -> LandmarkMap:
@@ -61,11 +71,10 @@ def _exact_map(state: State, rows: IntArray, loaded: LandmarkMap) -> LandmarkMap
     return replace(loaded.select(at), counts=state.landmarks.counts[rows])
 
 
-def _orientations_of(state: State, rows: IntArray) -> tuple[FloatArray | None, FloatArray | None]:
-    """Return orientations (m, 3, 3) in the world, and standard deviations (m,), rad."""
+def _orientations_of(state: State, rows: IntArray) -> FloatArray | None:
+    """Return orientations (m, 3, 3) in the world."""
     tags = state.filter.orientations
     if tags is None or not tags.are_known[rows].any():
-        return None, None
-    return state.observer.reference_pose[:3, :3] @ tags.B[rows], state.filter.orientation_sigmas(
-        rows
-    ) * tags.are_known[rows]
+        return None
+    world: FloatArray = state.observer.reference_pose[:3, :3] @ tags.B[rows]
+    return world

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.observer.known_points import blocks_at, KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks, part_of_joint, tags_among
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 
 
@@ -26,7 +26,8 @@ class LandmarkMap:
     # (n, 3, 3) of tags, from their own axes, all zero for points; None if all are points
     orientations: FloatArray | None = None
     orientation_sigmas: FloatArray | None = None  # (n,) of rotation vectors, rad, each axis
-    # (3 n, 3 n) of all positions together, m²; its blocks on the diagonal are the covariances
+    # (3 (n + t), …) of all positions together, m², whose blocks on the diagonal are the
+    # covariances, and then of the rotation vectors, map axes, of the t that have an orientation
     joint_covariance: FloatArray | None = None
 
     def select(self, rows: IntArray | BoolArray) -> LandmarkMap:
@@ -34,6 +35,8 @@ class LandmarkMap:
 
         def part(array: FloatArray | None) -> FloatArray | None:
             return None if array is None else array[rows]
+
+        joint = self.joint_covariance
 
         return LandmarkMap(
             self.ids[rows],
@@ -43,8 +46,13 @@ class LandmarkMap:
             self.frame_id,
             part(self.orientations),
             part(self.orientation_sigmas),
-            None if self.joint_covariance is None else blocks_at(self.joint_covariance, rows),
+            None if joint is None else part_of_joint(joint, len(self.ids), self.tags, rows),
         )
+
+    @property
+    def tags(self) -> IntArray:
+        """(t,) rows of landmarks with an orientation."""
+        return tags_among(self.orientations)
 
     @property
     def is_planar(self) -> bool:
@@ -63,8 +71,8 @@ class LandmarkMap:
             return self.covariances
         return np.tile(sigma_m**2 * np.eye(3), (len(self.ids), 1, 1))
 
-    def points_in(self, T: FloatArray, sigma_m: float) -> KnownPoints:
-        """Return positions and covariances, or :meth:`covariances_or`, in another frame.
+    def landmarks_in(self, T: FloatArray, sigma_m: float) -> KnownLandmarks:
+        """Return the landmarks with covariances, or :meth:`covariances_or`, in another frame.
 
         ``T`` (4, 4) leads into it.
         """
@@ -73,4 +81,6 @@ class LandmarkMap:
             # A map's shape says nothing of a motion of everything: that is all but exact, and as
             # it concerns all landmarks information about it would drown all other in rounding.
             joint = joint + RESOLUTION_M**2 * np.eye(len(joint))
-        return KnownPoints(self.world_points, covariances, joint).moved(T)
+        return KnownLandmarks(
+            self.world_points, covariances, joint, self.orientations, self.orientation_sigmas
+        ).moved(T)

@@ -9,7 +9,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.observer.gauge import anchor, JITTER_M2
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 
 MAX_TURN_STD_RAD = 0.2
 """Standard deviation about any axis beyond which landmarks don't determine the attitude.
@@ -24,7 +24,7 @@ CONTRADICTION_SIGMAS = 4.0
 def find_transform(
     source: FloatArray,
     source_covariance: FloatArray,
-    target: KnownPoints,
+    target: KnownLandmarks,
     axes: EstimatedAxes,
 ) -> tuple[FloatArray, BoolArray] | None:
     """Find the transform between the frames of two maps, even if some landmarks are wrong.
@@ -35,7 +35,7 @@ def find_transform(
         (m, 3) landmarks in the robot's own frame, metres.
     source_covariance : FloatArray
         (p + m k, p + m k) covariance of the pose's error and theirs together, rad² and m².
-    target : KnownPoints
+    target : KnownLandmarks
         The same m landmarks in the other frame.
     axes : EstimatedAxes
         Whether they lie in space (k = 3) or in a plane (k = 2).
@@ -81,7 +81,7 @@ def _improbable(degrees_of_freedom: int) -> float:
     return float(special.chdtri(degrees_of_freedom, both_tails))
 
 
-def _aligned(source: FloatArray, own: FloatArray, target: KnownPoints) -> FloatArray:
+def _aligned(source: FloatArray, own: FloatArray, target: KnownLandmarks) -> FloatArray:
     """Return the transform (4, 4) that aligns landmarks weighted by how well each is known."""
     variances = np.diagonal(own).reshape(len(source), -1).sum(axis=1)
     variances = variances + np.trace(target.covariances, axis1=1, axis2=2) + JITTER_M2

@@ -4,8 +4,9 @@ The line stands below the landmarks::
 
     correlations: {checksum: 2596996162, data: "eJwBCA…"}
 
-``data`` is the covariance (3 n, 3 n) of all positions together, m², in the order of the file: of
-its rows the entries up to the diagonal as little-endian 64-bit floats, compressed by zlib, in
+``data`` is the covariance of x y z of all landmarks together, m², in the order of the file, and
+then of the rotation vectors, along the axes of the map, of those with an orientation, rad². Of its
+rows it has the entries up to the diagonal as little-endian 64-bit floats, compressed by zlib, in
 base64. ``checksum`` is the CRC-32 of what the lines of the landmarks say, as floats of the same
 kind: of each its id, position, sigma or covariance, orientation and orientation_sigma. So nobody
 changes a landmark, and leaves correlations that are not those of the new one.
@@ -37,13 +38,13 @@ _ROUNDING = 1e-6
 """By how much correlations may be off, or have a negative eigenvalue."""
 
 _LEAST_DEVIATION = 1e-4
-"""Metres; entries of smaller standard deviations are compared with this one."""
+"""Metres or rad; entries of smaller standard deviations are compared with this one."""
 
 _COUNTED = ('id', 'position', 'sigma', 'covariance', 'orientation', 'orientation_sigma')
 
 
 def as_lines(joint: FloatArray | None, landmarks: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the line for a covariance (3 n, 3 n), m², of ``landmarks`` as they are written.
+    """Return the line for a joint covariance of ``landmarks`` as they are written.
 
     And no line where there is none, or with a warning where it is too large.
     """
@@ -65,7 +66,7 @@ def as_lines(joint: FloatArray | None, landmarks: Sequence[Mapping[str, Any]]) -
 def parse(
     content: Any, landmarks: Sequence[Mapping[str, Any]], covariances: FloatArray | None
 ) -> FloatArray:
-    """Return the covariance (3 n, 3 n), m², of ``landmarks`` as they were read.
+    """Return the joint covariance of ``landmarks`` as they were read.
 
     Raise :exc:`MapError` if it can't be right, or is not that of these landmarks, each of which
     has one of the ``covariances`` (n, 3, 3), m².
@@ -88,13 +89,14 @@ def _parsed(
         raise MapError('a landmark was added, removed, moved or changed since')
     if covariances is None:
         raise MapError('the landmarks have no covariances')
-    joint = _decoded(content['data'], 3 * len(landmarks))
+    tags = sum('orientation' in row for row in landmarks)
+    joint = _decoded(content['data'], 3 * (len(landmarks) + tags))
     check_joint(joint, covariances)
     return joint
 
 
 def check_joint(joint: FloatArray, covariances: FloatArray) -> None:
-    """Check a covariance (3 n, 3 n), m², against those of the landmarks (n, 3, 3).
+    """Check a joint covariance of n or more vectors against those of the landmarks (n, 3, 3).
 
     Raise :exc:`MapError` if there are others on its diagonal, or it is none.
     """
@@ -102,9 +104,10 @@ def check_joint(joint: FloatArray, covariances: FloatArray) -> None:
     deviations = np.sqrt(np.maximum(np.diagonal(joint), _LEAST_DEVIATION**2))
     scaled = joint / deviations
     scaled /= deviations[:, None]
-    units = deviations.reshape(-1, 3)
+    n = len(covariances)
+    units = deviations.reshape(-1, 3)[:n]
     own = covariances / (units[:, :, None] * units[:, None, :])
-    if np.abs(diagonal_blocks(scaled, 3) - own).max() > _ROUNDING:
+    if np.abs(diagonal_blocks(scaled, 3)[:n] - own).max() > _ROUNDING:
         raise MapError('a landmark has another covariance there')
     if np.abs(scaled - scaled.T).max() > _ROUNDING:
         raise MapError('they are not symmetric')
@@ -128,7 +131,8 @@ def _decoded(data: Any, size: int) -> FloatArray:
     except (binascii.Error, ValueError, zlib.error) as error:
         raise MapError(f"'data' is damaged ({error})") from error
     if len(raw) != expected or not unpacking.eof or unpacking.unused_data:
-        raise MapError(f"'data' does not have {expected} bytes, as of {size // 3} landmarks")
+        vectors = f'{size // 3} positions and orientations'
+        raise MapError(f"'data' does not have {expected} bytes, as of {vectors}")
     values = np.frombuffer(raw, '<f8').astype(np.float64)
     if not np.isfinite(values).all():
         raise MapError('an entry is NaN or infinite')

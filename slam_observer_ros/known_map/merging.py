@@ -21,7 +21,7 @@ from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_alignment import find_transform
 from slam_observer_ros.observer.gauge import JITTER_M2
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.state.state import State
 
 ROUNDING = 1e-14
@@ -69,31 +69,36 @@ def enter_map(state: State, known: LandmarkMap) -> bool:
     return True
 
 
-def joint_covariance(state: State, rows: IntArray, is_own_frame: bool) -> FloatArray | None:
-    """Return the covariance (3 m, 3 m) of landmarks ``rows`` together, world axes, m².
+def joint_covariance(
+    state: State, rows: IntArray, tags: IntArray, is_own_frame: bool
+) -> FloatArray | None:
+    """Return the covariance (3 (m + t), …) of landmarks ``rows`` (m,) together, world axes.
 
-    A frame of one's own starts where the robot did, and all landmarks share the error of how they
-    lie to that pose. Who loads the map knows it by its landmarks alone: what remains is the error
-    of its shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None
-    where the gains know no joint covariance.
+    Of their positions, m², and of the rotation vectors of ``tags`` (t,) among them. A frame of
+    one's own starts where the robot did, and all landmarks share the error of how they lie to that
+    pose. Who loads the map knows it by its landmarks alone: what remains is the error of its
+    shape, P − G (Gᵀ P⁻¹ G)⁻¹ Gᵀ, with G as in :mod:`slam_observer_ros.observer.gauge`. None where
+    the gains know no joint covariance.
     """
-    m, axes = len(rows), state.axes
-    k, points = axes.point, state.filter.points[rows]
+    m, axes, points = len(rows), state.axes, state.filter.points[rows]
     joint = state.filter.joint
-    with_pose = None if joint is None else joint.with_pose(rows, points)
-    if with_pose is None or m == 0:
-        return None if with_pose is None else np.zeros((0, 0))
+    P = None if joint is None else joint.of_landmarks(rows, points, tags)
+    if P is None or m == 0:
+        return P
     # As the square of a root, so that rounding makes no variance negative, however small it is.
-    L = _lower_root(with_pose[axes.p :, axes.p :])
+    L = _lower_root(P)
     if is_own_frame:
-        G = axes.output_matrix(points - points.mean(axis=0)).reshape(m * k, -1)
+        G = axes.output_matrix(points - points.mean(axis=0)).reshape(-1, axes.p)
+        G = np.vstack([G, np.tile(np.eye(axes.turn, axes.p), (len(tags), 1))])
         Q = orth(solve_triangular(L, G, lower=True, check_finite=False), RANK_TOLERANCE)
         L -= (L @ Q) @ Q.T
-    root = np.zeros((m, 3, m * k))
-    root[:, :k] = L.reshape(m, k, m * k)
-    world_root = (state.observer.reference_pose[:3, :3] @ root).reshape(3 * m, m * k)
-    P: FloatArray = world_root @ world_root.T
-    return P
+    of_points, of_turns = np.split(L, [m * axes.point])
+    root = np.zeros((m + len(tags), 3, len(L)))
+    root[:m, : axes.point] = of_points.reshape(m, axes.point, len(L))
+    root[m:, axes.turned] = of_turns.reshape(len(tags), axes.turn, len(L))
+    world_root = (state.observer.reference_pose[:3, :3] @ root).reshape(-1, len(L))
+    world: FloatArray = world_root @ world_root.T
+    return world
 
 
 def _lower_root(P: FloatArray) -> FloatArray:
@@ -113,7 +118,7 @@ def _find_frame(
     covariance = state.filter.joint_covariance(rows)
     if covariance is None:
         covariance = _of_constant_gains(state, rows)
-    target = known.points_in(np.eye(4), state.settings.map_noise)
+    target = known.landmarks_in(np.eye(4), state.settings.map_noise)
     return find_transform(state.filter.points[rows], covariance, target, axes)
 
 
@@ -158,19 +163,7 @@ def _complete(state: State, known: LandmarkMap, added: LandmarkMap) -> None:
     state.is_mapping = mode == 'off'
     if mode == 'fixed':
         _fix(state, known)
-    _take_orientations(state, known)
     state.forget_past('the pose in the loaded map was found')
-
-
-def _take_orientations(state: State, known: LandmarkMap) -> None:
-    """Take in what a map knows of orientations, where they are estimated."""
-    R, sigmas = known.orientations, known.orientation_sigmas
-    if state.filter.orientations is None or R is None or sigmas is None:
-        return
-    rows = state.landmarks.rows_of(known.ids)
-    taken = np.flatnonzero((rows >= 0) & R.any(axis=(1, 2)))
-    B = state.observer.reference_pose[:3, :3].T @ R[taken]
-    state.filter.know_orientations(rows[taken], B, sigmas[taken])
 
 
 def _fix(state: State, known: LandmarkMap) -> None:
@@ -179,9 +172,12 @@ def _fix(state: State, known: LandmarkMap) -> None:
     rows = order[np.searchsorted(known.ids, state.landmarks.ids, sorter=order)]
     exact = _in_reference_frame(state, known.select(rows))
     state.fix_landmarks(exact.points, exact.covariances)
+    R, sigmas, tags = exact.orientations, exact.sigmas, exact.tags
+    if state.filter.orientations is not None and R is not None and sigmas is not None:
+        state.filter.know_orientations(tags, R[tags], sigmas[tags])
 
 
-def _in_reference_frame(state: State, known: LandmarkMap) -> KnownPoints:
+def _in_reference_frame(state: State, known: LandmarkMap) -> KnownLandmarks:
     """Return what a map knows of positions in the frame of P°."""
     back = se3.inverse(state.observer.reference_pose)
-    return known.points_in(back, state.settings.map_noise)
+    return known.landmarks_in(back, state.settings.map_noise)

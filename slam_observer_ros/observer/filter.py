@@ -15,7 +15,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
@@ -96,7 +96,7 @@ class Filter:
         """Append landmarks seen for the first time at ``points``."""
         self.observer.add_landmarks(points)
 
-    def add_known(self, known: KnownPoints) -> None:
+    def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks that a map knows, reference frame; their errors may be correlated."""
         self.observer.add_reference_landmarks(known.points)
 
@@ -134,7 +134,7 @@ class Filter:
         """
         raise NotImplementedError
 
-    def enter_map(self, rows: IntArray, known: KnownPoints) -> None:
+    def enter_map(self, rows: IntArray, known: KnownLandmarks) -> None:
         """Move the estimate to where a map has landmarks ``rows`` (m,), and append its others.
 
         ``known`` (m + …) are these m in the reference frame, then the others. Where the filter

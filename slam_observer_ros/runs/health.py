@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import CalibrationEstimate, Update
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
@@ -43,17 +42,9 @@ def estimator_values(estimator: Diagnosed, dropped: Counter[str]) -> dict[str, s
     values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
     values['landmarks known'] = str(len(estimator.landmark_ids))
     values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
-    values['last observation age [s]'] = _age(update, estimator.stamp_ns)
     values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
     values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
     return values
-
-
-def _age(update: Update | None, stamp_ns: int | None) -> str:
-    """Return how much older an observation is than the estimate, seconds."""
-    if update is None or stamp_ns is None:
-        return 'never'
-    return f'{to_s(stamp_ns - update.stamp_ns):.3f}'
 
 
 def estimator_warnings(estimator: Diagnosed) -> list[str]:

@@ -42,7 +42,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import axes, se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.observer.designs import make_filter
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -600,7 +600,7 @@ def test_a_landmark_without_id_has_had_its_chance_after_so_many_looks_and_not_be
 def state_of(landmarks, points):
     """A state with these landmarks (n, 3), of which the table says what was seen of them."""
     state = State(make_filter(PLANAR, np.eye(4)), PLANAR)
-    state.filter.add_known(KnownPoints(points, np.tile(np.eye(3), (len(points), 1, 1))))
+    state.filter.add_known(KnownLandmarks(points, np.tile(np.eye(3), (len(points), 1, 1))))
     state.landmarks = landmarks
     return state
 

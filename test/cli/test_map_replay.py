@@ -371,4 +371,4 @@ def test_a_table_becomes_a_map_file(slam_observer, tmp_path):
     assert 'exists already' in slam_observer.fail('map', 'convert', table, made)
     table.write_text('7,1\n')
     error = slam_observer.fail('map', 'convert', table, made, '--force')
-    assert "there is no column 'y'" in error
+    assert 'line 1: it needs id, x and y' in error

@@ -27,6 +27,7 @@ from slam_observer_ros.evaluation.plots.drawing import (
     GREEN,
     ORANGE,
     PALE_BLUE,
+    plain_decades,
     PURPLE,
     RED,
 )
@@ -130,6 +131,22 @@ def test_legend_of_a_configuration_covers_nothing(
     assert {'start', 'end', 'landmark estimates on their way'} <= set(names)
     # As the picture in the first run's page: the scene is not lost in an empty figure.
     assert drawn.height > 0.6 * figure.bbox.height
+
+
+@pytest.mark.parametrize(
+    ('limits', 'expected'),
+    [((0.15, 7.0), ['0.2', '0.5', '1', '2', '5']), ((0.05, 2000.0), ['0.1', '1', '10', '100'])],
+)
+def test_a_logarithmic_axis_has_plain_numbers(
+    limits: tuple[float, float], expected: list[str]
+) -> None:
+    axes = Figure(figsize=(6.0, 3.0)).add_subplot()
+    axes.set(yscale='log', ylim=limits)
+    plain_decades(axes)
+    axes.figure.draw_without_rendering()
+    texts = [text.get_text() for text in axes.get_yticklabels(which='both')]
+    assert set(expected) <= set(texts)
+    assert not [text for text in texts if '10^' in text]
 
 
 def test_labels_of_a_map_erase_no_marker(tmp_path: Path, estimate: Trajectory) -> None:

@@ -18,16 +18,19 @@ import yaml
 from slam_observer_ros.common.errors import MapError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
 from slam_observer_ros.geometry.axes import PLANAR
 from slam_observer_ros.geometry.matrices import diagonal_blocks
 from slam_observer_ros.known_map import export, map_correlations
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map, write_map
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
+from slam_observer_ros.observer.riccati.tag_filter import RiccatiTagFilter
+from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 
 TWO_D = replace(PLAIN, two_d_mode=True)
@@ -136,7 +139,7 @@ class TestFile:
             (lambda data: data[:50] + ('A' if data[50] != 'A' else 'B') + data[51:], 'damaged'),
             (lambda data: data[:50] + '?' + data[51:], 'damaged'),
             (lambda data: data + data, 'damaged|does not have'),
-            (lambda data: packed(np.zeros(5)), "'data' does not have 1368 bytes, as of 6 landm"),
+            (lambda data: packed(np.zeros(5)), "'data' does not have 1368 bytes, as of 6 posi"),
             (lambda data: packed(np.zeros(10**6)), "'data' does not have 1368 bytes"),
             (lambda data: packed(np.full(171, np.nan)), 'an entry is NaN or infinite'),
             (lambda data: packed(np.zeros(171)), 'a landmark has another covariance there'),
@@ -193,7 +196,9 @@ class TestInAnotherFrame:
 
     def test_it_turns_with_the_frame(self):
         known, T = a_map(), se3.exp(np.array([0.3, -0.5, 1.0, 4.0, 5.0, 6.0]))
-        there = KnownPoints(known.world_points, known.covariances, known.joint_covariance).moved(T)
+        there = KnownLandmarks(
+            known.world_points, known.covariances, known.joint_covariance
+        ).moved(T)
         turn = np.kron(np.eye(6), T[:3, :3])
         assert_allclose(there.joint, turn @ known.joint_covariance @ turn.T, atol=1e-12)
         assert_allclose(diagonal_blocks(there.joint, 3), there.covariances, atol=1e-12)
@@ -220,7 +225,7 @@ def known_by_a_map(rng, filter_, rows, others):
     more = rng.uniform(-9.0, 9.0, (others, 3)) * flat
     points = np.vstack([filter_.points[rows] + off, more])
     joint = random_joint(rng, len(points))
-    return KnownPoints(points, diagonal_blocks(joint, 3).copy(), joint)
+    return KnownLandmarks(points, diagonal_blocks(joint, 3).copy(), joint)
 
 
 @pytest.mark.parametrize('settings', [PLAIN, TWO_D], ids=['3D', 'planar'])
@@ -355,6 +360,136 @@ def test_gains_without_a_joint_covariance_take_errors_for_independent(gains):
         saved.append(estimator.landmark_map)
     assert saved[0].joint_covariance is None
     assert_array_equal(saved[0].world_points, saved[1].world_points)
+
+
+def tag_map(seed=0):
+    """Six landmarks, of which three are tags, with the joint covariance of all."""
+    rng, known = np.random.default_rng(seed), a_map(seed=seed)
+    R = so3.exp(rng.normal(size=(6, 3)))
+    R[[0, 2, 5]] = 0.0
+    joint = random_joint(rng, 9)
+    sigmas = np.zeros(6)
+    sigmas[[1, 3, 4]] = np.sqrt(np.linalg.eigvalsh(diagonal_blocks(joint[18:, 18:], 3))[:, -1])
+    return replace(
+        known,
+        covariances=diagonal_blocks(joint[:18, :18], 3).copy(),
+        orientations=R,
+        orientation_sigmas=sigmas,
+        joint_covariance=joint,
+    )
+
+
+class TestTags:
+    """Orientations have errors in common with positions."""
+
+    TAGS = Settings(use_tag_orientation=True, reorder_window=0.0, localization_mode='uncertain')
+
+    def test_the_file_has_them_too(self, tmp_path):
+        known = tag_map()
+        path = write(tmp_path / 'map.yaml', known)
+        assert_array_equal(read_map(path).joint_covariance, known.joint_covariance)
+        positions_only = re.sub('orientation.*}', '}', path.read_text())
+        path.write_text(positions_only.replace(', }', '}'))
+        with pytest.raises(MapError, match='a landmark was added, removed, moved or changed'):
+            read_map(path)
+
+    def test_a_part_has_those_of_its_tags(self):
+        part = tag_map().select(np.array([4, 0, 1]))
+        columns = np.array([[3 * i, 3 * i + 1, 3 * i + 2] for i in (4, 0, 1, 8, 6)]).ravel()
+        assert_array_equal(
+            part.joint_covariance, tag_map().joint_covariance[np.ix_(columns, columns)]
+        )
+
+    @pytest.mark.parametrize('use_tag_orientation', [False, True])
+    @pytest.mark.parametrize('mode', ['off', 'uncertain', 'fixed'])
+    def test_what_is_loaded_can_be_saved(self, mode, use_tag_orientation):
+        known = tag_map()
+        estimator = Estimator(
+            replace(self.TAGS, localization_mode=mode, use_tag_orientation=use_tag_orientation)
+        )
+        estimator.load_map(known, np.eye(4), 0.01 * np.eye(6))
+        saved = estimator.landmark_map
+        known = known.select([known.ids.tolist().index(i) for i in saved.ids])
+        size = 27 if use_tag_orientation or mode == 'fixed' else 18
+        assert_allclose(saved.joint_covariance, known.joint_covariance[:size, :size], atol=2e-8)
+        if size == 27:
+            assert_allclose(saved.orientations, known.orientations, atol=1e-12)
+            assert_allclose(saved.orientation_sigmas, known.orientation_sigmas, atol=1e-5)
+
+    @pytest.mark.parametrize('two_d_mode', [False, True])
+    @given(generators())
+    def test_a_map_is_entered_as_by_a_kalman_filter_of_all_errors_together(self, two_d_mode, rng):
+        settings = replace(PLAIN, use_tag_orientation=True, two_d_mode=two_d_mode)
+        filter_ = mapped(rng, settings, n=6, design=RiccatiTagFilter)
+        see_tags(rng, filter_, np.array([0, 1, 3]))
+        # Of 3 both know how it is turned, of 0 and 1 the estimate alone, of 5 the map alone.
+        rows, known = np.array([3, 1, 5, 0]), known_by_a_tag_map(rng, filter_)
+        axes, points = filter_.axes, filter_.points
+        p, k, q, n = axes.p, axes.point, axes.turn, len(points)
+        stride = k + q
+        own = filter_.joint.of_positions(points)
+        G = np.zeros((len(own), p))
+        G[:p] = np.eye(p)
+        for i, J in enumerate(axes.output_matrix(points)):
+            G[p + stride * i :][:k] = J
+            G[p + stride * i + k :][:q] = np.eye(q, p)
+        R = known.joint_on(axes)
+        P = np.zeros((len(own) + len(R),) * 2)
+        P[: len(own), : len(own)] = own + 1e4 * G @ G.T
+        P[len(own) :, len(own) :] = R
+        H = np.zeros((4 * k + q, len(P)))
+        for i, row in enumerate(rows):
+            H[k * i : k * (i + 1), p + stride * row :][:, :k] = np.eye(k)
+        H[: 4 * k, len(own) :][:, : 4 * k] = -np.eye(4 * k)
+        H[4 * k :, p + stride * 3 + k :][:, :q] = np.eye(q)
+        H[4 * k :, len(own) + 6 * k :][:, :q] = -np.eye(q)
+        noise = np.diag(np.append(np.full(4 * k, 1e-12), np.full(q, RESOLUTION_RAD**2)))
+        P -= P @ H.T @ np.linalg.solve(H @ P @ H.T + noise, H @ P)
+        filter_.enter_map(rows, known)
+        # The pose, the positions of the estimate and of the two that are new, and all turns.
+        first, turns = len(own), len(own) + 6 * k
+        points_at = np.append(p + stride * np.arange(n), first + k * np.arange(4, 6))
+        turns_at = np.append(p + stride * np.array([0, 1, 3]) + k, turns + q * np.arange(1, 3))
+        expected_at = [np.arange(p), ranges(points_at, k), ranges(turns_at, q)]
+        # Where the filter has them: of landmark 5 and the last of the new ones it took the map's.
+        at = p + stride * np.arange(n + 2)
+        found_at = [np.arange(p), ranges(at, k), ranges(at[[0, 1, 3, 5, 7]] + k, q)]
+        found = filter_.joint.of_positions(filter_.points)
+        expected_at, found_at = np.concatenate(expected_at), np.concatenate(found_at)
+        assert_allclose(
+            found[np.ix_(found_at, found_at)], P[np.ix_(expected_at, expected_at)], atol=1e-6
+        )
+        assert_array_equal(filter_.orientations.are_known, [1, 1, 0, 1, 0, 1, 0, 1])
+        assert_allclose(filter_.orientations.B[[5, 7]], known.orientations[[2, 5]], atol=1e-5)
+
+
+def ranges(starts, count):
+    return (starts[:, None] + np.arange(count)).ravel()
+
+
+def see_tags(rng, filter_, rows):
+    """Let the filter see how landmarks are turned, for the first time, and then move."""
+    turns = np.zeros((len(rows), 3))
+    turns[:, filter_.axes.turned] = rng.normal(size=(len(rows), filter_.axes.turn))
+    noise = 1e-3 * random_covariances(rng, len(rows), 3)
+    Z = so3.exp(turns)
+    filter_.add_orientations(SeenOrientations(rows, Z, Z, noise, np.full(len(rows), np.inf)))
+    random_step(filter_, rng, 1e-3, 1e-2)
+
+
+def known_by_a_tag_map(rng, filter_):
+    """What a map knows of 3, 1, 5 and 0, and of two others; 3, 5 and the last are tags."""
+    known = known_by_a_map(rng, filter_, np.array([3, 1, 5, 0]), others=2)
+    joint = random_joint(rng, 9)
+    R = np.zeros((6, 3, 3))
+    R[0], R[2], R[5] = filter_.orientations.B[3], np.eye(3), np.eye(3)
+    return replace(
+        known,
+        covariances=diagonal_blocks(joint[:18, :18], 3).copy(),
+        joint=joint,
+        orientations=R,
+        sigmas=np.full(6, 0.1),
+    )
 
 
 SPACING_M, STEP_S, SPEED_M_S = 2.0, 0.2, 1.0

@@ -27,7 +27,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import CONFIRMING_VOTES, is_lost, PoseTrial
 from slam_observer_ros.known_map.map_alignment import _contradictions, find_transform
 from slam_observer_ros.observer.gauge import anchor
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.state.step import Outcome
 
@@ -260,7 +260,7 @@ def test_a_frame_that_lies_anyhow_to_robot_and_landmarks_alike_is_no_obstacle(ax
     G = np.vstack([np.eye(p), axes.output_matrix(source).reshape(6 * k, p)])
     tilted = G @ G.T + 1e-4 * np.eye(p + 6 * k)  # by 1 rad, in common
     true = se3.exp(np.array([0.0, 0.0, 1.0, 2.0, 3.0, 0.0]))
-    known = KnownPoints(se3.transform(true, source), np.tile(1e-4 * np.eye(3), (6, 1, 1)))
+    known = KnownLandmarks(se3.transform(true, source), np.tile(1e-4 * np.eye(3), (6, 1, 1)))
     transform, agree = find_transform(source, tilted, known, axes)
     assert_allclose(transform, true, atol=1e-9)
     assert agree.all()
@@ -274,7 +274,7 @@ def test_a_landmark_counts_for_the_frame_along_the_directions_in_which_its_map_k
     covariances[5:, 0, 0] = 1.0
     target = se3.transform(true, source) + np.sqrt(covariances[:, 0]) * (np.arange(8) > 4)[:, None]
     own = 1e-8 * np.eye(6 + 24)
-    transform, agree = find_transform(source, own, KnownPoints(target, covariances), SPATIAL)
+    transform, agree = find_transform(source, own, KnownLandmarks(target, covariances), SPATIAL)
     assert agree.all()
     assert_allclose(transform, true, atol=1e-3)
 

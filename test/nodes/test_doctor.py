@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from threading import Event
-
 from command_line import CommandLine
 from node_processes import running
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
+from slam_observer_ros.messages.message_types import TRANSFORMS
+from slam_observer_ros.nodes.live_inputs import HeardTopic
 from slam_observer_ros.nodes.message_classes import MESSAGES
 
 pytestmark = pytest.mark.ros
@@ -38,28 +38,20 @@ def test_topics_that_are_alive_are_named_with_what_a_node_needs_to_hear_them(
     assert found['installed']['tf2_msgs'] == 'installed'
 
 
-def test_fiducials_on_tf_are_told_from_the_rest_of_it(ros, slam_observer):
-    tf = ros.node.create_publisher(TFMessage, '/tf', 10)
-    static = ros.node.create_publisher(TFMessage, '/tf_static', 10)
+def test_fiducials_on_tf_are_told_from_the_rest_of_it():
     places = [('odom', 'base_link'), ('camera', 'tag36h11:7'), ('camera', 'tag_8')]
     message = TFMessage(
         transforms=[
             MESSAGES.transform_stamped(1, parent, child, np.eye(4)) for parent, child in places
         ]
     )
-    timer = ros.node.create_timer(0.1, lambda: (tf.publish(message), static.publish(message)))
-    is_heard = Event()
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(ros.spin_until, is_heard.is_set, 'the doctor')
-        found = slam_observer.succeed('doctor', '--seconds', 2, '--json').json
-        is_heard.set()
-    ros.node.destroy_timer(timer)
-    for publisher in (tf, static):
-        ros.node.destroy_publisher(publisher)
-    topics = {topic['topic']: topic['text'] for topic in found['topics']}
-    assert '2 fiducials, as landmarks with -p landmarks_type:=tf' in topics['/tf']
-    assert topics['/tf'].endswith('as /tf')
-    assert topics['/tf_static'].endswith('as /tf_static')
+    tf = HeardTopic('/tf', TRANSFORMS)
+    for _ in range(6):
+        tf.take(serialize_message(message))
+    assert tf.text(seconds=3.0) == (
+        f'{TRANSFORMS}, 2.0 Hz, 2 fiducials, as landmarks with -p landmarks_type:=tf, as /tf'
+    )
+    assert HeardTopic('/tf_static', TRANSFORMS).text(seconds=3.0).endswith('as /tf_static')
 
 
 def test_it_says_that_nothing_is_heard(slam_observer):

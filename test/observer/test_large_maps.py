@@ -12,7 +12,7 @@ from random_runs import covariance_of_all, observe, PLAIN, propagate, random_cov
 from strategies import generators
 
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
     CHECK_INTERVAL,
@@ -167,7 +167,7 @@ def test_known_maps_poses_that_are_set_and_known_landmarks_that_anchor(settings,
     covariances = 0.01 * random_covariances(rng, len(ids), 3)
     known = world.points[ids] + world.flat(0.1 * rng.standard_normal((len(ids), 3)))
     for filter_ in filters:
-        filter_.add_known(KnownPoints(known, covariances))
+        filter_.add_known(KnownLandmarks(known, covariances))
     world.ids += ids.tolist()
     world.drive(filters, 30)
     assert_same(*filters)

@@ -18,7 +18,7 @@ from slam_observer_ros.observer.constant import (
 )
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.innovation import innovation, lyapunov, lyapunov_rate
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -191,7 +191,7 @@ def test_lyapunov_never_increases_at_any_step_gain_distance_and_rotation(
     points = y_ref @ turn.T + 0.3 * distance_m * rng.normal(size=(n, 3))
     settings = Settings(gain_k=k, gain_l=k * rng.uniform(0.01, 10.0), step_mode=step_mode)
     constant = ConstantFilter(settings, np.eye(4))
-    constant.add_known(KnownPoints(y_ref, np.zeros((n, 3, 3))))
+    constant.add_known(KnownLandmarks(y_ref, np.zeros((n, 3, 3))))
     observe(constant, np.arange(n), points, dt_s)
     _, remaining = constant.observer.errors(slice(None), points)
     before = lyapunov(k, points - y_ref)
@@ -242,7 +242,7 @@ def test_far_landmarks_that_overflow_the_explicit_step_converge():
     y_ref = 50.0 * directions / np.linalg.norm(directions, axis=1)[:, None]
     constant, levels = ConstantFilter(Settings(), np.eye(4)), []
     known = y_ref + 0.5 * rng.normal(size=y_ref.shape)
-    constant.add_known(KnownPoints(known, np.zeros((100, 3, 3))))
+    constant.add_known(KnownLandmarks(known, np.zeros((100, 3, 3))))
     for _ in range(500):
         levels.append(lyapunov(4.0, constant.observer.errors(slice(None), y_ref)[1]))
         observe(constant, np.arange(100), y_ref, 0.02)

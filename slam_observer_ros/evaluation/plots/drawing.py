@@ -10,6 +10,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
@@ -77,6 +78,9 @@ LANDMARKS: Any = {
 LINKS: Any = {'color': '#333333', 'linestyle': '-', 'linewidth': 0.9, 'zorder': 4.5}
 LEGEND_ABOVE: Any = {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'borderaxespad': 0.2}
 
+_FEW_DECADES = 300.0
+"""Ratio of the limits of a logarithmic axis up to which there is room for 1, 2 and 5."""
+
 _PLANAR_RATIO = 0.01
 """A scene lower than this part of its width is drawn from above."""
 
@@ -100,6 +104,15 @@ def legend_below(figure: Figure, named: Axes, columns: int) -> None:
     height = legend.get_window_extent().height / figure.bbox.height
     layout: Any = figure.get_layout_engine()
     layout.set(rect=(0.0, height, 1.0, 1.0 - height))
+
+
+def plain_decades(axes: Axes) -> None:
+    """Write numbers as 0.5 and 20 on a logarithmic axis, whose limits are set, not as powers."""
+    low, high = axes.get_ylim()
+    subs = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _position: f'{value:g}'))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def save(figure: Figure, path: Path) -> Path:

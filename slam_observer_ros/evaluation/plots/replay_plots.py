@@ -24,6 +24,7 @@ from slam_observer_ros.evaluation.plots.drawing import (
     is_flat,
     LEGEND_ABOVE,
     ORANGE,
+    plain_decades,
     PURPLE,
     RED,
     save,
@@ -124,6 +125,7 @@ def _draw_nees(axes: Axes, start_ns: int, nees: NeesOverTime, is_anchored: bool)
     axes.plot(*_broken_at_gaps(times_s, nees.values), color=PURPLE, **_LINE)
     axes.set(yscale='log', ylabel='NEES per d.o.f.')
     axes.set_ylim(bottom=max(axes.get_ylim()[0], _LEAST_NEES))
+    plain_decades(axes)
     axes.margins(x=0.01)
     axes.legend(**LEGEND_ABOVE)
     errors = 'error from the first pose on' if is_anchored else 'error after rigid alignment'
@@ -194,6 +196,7 @@ def _draw_residuals(axes: Axes, innovations: Innovations, settings: Settings) ->
     line: Any = {'color': BLACK, 'linestyle': '--', 'linewidth': 1.0}
     axes.axhline(median, **line, label=name)
     axes.margins(x=0.01)
+    plain_decades(axes)
     below_title: Any = {'loc': 'lower left', 'bbox_to_anchor': (0.0, 1.0), 'borderaxespad': 0.2}
     axes.legend(**below_title, ncols=5, columnspacing=1.4, handlelength=1.6)
 

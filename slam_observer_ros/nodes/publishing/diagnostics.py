@@ -22,6 +22,7 @@ from slam_observer_ros.runs.health import estimator_values, estimator_warnings
 SILENT_S = 2.0  # an input without messages for this long is a warning
 RECENT = 30  # statuses, of about a second each, over which rejected points are counted
 MIN_POINTS = 50  # points that it takes to say how large a share of them is rejected
+MANY_EMPTY = 200  # messages without a landmark, that are no detector that waits for one
 MANY_UNUSED = 20  # messages, none of which was used, that are no transient of the start
 
 USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
@@ -53,6 +54,8 @@ class DiagnosticsPublisher:
         self._localisation = localisation
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_time_s = time.monotonic()
+        self._seen_s: float | None = None  # when a landmark was seen last
+        self._said_empty = False
         self._last_received = {source.topic: 0 for source in inputs}
         self._last_dropped: Counter[str] = Counter()
         self._last_counts: Counter[str] = Counter()
@@ -102,6 +105,8 @@ class DiagnosticsPublisher:
 
     def _estimator_values(self) -> dict[str, str]:
         values = estimator_values(self._estimator, self._dropped())
+        age_s = 'never' if self._seen_s is None else f'{time.monotonic() - self._seen_s:.0f}'
+        values['landmarks seen, age [s]'] = age_s
         values['processing time, mean [ms]'] = f'{self._feed.take_mean_processing_ms():.3f}'
         return values
 
@@ -112,6 +117,8 @@ class DiagnosticsPublisher:
         counts = self._estimator.counts
         since_last = dropped - self._last_dropped, counts - self._last_counts
         self._last_dropped, self._last_counts = dropped, counts
+        if since_last[1]['observed_point']:
+            self._seen_s = time.monotonic()
         return since_last
 
     def _dropped(self) -> Counter[str]:
@@ -130,6 +137,7 @@ class DiagnosticsPublisher:
             reasons = f'mostly {reason}' if others else reason
             plural = 's' * (dropped.total() != 1)
             warnings.append(f'{dropped.total()} message{plural} dropped ({reasons})')
+        warnings.append(self._empty_warning())
         warnings.append(self._points_warning(new))
         warnings.append(self._rejections_warning(new))
         warnings += estimator_warnings(self._estimator)
@@ -147,6 +155,19 @@ class DiagnosticsPublisher:
         if self._last_counts[kind]:
             return ''
         return f"none of {source.received} messages on '{source.topic}' was used"
+
+    def _empty_warning(self) -> str:
+        """Report, and log once, that a detector has not seen anything so far."""
+        observations = self._last_counts['observation']
+        if self._seen_s is not None or observations < MANY_EMPTY:
+            return ''
+        if not self._said_empty:
+            self._said_empty = True
+            self._node.get_logger().warning(
+                f'no landmark in the first {observations} messages: are there any in view, and is '
+                'the detector set up for them?'
+            )
+        return f'no landmark in {observations} messages so far'
 
     def _ids_warning(self) -> str:
         """Report that the pose in a map can't be found: nothing that is seen has an id."""

@@ -21,6 +21,7 @@ from slam_observer_ros.geometry.matrices import (
     transpose,
     with_blocks,
 )
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration
@@ -75,6 +76,13 @@ class JointCovariance:
         columns = np.append(np.arange(self._p), self._columns(rows))
         P: FloatArray = self.P[np.ix_(columns, columns)]
         return sheared(P, self._p, -self._turning(points).reshape(-1, self._p))
+
+    def of_landmarks(
+        self, rows: IntArray, points: FloatArray, tags: IntArray
+    ) -> FloatArray | None:
+        """Return the covariance (m k + …) of ã_i of ``rows`` (m,), then of how ``tags`` turn."""
+        with_pose = self.with_pose(rows, points)
+        return None if with_pose is None else with_pose[self._p :, self._p :]
 
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray | None]:
         """Return ξ_i (n, 3) of x, and the changes of velocities, None where there are none."""
@@ -173,11 +181,12 @@ class JointCovariance:
 
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
-        self.add_correlated(points, self._noise(covariances))
+        self._insert(self._make_room(len(points)), self._turning(points), self._noise(covariances))
 
-    def add_correlated(self, points: FloatArray, covariance: FloatArray) -> None:
-        """Append landmarks (m,) likewise, but with errors of a joint covariance (m k, m k)."""
-        self._insert(self._make_room(len(points)), self._turning(points), covariance)
+    def add_correlated(self, known: KnownLandmarks) -> None:
+        """Append landmarks of a map (m,) likewise, but with errors that are correlated."""
+        rows, covariance = self._make_room(len(known)), known.covariance_on(self._axes)
+        self._insert(rows, self._turning(known.points), covariance)
 
     def relocate(self, rows: IntArray, covariances: FloatArray) -> None:
         """Take landmarks (m,) for newly seen ones, with covariances (m, 3, 3)."""
@@ -196,11 +205,21 @@ class JointCovariance:
         G[self._columns(rows)] = self._moving(rows).reshape(-1, self._p)
         return G
 
-    def embedded(self, rows: IntArray, values: FloatArray) -> FloatArray:
-        """Return (…, q) with ``values`` (m k, q) at the positions of landmarks, zero elsewhere."""
-        M = np.zeros((len(self.P), values.shape[1]))
-        M[self._columns(rows)] = values
-        return M
+    def at_rest(self, rows: IntArray, points: FloatArray) -> FloatArray:
+        """Return G (…, p) likewise if landmarks ``rows`` at ``points`` (m, 3) are not moved."""
+        G = np.zeros((len(self.P), self._p))
+        G[self._columns(rows)] = self._turning(points).reshape(-1, self._p)
+        return G
+
+    def difference(
+        self, rows: IntArray, others: IntArray, points: FloatArray, other_points: FloatArray
+    ) -> FloatArray:
+        """Return H (m k, …) of the differences ã_i − ã_j of landmarks at two points (m, 3)."""
+        H = np.zeros((len(rows) * self._axes.point, len(self.P)))
+        each = np.arange(len(H))
+        H[each, self._columns(rows)], H[each, self._columns(others)] = 1.0, -1.0
+        H[:, : self._p] = self._turning(other_points - points).reshape(-1, self._p)
+        return H
 
     # Other coordinates
 

@@ -22,7 +22,7 @@ from slam_observer_ros.geometry import se3, slam_group
 from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.compressed_covariance import (
     BlockSize,
@@ -96,7 +96,7 @@ class RiccatiFilter(Filter):
         super().add(points, covariances)
         self.joint.add_seen(self.observer.turned(covariances))
 
-    def add_known(self, known: KnownPoints) -> None:
+    def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks whose errors are independent of all else, or only of all others."""
         if known.joint is None:
             self._compress_if_large(len(known))
@@ -104,7 +104,7 @@ class RiccatiFilter(Filter):
             super().add_known(known)
             return
         self.joint = self.joint.dense()
-        self.joint.add_correlated(known.points, known.covariance_on(self.axes))
+        self.joint.add_correlated(known)
         super().add_known(known)
         self._compress_if_large(0)
 
@@ -131,12 +131,20 @@ class RiccatiFilter(Filter):
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:
         """Move the whole estimate, of unknown gauge γ, to where landmarks are known to be."""
+        # A motion exp(γ) of everything changes ε and each ξ_i by γ and γ_v (G), and the positions
+        # of the known landmarks by J γ.
+        self.joint = joint = self.joint.dense()
         k = self.axes.point
-        self.joint = self.joint.dense()
-        G = self.joint.gauge(len(self.observer.y_ref))
-        self._anchor(rows, r, block_diagonal(covariances[:, :k, :k]), G, 0.0)
+        G = joint.gauge(len(self.observer.y_ref))
+        J = self.axes.output_matrix(self.observer.points[rows]).reshape(-1, self.axes.p)
+        # What P says of these positions, and the map's noise.
+        to_position = -self.axes.turn_matrix(self.observer.points[rows])
+        HP, HPH = joint.project(to_position, rows)  # of −ã_i
+        R = block_diagonal(covariances[:, :k, :k])
+        x, joint.P = anchor(joint.P, G, -HP.T, HPH + R, J, r[:, :k].ravel())
+        self._move(-x)
 
-    def enter_map(self, rows: IntArray, known: KnownPoints) -> None:
+    def enter_map(self, rows: IntArray, known: KnownLandmarks) -> None:
         """Move the estimate to where a map has landmarks ``rows`` (m,), and append its others.
 
         As far as the map's errors are correlated, seeing the m says where the others are, too.
@@ -144,43 +152,26 @@ class RiccatiFilter(Filter):
         if known.joint is None:
             super().enter_map(rows, known)
             return
-        r = self.points[rows] - known.points[: len(rows)]
-        of_rows, others = np.split(np.arange(len(known)), [len(rows)])
-        # The others are in the map's frame already: its gauge γ does not move them, …
-        n = len(self.observer.y_ref)
-        self.add_known(known.select(others))
+        # The map beside the estimate, whose gauge γ does not move it, …
+        n, m = len(self.observer.y_ref), len(rows)
+        own = self.points[rows]
+        self.add_known(known)
         self.joint = joint = self.joint.dense()
-        added = np.arange(n, n + len(others))
-        still = -self.axes.turn_matrix(known.points[others]).reshape(-1, self.axes.p)
-        G = joint.gauge(n) + joint.embedded(added, still)
-        # … but they share the errors of the map.
-        R, q = known.covariance_on(self.axes), len(of_rows) * self.axes.point
-        shared = joint.embedded(added, -R[q:, :q])
-        self._anchor(rows, r, R[:q, :q], G, shared)
+        added = n + np.arange(len(known))
+        copies = added[:m]
+        G = joint.gauge(n) + joint.at_rest(added, known.points)
+        # … and landmarks that both have are the same.
+        H = joint.difference(rows, copies, own, known.points[:m])
+        PH, r = joint.P @ H.T, (own - known.points[:m])[:, : self.axes.point].ravel()
+        x, joint.P = anchor(joint.P, G, PH, H @ PH, H @ G, r)
+        self._move(-x)
+        self._merge_orientations(rows, copies)
+        self.remove(copies)
         self.observer.set_reference(self.observer.points)
         self._compress_if_large(0)
 
-    def _anchor(
-        self,
-        rows: IntArray,
-        r: FloatArray,
-        R: FloatArray,
-        G: FloatArray,
-        shared: FloatArray | float,
-    ) -> None:
-        """Anchor by landmarks (m,) whose map has errors of covariance ``R`` (m k, m k).
-
-        A motion exp(γ) of everything changes x by ``G`` γ; ``shared`` (…, m k) is the covariance
-        of x with minus the map's errors.
-        """
-        # It changes ε and each ξ_i by γ and γ_v, and the positions of known landmarks by J γ.
-        joint, points = self.joint, self.observer.points[rows]
-        J = self.axes.output_matrix(points).reshape(-1, self.axes.p)
-        # What P says of these positions, and the map's noise.
-        HP, HPH = joint.project(-self.axes.turn_matrix(points), rows)  # of −ã_i
-        r = r[:, : self.axes.point].ravel()
-        x, joint.P = anchor(joint.P, G, shared - HP.T, HPH + R, J, r)
-        self._move(-x)
+    def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
+        """Merge those of landmarks ``rows`` (m,) with the map's, which are at ``copies``."""
 
     @property
     def calibration_variances(self) -> FloatArray:

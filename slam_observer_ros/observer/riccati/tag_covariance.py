@@ -13,7 +13,12 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import block_diagonal
-from slam_observer_ros.observer.riccati.joint_covariance import ExactMapCovariance, JointCovariance
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.riccati.joint_covariance import (
+    ExactMapCovariance,
+    JointCovariance,
+    sheared,
+)
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
@@ -38,6 +43,40 @@ class TagCovariance(JointCovariance):
     def propagate(self, motion: Motion, points: FloatArray, u: FloatArray) -> None:
         """Let the robot move; no tag turns."""
         self._propagate(motion, self._all_turning(points))
+
+    def of_landmarks(
+        self, rows: IntArray, points: FloatArray, tags: IntArray
+    ) -> FloatArray | None:
+        """Return the covariance (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,)."""
+        p = self._p
+        columns = np.concatenate([np.arange(p), self._columns(rows), self._turn_columns(tags)])
+        P, L = self.P[np.ix_(columns, columns)], np.zeros((len(columns) - p, p))
+        L[: len(rows) * self._axes.point] = -self._turning(points).reshape(-1, p)
+        return sheared(P, p, L)[p:, p:]
+
+    def add_correlated(self, known: KnownLandmarks) -> None:
+        """Append landmarks of a map with errors of positions and orientations together."""
+        first = (len(self.P) - self.first) // self._stride
+        super().add_correlated(known)
+        rows = first + np.arange(len(known))
+        turns, positions = self._turn_columns(rows[known.tags]), self._columns(rows)
+        R, q = known.joint_on(self._axes), len(positions)
+        self.P[np.ix_(turns, positions)], self.P[np.ix_(positions, turns)] = R[q:, :q], R[:q, q:]
+        self.P[np.ix_(turns, turns)] = R[q:, q:]
+
+    def copy_turns(self, source: IntArray, target: IntArray) -> None:
+        """Let tags ``target`` (m,) have the orientations, with their errors, of others."""
+        source, target = self._turn_columns(source), self._turn_columns(target)
+        self.P[target] = self.P[source]
+        self.P[:, target] = self.P[:, source]
+
+    def project_turn_differences(
+        self, rows: IntArray, others: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of ω_i − ω_j."""
+        own, other = self._turn_columns(rows), self._turn_columns(others)
+        HP = self.P[own] - self.P[other]
+        return HP, HP[:, own] - HP[:, other]
 
     def gauge(self, n: int) -> FloatArray:
         """Return G (…, p): a motion of everything turns the tags with it."""

@@ -13,7 +13,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose, with_blocks
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.observer.riccati.tag_covariance import ExactTagMapCovariance, TagCovariance
@@ -131,10 +131,48 @@ class RiccatiTagFilter(RiccatiFilter):
         super().add(points, covariances)
         self.orientations.add(len(points))
 
-    def add_known(self, known: KnownPoints) -> None:
-        """Append landmarks of a map, as yet without orientation."""
+    def add_known(self, known: KnownLandmarks) -> None:
+        """Append landmarks of a map, with the orientations that it knows."""
+        first = len(self.observer.y_ref)
         super().add_known(known)
         self.orientations.add(len(known))
+        self._take_orientations(first + np.arange(len(known)), known)
+
+    def enter_map(self, rows: IntArray, known: KnownLandmarks) -> None:
+        """Move the estimate to where a map has landmarks ``rows``, and append its others."""
+        super().enter_map(rows, known)
+        if known.joint is None:
+            self._take_orientations(rows, known.select(np.arange(len(rows))))
+
+    def _take_orientations(self, rows: IntArray, known: KnownLandmarks) -> None:
+        """Take in what a map knows of the orientations of landmarks ``rows`` (m,)."""
+        tags, R, sigmas = known.tags, known.orientations, known.sigmas
+        if R is None or sigmas is None:
+            return
+        if known.joint is None:
+            self.know_orientations(rows[tags], R[tags], sigmas[tags])
+        else:  # their errors have been taken in with those of the positions
+            seen = self._settings.max_rejections
+            self.orientations.put_known(rows[tags], R[tags], sigmas[tags], seen)
+
+    def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
+        tags = self.orientations
+        in_map, own = tags.are_known[copies], tags.are_known[rows]
+        # Those of which only the map knows, …
+        new, of_new = rows[in_map & ~own], copies[in_map & ~own]
+        self.joint.copy_turns(of_new, new)
+        seen = self._settings.max_rejections
+        tags.put_known(new, tags.B[of_new], tags.map_sigmas[of_new], seen)
+        # … and those that both have, B̂_i B̂_jᵀ = exp(ω_i − ω_j), unless they are contradictory.
+        rows, copies = rows[in_map & own], copies[in_map & own]
+        omega = self.axes.turns(so3.log(tags.B[rows] @ transpose(tags.B[copies])))
+        R = RESOLUTION_RAD**2 * np.tile(np.eye(self.axes.turn), (len(rows), 1, 1))
+        near = distances(omega, self.joint.project_turn_differences(rows, copies)[1], R)
+        agree = near <= self._settings.rejection_threshold
+        if agree.any():
+            HP, HPH = self.joint.project_turn_differences(rows[agree], copies[agree])
+            S = with_blocks(HPH, R[agree])
+            self._move(-self.joint.update(HP, S, omega[agree].ravel()))
 
     def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
         """Take landmarks for new ones, without orientation."""

@@ -37,7 +37,7 @@ from slam_observer_ros.geometry.matrices import (
 )
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
-from slam_observer_ros.observer.known_points import KnownPoints
+from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.robust import huber_weights, REWEIGHTINGS
 from slam_observer_ros.observer.scheduled.core import Core, regression
@@ -112,7 +112,7 @@ class ScheduledFilter(Filter):
         y_ref, noise = self.observer.y_ref[-len(points) :], self.observer.turned(covariances)
         self._postponed.add(self._output_matrix(y_ref), self._noise(noise))
 
-    def add_known(self, known: KnownPoints) -> None:
+    def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks (m,) as certain as the map has each of them."""
         super().add_known(known)
         N = self._noise(known.covariances)

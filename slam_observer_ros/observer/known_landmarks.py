@@ -1,0 +1,91 @@
+"""Landmarks that a map knows, and how far it may be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.matrices import block_diagonal, turned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownLandmarks:
+    """n landmarks of a map in one frame, of which t are tags with an orientation."""
+
+    points: FloatArray  # (n, 3) metres
+    covariances: FloatArray  # (n, 3, 3) of each position, m²
+    # (3 (n + t),) squared, of all positions, then of the rotation vectors of the tags, along the
+    # axes of the frame; None if errors are independent
+    joint: FloatArray | None = None
+    orientations: FloatArray | None = None  # (n, 3, 3), zero for points; None without tags
+    sigmas: FloatArray | None = None  # (n,) of rotation vectors, rad
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def tags(self) -> IntArray:
+        """(t,) rows of the tags."""
+        return tags_among(self.orientations)
+
+    def select(self, rows: IntArray | BoolArray) -> KnownLandmarks:
+        """Return those at ``rows``."""
+        R, sigmas, joint = self.orientations, self.sigmas, self.joint
+        return KnownLandmarks(
+            self.points[rows],
+            self.covariances[rows],
+            None if joint is None else part_of_joint(joint, len(self), self.tags, rows),
+            None if R is None else R[rows],
+            None if sigmas is None else sigmas[rows],
+        )
+
+    def moved(self, T: FloatArray) -> KnownLandmarks:
+        """Return the same in another frame, into which ``T`` (4, 4) leads."""
+        R = T[:3, :3]
+        covariances: FloatArray = R @ self.covariances @ R.T
+        joint = None if self.joint is None else turned(self.joint, R)
+        orientations = None if self.orientations is None else R @ self.orientations
+        points = se3.transform(T, self.points)
+        return KnownLandmarks(points, covariances, joint, orientations, self.sigmas)
+
+    def covariance_on(self, axes: EstimatedAxes) -> FloatArray:
+        """Return the covariance (n k, n k) of all positions on the axes that are estimated."""
+        n, k = len(self), axes.point
+        if self.joint is None:
+            return block_diagonal(self.covariances[:, :k, :k])
+        return self.joint_on(axes)[: n * k, : n * k]
+
+    def joint_on(self, axes: EstimatedAxes) -> FloatArray:
+        """Return the covariance (n k + t q, …) of positions and turns on the same axes."""
+        if self.joint is None:
+            raise ValueError('the errors are independent')
+        n, numbers = len(self), 3 * np.arange(len(self.joint) // 3)[:, None]
+        points, turns = numbers[:n] + np.arange(axes.point), numbers[n:] + axes.turned
+        columns = np.append(points, turns)
+        part: FloatArray = self.joint[np.ix_(columns, columns)]
+        return part
+
+
+def tags_among(orientations: FloatArray | None) -> IntArray:
+    """Return the rows (t,) of those landmarks that have an orientation (3, 3)."""
+    if orientations is None:
+        return np.empty(0, dtype=np.int64)
+    return np.flatnonzero(orientations.any(axis=(1, 2)))
+
+
+def part_of_joint(
+    joint: FloatArray, n: int, tags: IntArray, rows: IntArray | BoolArray
+) -> FloatArray:
+    """Return the part of a joint covariance of n landmarks that is that of ``rows``."""
+    chosen = np.arange(n)[rows]
+    number_of = np.full(n, -1)
+    number_of[tags] = n + np.arange(len(tags))
+    turns = number_of[chosen]
+    numbers = np.append(chosen, turns[turns >= 0])
+    columns = (3 * numbers[:, None] + np.arange(3)).ravel()
+    part: FloatArray = joint[np.ix_(columns, columns)]
+    return part
