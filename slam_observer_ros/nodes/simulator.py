@@ -31,7 +31,7 @@ from slam_observer_ros.simulation import Delivery, Scenario, SimulatedEvent, Sim
 QUEUE_DEPTH = 1000  # nothing is lost while a reliable reader falls behind for a moment
 TICK_S = 0.005  # wall time between two checks of what is due
 MATCH_DELAY_S = 1.0  # a publisher knows of its reader before the reader can receive
-ACKNOWLEDGED_S = 10.0  # how long the last messages may be on their way, as on a busy machine
+ACKNOWLEDGED_S = 10.0  # how long the first and last messages may be on their way, if it is busy
 SIMULATED_EPOCH_NS = 1_000_000_000  # first stamp of a simulated /clock; zero means 'no time yet'
 
 
@@ -83,7 +83,6 @@ class SimulatorNode(RepeatableParameters):
 
     def _start(self) -> None:
         self.destroy_timer(self._start_timer)
-        self._start_wall_s = time.monotonic()
         self._start_ns = (
             SIMULATED_EPOCH_NS if self._publishes_clock else self.get_clock().now().nanoseconds
         )
@@ -92,19 +91,36 @@ class SimulatorNode(RepeatableParameters):
         self._next: Delivery | None = next(self._deliveries, None)
         self._publish_true_landmarks(self._start_ns)
         self._publish_start()
+        self._give_up_s = time.monotonic()
+        if self._publishes_clock:  # which can stand still until reliable readers have heard
+            self._publish_until(self._start_ns)
+            self._give_up_s += ACKNOWLEDGED_S
+        self._start_timer = self.create_timer(TICK_S, self._drive, clock=self._steady_clock)
+
+    def _drive(self) -> None:
+        """Let time pass once the first messages are acknowledged: their readers hear the rest."""
+        at_once = Duration()
+        publishers = (self._twist, self._landmarks)
+        are_heard = all(publisher.wait_for_all_acked(at_once) for publisher in publishers)
+        if not are_heard and time.monotonic() < self._give_up_s:
+            return
+        self.destroy_timer(self._start_timer)
+        self._start_wall_s = time.monotonic()
         self.create_timer(TICK_S, self._publish_due, clock=self._steady_clock)
         self.get_logger().info('the robot starts')
 
     def _publish_due(self) -> None:
         elapsed_s = (time.monotonic() - self._start_wall_s) * self._settings.real_time_factor
-        now_ns = self._start_ns + to_ns(elapsed_s)
+        self._publish_until(self._start_ns + to_ns(elapsed_s))
+        if self._next is None:
+            self._finish()
+
+    def _publish_until(self, now_ns: int) -> None:
         if self._publishes_clock:
             self._clock_publisher.publish(Clock(clock=MESSAGES.time(now_ns)))
         while self._next is not None and self._next.arrival_ns <= now_ns:
             self._publish(self._next.event)
             self._next = next(self._deliveries, None)
-        if self._next is None:
-            self._finish()
 
     def _finish(self) -> None:
         for publisher in (self._twist, self._landmarks, self._true_pose):

@@ -13,6 +13,7 @@ import sys
 import time
 from typing import Any, ClassVar
 
+from rcl_interfaces.srv import GetParameterTypes
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -20,6 +21,9 @@ from rclpy.qos import QoSProfile
 
 PATIENCE_S = 30.0
 """How long anything may take before a test fails; it normally takes a fraction of a second."""
+
+ASK_AGAIN_S = 0.5
+"""After which time an answer that was given to nobody is asked for again."""
 
 RELIABLE = QoSProfile(depth=5000)
 
@@ -95,6 +99,7 @@ class Client:
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._clients: dict[tuple[type, str, int], Any] = {}
+        self._ask_again_s = 0.0
 
     def collect(self, message_class: type, topic: str, qos: QoSProfile = RELIABLE) -> list[Any]:
         """Return a list to which every message on the topic will be appended."""
@@ -118,29 +123,56 @@ class Client:
     def wait_for_subscriber(self, *publishers: Any) -> None:
         """Wait until each publisher has a subscriber that can hear it."""
         for publisher in publishers:
-            self.spin_until(publisher.get_subscription_count, f'reader of {publisher.topic_name}')
-        # The publisher hears of its reader first; the other way takes a moment longer.
-        self.spin_for(0.5)
+            topic = publisher.topic_name
+            self.spin_until(publisher.get_subscription_count, f'reader of {topic}')
+            self._meet_all(topic, self.node.get_subscriptions_info_by_topic)
 
     def wait_for_publisher(self, *topics: str) -> None:
-        """Wait until each topic has a publisher."""
+        """Wait until each topic has a publisher that knows of this node's subscriptions."""
         for topic in topics:
-            self.spin_until(
-                lambda topic=topic: self.node.get_publishers_info_by_topic(topic), topic
-            )
+            self._meet_all(topic, self.node.get_publishers_info_by_topic)
 
     def call(self, service_class: type, name: str, request: Any) -> Any:
-        """Call a service and return its response."""
+        """Call a service ``NODE/NAME`` and return its response."""
         # A node that was started since may have taken the place of the one that was called.
         key = service_class, name, NodeProcess.started
         if key not in self._clients:
             self._clients[key] = self.node.create_client(service_class, name)
             self.spin_until(self._clients[key].service_is_ready, name)
-            # The server may not have heard of its client yet; its response would then be lost.
-            self.spin_for(0.5)
+            # Of a client that the server had not heard of, the response would be lost.
+            self.meet(name.rpartition('/')[0])
         future = self._clients[key].call_async(request)
         self.spin_until(future.done, f'response of {name}')
         return future.result()
+
+    def meet(self, node_name: str) -> None:
+        """Wait until a node knows all that was made here, and has handled what it was sent.
+
+        What is made is announced in order, so a node that answers a new client knows all before.
+        """
+        asked = self.node.create_client(GetParameterTypes, f'{node_name}/get_parameter_types')
+        self.spin_until(asked.service_is_ready, node_name)
+        answers: list[Any] = []
+
+        def is_answered() -> bool:
+            if not answers or time.monotonic() > self._ask_again_s:
+                answers.append(asked.call_async(GetParameterTypes.Request()))
+                self._ask_again_s = time.monotonic() + ASK_AGAIN_S
+            return any(answer.done() for answer in answers)
+
+        self.spin_until(is_answered, f'an answer of {node_name}')
+        self.node.destroy_client(asked)
+
+    def _meet_all(self, topic: str, ends: Callable[[str], list[Any]]) -> None:
+        """Meet the nodes that have one end of a topic."""
+        self.spin_until(
+            lambda: ends(topic) and all('UNKNOWN' not in end.node_name for end in ends(topic)),
+            topic,
+        )
+        for node_name in {
+            f'{end.node_namespace.rstrip("/")}/{end.node_name}' for end in ends(topic)
+        }:
+            self.meet(node_name)
 
     def close(self) -> None:
         self._executor.shutdown()

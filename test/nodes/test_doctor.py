@@ -27,6 +27,7 @@ def test_topics_that_are_alive_are_named_with_what_a_node_needs_to_hear_them(
     parameters = {'stamped': True, 'landmarks_type': 'PointCloud2', 'duration': 600.0}
     arguments = ('-r', '__ns:=/a')
     with running('simulator_node', tmp_path / 'log', *arguments, **parameters):
+        ros.wait_for_publisher('/a/twist', '/a/landmarks')
         found = slam_observer.succeed('doctor', '--seconds', 3, '--json').json
     topics = {topic['topic']: topic for topic in found['topics']}
     twist, landmarks = topics['/a/twist'], topics['/a/landmarks']

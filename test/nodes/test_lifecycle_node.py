@@ -172,11 +172,13 @@ def test_two_robots_on_one_machine_do_not_hear_each_other(ros, tmp_path):
         left.run(RUN)
         ros.spin_until(lambda: len(odometry['left']) > 5, 'the estimate')
         ros.call(Trigger, '/right/observer_node/reset', Trigger.Request())
-        ros.spin_for(0.3)
+        ros.meet('/left/observer_node')
+        last_ns = time.time_ns()
+        ros.spin_until(
+            lambda: stamp_ns(odometry['left'][-1]) > last_ns or left.send_zeros(), 'a pose since'
+        )
+        assert x_of(odometry['left'][-1]) > 0.3, "the other robot's reset has reached it"
         assert not odometry['right'] + transforms['right']
-        left.run(RUN)
-        # Had the other robot's reset reached it, it would have come 0.6 m far.
-        ros.spin_until(lambda: x_of(odometry['left'][-1]) > 0.7, 'the second run after the first')
         assert len({stamp_ns(message) for message in odometry['left']}) == len(odometry['left'])
         if TFMessage:
             ros.spin_until(lambda: transforms['left'], 'its /tf')

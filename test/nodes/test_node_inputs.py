@@ -501,8 +501,8 @@ def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
     executor = SingleThreadedExecutor(context=ros.node.context)
     executor.add_node(node)
     try:
-        ros.wait_for_subscriber(twists)
-        ros.wait_for_subscriber(landmarks)
+        for publisher in (twists, landmarks):
+            ros.spin_until(publisher.get_subscription_count, publisher.topic_name)
         for _ in range(12):
             for _ in range(5):
                 twists.publish(Twist())
