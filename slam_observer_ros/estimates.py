@@ -133,3 +133,5 @@ class Smoothed:
     world_points: FloatArray  # (n, 3) landmarks, metres, world
     ids: IntArray  # (n,)
     since: str
+    # (n, 3, 3) of the landmarks, world, zero where unknown; None if it is not estimated
+    orientations: FloatArray | None = None

@@ -196,8 +196,10 @@ def _on_one_line(landmark: Mapping[str, Any]) -> str:
 
 
 def _parse(content: Any) -> LandmarkMap:
+    if isinstance(content, dict) and {'image', 'resolution'} <= content.keys():
+        raise MapError("it is an occupancy grid, as map_server's, and no map of landmarks")
     is_map = isinstance(content, dict) and content.get('format') == FORMAT
-    _expect(is_map, f"it has no line 'format: {FORMAT}'")
+    _expect(is_map, f"it has no line 'format: {FORMAT}'; slam-observer map convert makes maps")
     version = content.get('version')
     if version != FORMAT_VERSION:
         raise MapError(f'it has version {shown(version)}; this program reads {FORMAT_VERSION}')

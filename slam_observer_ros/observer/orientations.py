@@ -9,6 +9,15 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 
+UNKNOWN_RAD = 100.0
+"""Standard deviation about each axis of an orientation of which nothing is known."""
+
+FLIP_EVIDENCE = 9.0
+"""By how much less, as −2 ln of likelihood, what is seen must cost than its flipped twin."""
+
+FLIP_DISTANCE = 3.0
+"""Standard deviations of the sensor's noise within which a flip does no harm."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenOrientations:
@@ -87,3 +96,15 @@ class LandmarkOrientations:
         """Return which of the rows (m,) are rejected so often that the first one was wrong."""
         needed = np.minimum(self.counts[rows] + 1, max_rejections)
         return np.asarray(self.rejections[rows] >= needed)
+
+
+def flip_verdicts(evidence: FloatArray, apart: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Return which orientations (m,) are less likely than their twins, and which hardly likelier.
+
+    ``evidence`` (m,) is by how much less they cost, as −2 ln of likelihood, ``apart`` (m,) how far
+    the twins are from them by the sensor's noise. Those that are as good as their twins are
+    neither.
+    """
+    differ = apart > FLIP_DISTANCE
+    are_flipped = differ & (evidence < 0.0)
+    return are_flipped, differ & ~are_flipped & (evidence < FLIP_EVIDENCE)

@@ -2,7 +2,8 @@
 
 The unknowns are a first pose and the S poses at which landmarks were observed, the n landmarks
 and the velocity's calibration c. They are moved by Â_s ← Â_s exp(η_s), p_i ← p_i + dp_i and
-c ← c + dc. Landmarks and calibration together are called the border. The normal equations
+c ← c + dc. Of a landmark with an orientation dp_i ends in its turn, B̂_i ← exp(ω_i) B̂_i.
+Landmarks and calibration together are called the border. The normal equations
 
     [ T   B ] [ η      ]     [ g ]
     [ Bᵀ  D ] [ dc, dp ] = − [ h ]
@@ -14,77 +15,19 @@ Outliers are reweighted in each iteration (Huber).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
+from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
+from slam_observer_ros.smoothing.observations import normal, Observations
 from slam_observer_ros.smoothing.prior import EXACT_M, Prior
-
-
-@dataclass(frozen=True, slots=True)
-class Keyframes:
-    """S keyframes with M observed points since a prior."""
-
-    motions: FloatArray  # (S, 4, 4) pose in the one before; the first in the prior's pose
-    motion_covariances: FloatArray  # (S, d, d) of each motion as a right perturbation
-    sensitivities: FloatArray  # (S, d, c) derivative of each motion by the calibration, so too
-    calibrations: FloatArray  # (S, c) with which each motion was computed
-    drift_covariances: FloatArray  # (S, c, c) of what the calibration drifted by meanwhile
-    keyframes: IntArray  # (M,) in which keyframe each point was observed
-    landmarks: IntArray  # (M,) which landmark it is
-    points: FloatArray  # (M, 3) where it was seen, metres, body frame
-    information: FloatArray  # (M, k, k) inverse covariance of it, body frame, 1/m²
-    # (M,) how much of it counts: less than 1 where its error is partly that of a point before
-    shares: FloatArray
-
-    def only(self, kept: BoolArray) -> Keyframes:
-        """Return the keyframes with only some of the points (M,)."""
-        return replace(
-            self,
-            keyframes=self.keyframes[kept],
-            landmarks=self.landmarks[kept],
-            points=self.points[kept],
-            information=self.information[kept],
-            shares=self.shares[kept],
-        )
-
-
-def joined(parts: list[Keyframes]) -> Keyframes:
-    """Return the keyframes of one or more parts, one after the other."""
-    names = [field.name for field in fields(Keyframes)]
-    return Keyframes(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-def no_keyframes(d: int, c: int, k: int) -> Keyframes:
-    """Return no keyframes; d, c and k as in :class:`Smoother`."""
-    none = np.empty(0, dtype=np.int64)
-    return Keyframes(
-        motions=np.empty((0, 4, 4)),
-        motion_covariances=np.empty((0, d, d)),
-        sensitivities=np.empty((0, d, c)),
-        calibrations=np.empty((0, c)),
-        drift_covariances=np.empty((0, c, c)),
-        keyframes=none,
-        landmarks=none,
-        points=np.empty((0, 3)),
-        information=np.empty((0, k, k)),
-        shares=np.empty(0),
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """Smoothed estimates."""
-
-    poses: FloatArray  # (S + 1, 4, 4) of the prior, then of each keyframe
-    calibrations: FloatArray  # (S + 1, c) of the velocity; all the same unless it drifts
-    points: FloatArray  # (n, 3) landmarks, metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +57,9 @@ class Smoother:
         self._axes = axes
         self._prior = prior
         self._keyframes = keyframes
-        self._settings = settings
+        self._observations = Observations(axes, keyframes, settings)
+        # Unknowns of a landmark: its position, then its turn if that is estimated.
+        self._unknowns = axes.point + (axes.turn if keyframes.turns is not None else 0)
         drifts, c = settings.calibration_drift > 0.0, len(prior.calibration)
         self._chained, self._shared = (c, 0) if drifts else (0, c)
         self._link_information = _link_information(keyframes, drifts)
@@ -141,18 +86,24 @@ class Smoother:
         d, c = self._axes.p, self._shared
         eta = np.zeros((len(change), 6))
         eta[:, self._axes.pose] = change[:, :d]
+        landmark_changes = border_change[c:].reshape(-1, self._unknowns)
+        shifts, turns = np.hsplit(landmark_changes, [self._axes.point])
+        orientations = solution.orientations
+        if orientations is not None:
+            orientations = so3.exp(self._axes.full_turns(turns)) @ orientations
         return Solution(
             solution.poses @ se3.exp(eta),
             solution.calibrations + (border_change[:c] if c else change[:, d:]),
-            solution.points + self._axes.full_points(border_change[c:]),
+            solution.points + self._axes.full_points(shifts),
+            orientations,
         )
 
     def _linearise(self, solution: Solution) -> Equations:
-        c, k, keyframes = self._shared, self._axes.point, self._keyframes
+        c, k, keyframes = self._shared, self._unknowns, self._keyframes
         S, b = len(solution.poses), c + k * len(solution.points)
         d = self._axes.p + self._chained
         # What the observations say of poses, landmarks, and of both together.
-        H, gradient = self._observations(solution)
+        H, gradient = self._observations.normal_equations(solution, self._chained)
         poses, landmarks, n = keyframes.keyframes + 1, keyframes.landmarks, len(solution.points)
         columns = landmark_columns(np.arange(n), c, k)
         corner, border_gradient = np.zeros((b, b)), np.zeros(b)
@@ -181,6 +132,7 @@ class Smoother:
             solution.poses[0],
             solution.calibrations[0],
             solution.points,
+            solution.orientations,
         )
         d = self._axes.p + self._chained
         known = len(gradient) - d
@@ -189,12 +141,17 @@ class Smoother:
         equations.corner[:known, :known] += information[d:, d:]
         equations.gradient[0] += gradient[:d]
         equations.border_gradient[:known] += gradient[d:]
+        # Of the turns of landmarks since then nothing was known.
+        new = landmark_columns(
+            np.arange(len(self._prior.points), len(solution.points)), self._shared, self._unknowns
+        )[:, self._axes.point :].ravel()
+        equations.corner[new, new] += UNKNOWN_RAD**-2
 
     def _add_motions(self, equations: Equations, solution: Solution) -> None:
         """Add e_s = log((M_s exp(F_s (c − c_s)))⁻¹ Â_{s−1}⁻¹ Â_s) of each motion M_s."""
         d, c = self._axes.p + self._chained, self._shared
         J, error = self._links(solution)
-        H, gradient = _normal(J, self._link_information, error)
+        H, gradient = normal(J, self._link_information, error)
         # The blocks of the poses before (:-1) and after (1:), and of the calibration.
         equations.diagonal[:-1] += H[:, :d, :d]
         equations.diagonal[1:] += H[:, d : 2 * d, d : 2 * d]
@@ -243,39 +200,6 @@ class Smoother:
         """Return the rows and columns (S, d, d) of (S, 6, 6) on the axes that are estimated."""
         pose = self._axes.pose
         return matrices[:, pose, pose]
-
-    def _observations(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
-        """Return the normal equations of R_Âᵀ (p_i − x_Â) − y, with Huber's weight.
-
-        They are (M, q + k, q + k) and (M, q + k), for the q unknowns of the chain's pose and the
-        landmark of each point.
-        """
-        keyframes, k = self._keyframes, self._axes.point
-        poses = solution.poses[keyframes.keyframes + 1]
-        R = poses[:, :3, :3]
-        arms = solution.points[keyframes.landmarks] - poses[:, :3, 3]
-        predicted = (transpose(R) @ arms[:, :, None])[:, :, 0]
-        error = (predicted - keyframes.points)[:, :k]
-        J_point = transpose(R)[:, :k, :k]
-        C, unseen = self._axes.output_matrix(predicted), np.zeros((len(error), k, self._chained))
-        J = np.concatenate([-C, unseen, J_point], axis=2)
-        counted = keyframes.shares * self._weights(error)
-        return _normal(J, keyframes.information * counted[:, None, None], error)
-
-    def _weights(self, error: FloatArray) -> FloatArray:
-        """Return Huber's weights (M,), which fall off faster where a filter would reject."""
-        huber, rejection = self._settings.huber_threshold, self._settings.rejection_threshold
-        squared = (error[:, None, :] @ self._keyframes.information @ error[:, :, None])[:, 0, 0]
-        weights: FloatArray = np.minimum(1.0, rejection**2 / np.maximum(squared, rejection**2))
-        if huber > 0.0:
-            weights = weights * huber / np.sqrt(np.maximum(squared, huber**2))
-        return weights
-
-
-def _normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Jᵀ W J (M, q, q) and Jᵀ W e (M, q) for J (M, k, q), W (M, k, k) and e (M, k)."""
-    JW = transpose(J) @ W
-    return JW @ J, (JW @ error[:, :, None])[:, :, 0]
 
 
 def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:

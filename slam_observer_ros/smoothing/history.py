@@ -12,9 +12,16 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
-from slam_observer_ros.smoothing.gauss_newton import joined, Keyframes, no_keyframes
+from slam_observer_ros.smoothing.keyframes import (
+    joined,
+    joined_turns,
+    Keyframes,
+    no_keyframes,
+    SeenTurns,
+)
 from slam_observer_ros.smoothing.prior import Prior
 
 
@@ -29,6 +36,18 @@ class Keyframe:
     lines_of_sight: FloatArray
     covariances: FloatArray | None  # (m, 3, 3) of the points, m²; None for the noise model's
     dt_s: FloatArray  # (m,) seconds since each was seen before; infinite if it was not
+    # (m,) how their tags are turned, zero for none; None if that is not estimated
+    orientations: SeenOrientations | None = None
+
+
+def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:
+    """Return how the tags of a keyframe's m points are turned."""
+    seen, m, q = keyframe.orientations, len(keyframe.rows), axes.turn
+    if seen is None:
+        return SeenTurns(np.zeros((m, 3, 3)), np.zeros((m, 3, 3)), np.zeros((m, q, q)))
+    information = np.linalg.inv(axes.turn_covariances(seen.covariances)).astype(np.float64)
+    are_none = np.logical_not(seen.Z.any(axis=(1, 2)))
+    return SeenTurns(seen.Z, seen.flipped, information).without(are_none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +85,8 @@ class History:
         self._end = prior.pose
         self._motion_noise, self._sensitivity, self._drift = self._at_rest()
         # Keyframes as arrays: those that are summarised, in pieces, and those that are not.
-        self._none = no_keyframes(axes.p, len(prior.calibration), axes.point)
+        q = 0 if prior.orientations is None else axes.turn
+        self._none = no_keyframes(axes.p, len(prior.calibration), axes.point, q)
         self._summarised: list[Keyframes] = []
         self._latest = self._none
         self._new: list[_Step] = []
@@ -121,6 +141,17 @@ class History:
         self._change(seen_for_the_first_time)
         self.prior = self.prior.with_unknown(self._axes, rows)
         self.summary = self.summary.with_unknown(self._axes, rows)
+
+    def forget_orientations(self, rows: IntArray) -> None:
+        """Forget how the tags of the landmarks at ``rows`` were turned."""
+
+        def without(keyframes: Keyframes) -> Keyframes:
+            turns, forgotten = keyframes.turns, np.isin(keyframes.landmarks, rows)
+            return replace(keyframes, turns=None if turns is None else turns.without(forgotten))
+
+        self._change(without)
+        self.prior = self.prior.with_unknown_turns(self._axes, rows)
+        self.summary = self.summary.with_unknown_turns(self._axes, rows)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows`` and all observations of them."""
@@ -179,7 +210,14 @@ class History:
             points=np.concatenate([part.points for part in seen]),
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
             shares=1.0 / repetition_factors(dt_s, self._observation_noise.error_time_s),
+            turns=self._turns(seen),
         )
+
+    def _turns(self, seen: list[Keyframe]) -> SeenTurns | None:
+        """Return how the tags of all points are turned, if that is estimated."""
+        if self.prior.orientations is None:
+            return None
+        return joined_turns([_seen_turns(part, self._axes) for part in seen])
 
     def _covariances(self, seen: list[Keyframe]) -> FloatArray:
         """Return the covariances (M, 3, 3) of all points, body frame, m²."""

@@ -6,10 +6,13 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.geometry import se3
+from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 
 ANYWHERE_M = 1e3
 """Standard deviation of a landmark of which nothing is known, metres."""
@@ -20,23 +23,29 @@ EXACT_M = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Estimates with the covariance of their errors: pose exp(η), c + dc and p_i + dp_i."""
+    """Estimates with the covariance of their errors: pose exp(η), c + dc and p_i + dp_i.
+
+    Where orientations B_i are estimated, dp_i ends in the turn ω_i of exp(ω_i) B_i.
+    """
 
     pose: FloatArray  # (4, 4) P
     calibration: FloatArray  # (c,)
     points: FloatArray  # (n, 3) landmarks that were known, metres; the first n of the map
     covariance: FloatArray  # (d + c + k n, d + c + k n) of (η, dc, dp)
-    # Whether it is that of (η, dc, dy) instead, of y_i = P⁻¹ p_i as seen from the pose.
+    # Whether it is that of (η, dc, dy) instead, of y_i = P⁻¹ p_i as seen from the pose; then
+    # orientations are as seen from there, too.
     is_relative: bool = False
+    # (n, 3, 3) of the landmarks, zero where that is not known; None if it is not estimated
+    orientations: FloatArray | None = None
 
     def relative(self, axes: EstimatedAxes) -> Prior:
         """Return the same knowledge, but of where the landmarks lie as seen from the pose.
 
         dy_i is Rᵀ dp_i − C_i η, with C_i the output matrix at y_i and R the pose's rotation.
         """
-        d, k, first = axes.p, axes.point, self._first_point(axes)
+        d, first = axes.p, self._first_point(axes)
         y = se3.transform(se3.inverse(self.pose), self.points)
-        C, R = axes.output_matrix(y).reshape(-1, d), self.pose[:k, :k]
+        C, R = self._output_matrix(axes, y).reshape(-1, d), self._rotation(axes, self.pose)
         covariance = self.covariance.copy()
         for rows in (covariance, covariance.T):  # a view: its rows are the columns
             rows[first:] = _turned(rows[first:], R.T) - C @ rows[:d]
@@ -73,15 +82,27 @@ class Prior:
             self,
             points=np.delete(self.points, known, axis=0),
             covariance=np.delete(np.delete(self.covariance, columns, 0), columns, 1),
+            orientations=(
+                None if self.orientations is None else np.delete(self.orientations, known, axis=0)
+            ),
         )
 
     def with_unknown(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior with landmarks at ``rows`` that may be anywhere."""
         _, columns = self._known(axes, rows)
-        covariance = self.covariance.copy()
-        covariance[columns] = covariance[:, columns] = 0.0
-        covariance[columns, columns] = ANYWHERE_M**2
-        return replace(self, covariance=covariance)
+        unknown = replace(self, covariance=_with_unknown(self.covariance, columns, ANYWHERE_M))
+        return unknown.with_unknown_turns(axes, rows)
+
+    def with_unknown_turns(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
+        """Return the prior with landmarks at ``rows`` that may be turned in any way."""
+        if self.orientations is None:
+            return self
+        known, columns = self._known(axes, rows)
+        orientations = self.orientations.copy()
+        orientations[known] = 0.0
+        turns = columns.reshape(len(known), self._unknowns(axes))[:, axes.point :].ravel()
+        covariance = _with_unknown(self.covariance, turns, UNKNOWN_RAD)
+        return replace(self, covariance=covariance, orientations=orientations)
 
     def normal_equations(
         self,
@@ -90,26 +111,41 @@ class Prior:
         pose: FloatArray,
         calibration: FloatArray,
         points: FloatArray,
+        orientations: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Return Jᵀ W J and Jᵀ W e of the error e of estimates, by (η, dc, dp) of these.
 
         ``information`` is W, the inverse of the covariance; estimates are a pose (4, 4),
-        calibration (c,) and points (n + …, 3).
+        calibration (c,), points (n + …, 3) and orientations (n + …, 3, 3).
         """
-        d, k, first = axes.p, axes.point, self._first_point(axes)
+        d, k, first = axes.p, self._unknowns(axes), self._first_point(axes)
         # The error of pose, calibration and landmarks, and its derivatives.
         eta = se3.log(se3.inverse(self.pose) @ pose)
         y = self._seen_from(pose, points[: len(self.points)])
-        shifts = (y - self._seen_from(self.pose, self.points))[:, :k].ravel()
-        error = np.concatenate([eta[axes.pose], calibration - self.calibration, shifts])
+        shifts = (y - self._seen_from(self.pose, self.points))[:, : axes.point]
+        J_turns = None
+        if self.orientations is not None and orientations is not None:
+            turns = self._turns_from(pose, orientations[: len(self.points)])
+            shifts = np.hstack([shifts, axes.turns(turns)])
+            J_turns = axes.turn_covariances(so3.left_jacobian_inverse(turns))
+        off = [eta[axes.pose], calibration - self.calibration, shifts.ravel()]
+        error = np.concatenate(off)
         J_eta = se3.left_jacobian_inverse(-eta)[axes.pose, axes.pose]
-        C, R = np.zeros((len(shifts), d)), np.eye(k)
+        C, R = np.zeros((shifts.size, d)), np.eye(k)
         if self.is_relative:
-            C, R = axes.output_matrix(y).reshape(-1, d), pose[:k, :k]
+            C, R = self._output_matrix(axes, y).reshape(-1, d), self._rotation(axes, pose)
 
         def pull_back(rows: FloatArray) -> FloatArray:
-            """Return Jᵀ b for rows b, J = [[J_η, 0, 0], [0, I, 0], [−C, 0, Rᵀ for each point]]."""
+            """Return Jᵀ b for rows b, J = [[J_η, 0, 0], [0, I, 0], [−C, 0, Rᵀ for each point]].
+
+            Of orientations −C and Rᵀ are multiplied by the Jacobian of the logarithm.
+            """
             pulled: FloatArray = rows.copy()
+            if J_turns is not None:
+                blocks = pulled[first:].reshape(len(J_turns), k, rows.shape[1])
+                of_turns = blocks[:, axes.point :]
+                of_turns[:] = transpose(J_turns) @ of_turns
+                rows = pulled.copy()
             pulled[:d] = J_eta.T @ rows[:d] - C.T @ rows[first:]
             pulled[first:] = _turned(rows[first:], R)
             return pulled
@@ -121,18 +157,61 @@ class Prior:
         """Return points (n, 3) in the frame in which they are known: a pose's or the world."""
         return se3.transform(se3.inverse(pose), points) if self.is_relative else points
 
+    def _turns_from(self, pose: FloatArray, orientations: FloatArray) -> FloatArray:
+        """Return rotation vectors (n, 3) from the known orientations to others (n, 3, 3).
+
+        As points are, they are seen from a pose; zero where one of them is not known.
+        """
+        before, now = self.orientations, orientations
+        if before is None:
+            raise TypeError('a prior of points alone knows no orientations')
+        are_known = np.logical_and(before.any(axis=(1, 2)), now.any(axis=(1, 2)))
+        if self.is_relative:
+            before, now = self.pose[:3, :3].T @ before, pose[:3, :3].T @ now
+        turns = so3.log(now @ transpose(before))
+        turns[~are_known] = 0.0
+        return turns
+
+    def _unknowns(self, axes: EstimatedAxes) -> int:
+        """Return how many unknowns a landmark has."""
+        return axes.point + (axes.turn if self.orientations is not None else 0)
+
+    def _output_matrix(self, axes: EstimatedAxes, y: FloatArray) -> FloatArray:
+        """Return (n, k, d) blocks: how the pose moves and turns landmarks at ``y`` (n, 3)."""
+        C = axes.output_matrix(y)
+        if self.orientations is None:
+            return C
+        turns = np.eye(axes.turn, axes.p)
+        return np.concatenate([C, np.tile(turns, (len(y), 1, 1))], axis=1)
+
+    def _rotation(self, axes: EstimatedAxes, pose: FloatArray) -> FloatArray:
+        """Return R (k, k) of a pose, for the unknowns of a landmark."""
+        R = pose[: axes.point, : axes.point]
+        if self.orientations is None:
+            return R
+        full: FloatArray = block_diag(R, axes.turn_covariances(pose[None, :3, :3])[0])
+        return full
+
     def _turns(self, axes: EstimatedAxes) -> slice:
         """Return the columns of the pose's angles, which come before its shifts."""
         return slice(axes.p - axes.point)
 
     def _first_point(self, axes: EstimatedAxes) -> int:
         """Return the first column of the landmarks."""
-        return len(self.covariance) - axes.point * len(self.points)
+        return len(self.covariance) - self._unknowns(axes) * len(self.points)
 
     def _known(self, axes: EstimatedAxes, rows: IntArray) -> tuple[IntArray, IntArray]:
         """Return those of landmarks (m,) that were known, and their columns."""
-        known, k = rows[rows < len(self.points)], axes.point
+        known, k = rows[rows < len(self.points)], self._unknowns(axes)
         return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()
+
+
+def _with_unknown(covariance: FloatArray, columns: IntArray, sigma: float) -> FloatArray:
+    """Return a covariance in which ``columns`` are independent of all else, and all but free."""
+    changed: FloatArray = covariance.copy()
+    changed[columns] = changed[:, columns] = 0.0
+    changed[columns, columns] = sigma**2
+    return changed
 
 
 def _turned(rows: FloatArray, R: FloatArray) -> FloatArray:

@@ -11,7 +11,8 @@ grow with the history, of which only :meth:`Relinearisation.smooth` needs all.
 
 It is O(n³) for n landmarks. In a map without a dense covariance (:mod:`.compressed_covariance`)
 nothing is relinearised any more. Its history goes on, to be smoothed, until it would have to begin
-again: then it is given up.
+again: then it is given up. Among tags the covariance stays dense, but from
+:data:`MAX_UNKNOWNS` on nothing is relinearised, either.
 """
 
 from __future__ import annotations
@@ -27,13 +28,15 @@ from slam_observer_ros.common.types import FloatArray, Immutable, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.orientations import LandmarkOrientations
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.gauss_newton import Smoother, Solution, Step
+from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
+from slam_observer_ros.smoothing.keyframes import Solution
 from slam_observer_ros.smoothing.prior import Prior
 
 logger = logging.getLogger(__name__)
@@ -47,6 +50,11 @@ many that each of them costs no more than an update, O(n²).
 
 MAX_INTERVAL = 300
 """Observations that are enough, however many there were before."""
+
+MAX_UNKNOWNS = 600
+"""Most unknowns of a map that is relinearised, in some tenths of a second: 100 tags in space."""
+
+CUT = 'the history was cut (smoothing_window=0 keeps all of it)'
 
 MAX_TURN_RAD = 0.2
 """Angle, see :meth:`.Prior.least_nonlinear`, beyond which there is no summary."""
@@ -70,6 +78,7 @@ class JointFilter(Protocol):
     calibration: Calibration
     axes: EstimatedAxes
     joint: JointCovariance | None
+    orientations: LandmarkOrientations | None
 
 
 class Relinearisation:
@@ -135,7 +144,7 @@ class Relinearisation:
         self._observations += 1
         if not self._joint.is_dense:
             if self._window_is_full:
-                self.reset('the history was cut (smoothing_window=0 keeps all of it)')
+                self.reset(CUT)
         elif in_doubt:
             self._relinearise()
             # The landmark may be relocated by this very keyframe, which must be kept for that.
@@ -146,6 +155,10 @@ class Relinearisation:
     def relocate(self, rows: IntArray) -> None:
         """Forget all about landmarks (m,) but their latest observation."""
         self.history.relocate(rows)
+
+    def forget_orientations(self, rows: IntArray) -> None:
+        """Forget how landmarks (m,) are turned."""
+        self.history.forget_orientations(rows)
 
     def remove(self, rows: IntArray) -> None:
         """Forget landmarks; those behind move up."""
@@ -219,9 +232,11 @@ class Relinearisation:
     def _sum_up(self, is_done: bool) -> None:
         """Let what is known now stand for all keyframes, if they could be relinearised."""
         self._clear_counts()
+        if not (is_done or self._window_is_full):
+            return
         known, angle_rad = self._known().least_nonlinear(self._axes)
         if self._window_is_full:
-            self._start(known, 'the history was cut (smoothing_window=0 keeps all of it)')
+            self._start(known, CUT)
         elif is_done and angle_rad < MAX_TURN_RAD:
             self.history.summarise(known)
 
@@ -230,6 +245,8 @@ class Relinearisation:
 
         Return whether it was: if they don't determine everything, more may do so later.
         """
+        if len(self._joint.P) - self._joint.first > MAX_UNKNOWNS:
+            return False
         # Smooth them, after the summary of those before, …
         history, first = self.history, self.history.summarised
         try:
@@ -263,6 +280,9 @@ class Relinearisation:
         self._calibration.shift(end.calibrations[-1] - self._calibration.values)
         D = end.poses[-1] @ se3.inverse(start.poses[-1])
         observer.correct(D, slice(None), end.points - start.points)
+        tags = self._filter.orientations
+        if tags is not None and end.orientations is not None:
+            tags.B = end.orientations
 
     def _solution_from(self, first: int) -> Solution:
         """Return the present estimates, of poses those from before keyframe ``first`` on."""
@@ -270,7 +290,7 @@ class Relinearisation:
         calibrations = np.tile(self._calibration.values, (len(poses), 1))
         if self._calibration.drifts:
             calibrations = np.array(self.history.calibrations[first:])
-        return Solution(poses, calibrations, self._observer.points)
+        return Solution(poses, calibrations, self._observer.points, self._orientations())
 
     def _known(self) -> Prior:
         """Return what is known now."""
@@ -280,7 +300,13 @@ class Relinearisation:
         if not self._is_given_up:
             P = joint.of_positions(points)
         P = _with_pose_error_by(se3.inverse(observer.A), P, self._axes)
-        return Prior(observer.A, self._calibration.values, points, P)
+        values = self._calibration.values
+        return Prior(observer.A, values, points, P, orientations=self._orientations())
+
+    def _orientations(self) -> FloatArray | None:
+        """Return those of the landmarks (n, 3, 3), if they are estimated."""
+        tags = self._filter.orientations
+        return None if tags is None else tags.B.copy()
 
 
 def _with_pose_error_by(A: FloatArray, P: FloatArray, axes: EstimatedAxes) -> FloatArray:

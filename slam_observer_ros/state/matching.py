@@ -9,6 +9,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
+from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
@@ -60,13 +61,18 @@ def residuals_of(
     return state.filter.residuals(rows, event.points, covariances, dt_s)
 
 
-def keyframe_of(state: State, event: ObservationEvent, rows: IntArray) -> Keyframe:
+def keyframe_of(
+    state: State,
+    event: ObservationEvent,
+    rows: IntArray,
+    orientations: SeenOrientations | None = None,
+) -> Keyframe:
     """Return what is needed to linearise an observation again, after its correction."""
     lines_of_sight, noise = _lines_of_sight(state, event, rows), state.observation_noise
     is_stated = event.covariances is not None
     stated = noise.covariances(event, lines_of_sight) if is_stated else None
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    return Keyframe(event.stamp_ns, rows, event.points, lines_of_sight, stated, dt_s)
+    return Keyframe(event.stamp_ns, rows, event.points, lines_of_sight, stated, dt_s, orientations)
 
 
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:

@@ -33,8 +33,7 @@ class State:
         self.observer, self.axes = self.filter.observer, self.filter.axes
         self.landmarks = LandmarkTable()
         self.relinearisation: Relinearisation | None = None  # where the filter needs it
-        takes_points = filter_.orientations is None and not self.landmark_velocity_stddev
-        if filter_.joint is not None and takes_points:
+        if filter_.joint is not None and not self.landmark_velocity_stddev:
             self.relinearisation = Relinearisation(filter_, settings)
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
@@ -189,10 +188,6 @@ class State:
             raise ParameterError(
                 "smoothing takes landmarks to rest: 'landmark_velocity_stddev' must be 0"
             )
-        if self.filter.orientations is not None:
-            raise ParameterError(
-                "smoothing takes tags for points: 'use_tag_orientation' must be false"
-            )
         if self.relinearisation is None:
             raise ParameterError(
                 "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
@@ -200,10 +195,12 @@ class State:
         # From the reference frame to the world.
         found, rows = self.relinearisation.smooth(), self.confirmed
         history, P = self.relinearisation.history, self.observer.reference_pose
+        turned = found.orientations
         return Smoothed(
             stamps_ns=np.array(history.stamps_ns, dtype=np.int64),
             poses=P @ found.poses[1:],
             world_points=se3.transform(P, found.points[rows]),
             ids=self.landmarks.ids[rows],
             since=history.since,
+            orientations=None if turned is None else P[:3, :3] @ turned[rows],
         )

@@ -22,6 +22,7 @@ from slam_observer_ros.state.matching import (
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.tag_orientations import (
     correct_by_orientations,
+    seen_orientations,
     take_over_orientations,
 )
 
@@ -50,9 +51,9 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     rejected = weights == 0.0
     _count(state, matched, rejected)
     event, rows = _add_new(state, matched)  # y_i° = Â y_i
-    moved_ids = _relinearise(state, event, rows)
     if event.orientations is not None:
         take_over_orientations(state, event, rows)  # B̂_i = R_Â Z_i
+    moved_ids = _relinearise(state, event, rows)
     _set_velocities(state, event, rows)  # (19)
     innovation = None if expected is None else expected.judge(weights)
     return Outcome(matched.known.ids, residuals.r, rejected, moved_ids, innovation)
@@ -91,7 +92,8 @@ def _relinearise(state: State, event: ObservationEvent, rows: IntArray) -> IntAr
     some_are = bool(np.count_nonzero(in_doubt))
     past = state.relinearisation
     if past is not None and past.is_active:
-        past.add(keyframe_of(state, event, rows), some_are)
+        turns = seen_orientations(state, event, rows) if event.orientations is not None else None
+        past.add(keyframe_of(state, event, rows, turns), some_are)
     if some_are:
         return _relocate_moved(state, event.select(in_doubt), rows[in_doubt])
     return np.empty(0, dtype=np.int64)
@@ -135,6 +137,7 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     if far.any():
         state.relocate(rows[far], event.points[far], noise[far])
         state.landmarks.take_for_new(rows[far], event.stamp_ns)
+        take_over_orientations(state, event.select(far), rows[far])
     return event.ids[moved]
 
 

@@ -33,7 +33,10 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
     seen = _seen(state, event, rows, event.orientations, are_near & tags.are_known[rows])
     if not len(seen.rows):
         return matched
+    before = state.observer.A
     weights, are_unclear = state.filter.correct_by_orientations(seen)
+    if state.relinearisation is not None:
+        state.relinearisation.note_correction(before, state.observer.A)
     judged = ~are_unclear
     tags.count(seen.rows[judged], weights[judged] > 0.0)
     state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
@@ -53,8 +56,21 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
     in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     is_used = state.landmarks.rejections[rows] == 0
     seen = _seen(state, event, rows, Z, is_used & (in_doubt | ~tags.are_known[rows]))
-    if len(seen.rows):
-        state.filter.add_orientations(seen)
+    if not len(seen.rows):
+        return
+    replaced = seen.rows[tags.are_known[seen.rows]]
+    if state.relinearisation is not None and len(replaced):
+        state.relinearisation.forget_orientations(replaced)
+    state.filter.add_orientations(seen)
+
+
+def seen_orientations(
+    state: State, event: ObservationEvent, rows: IntArray
+) -> SeenOrientations | None:
+    """Return how tags of landmarks ``rows`` (m,) are turned, zero for none; None of points."""
+    if state.filter.orientations is None or event.orientations is None:
+        return None
+    return _all_seen(state, event, rows, event.orientations)
 
 
 def flipped(Z: FloatArray, lines_of_sight: FloatArray) -> FloatArray:
@@ -74,10 +90,16 @@ def _seen(
     state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray, are_wanted: BoolArray
 ) -> SeenOrientations:
     """Return those of the orientations in an observation that are wanted (m,) and known."""
+    return _all_seen(state, event, rows, Z).select(are_wanted & Z.any(axis=(1, 2)))
+
+
+def _all_seen(
+    state: State, event: ObservationEvent, rows: IntArray, Z: FloatArray
+) -> SeenOrientations:
+    """Return the orientations (m, 3, 3) in an observation, with their noise."""
     noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    seen = SeenOrientations(rows, Z, flipped(Z, event.lines_of_sight), noise, dt_s)
-    return seen.select(are_wanted & Z.any(axis=(1, 2)))
+    return SeenOrientations(rows, Z, flipped(Z, event.lines_of_sight), noise, dt_s)
 
 
 def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from command_line import CommandLine
 import detector_messages as detector
+import numpy as np
 import pytest
 import ros_messages as ros
 from rosbags import rosbag2
@@ -11,6 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from tag_drives import past_tags, SETTINGS
 
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.known_map.map_file import read_map
 
 STEPS = 300
 
@@ -51,18 +53,18 @@ def record(path):
 
 
 @pytest.fixture
-def heading_error(capsys):
-    """Replay a recording; return the RMS error of the heading, rad."""
+def replay(capsys):
+    """Replay a recording; return the report."""
     # So large a noise of the velocity leaves the ids in doubt, which takes most of the time.
     settings = SETTINGS | {'max_hypotheses': 1}
     options = [f'{name}={written(value)}' for name, value in settings.items()]
 
-    def run(path, use_tag_orientation):
+    def run(path, use_tag_orientation, *more):
         chosen = [*options, f'use_tag_orientation={use_tag_orientation}']
         arguments = [word for option in chosen for word in ('--set', option)]
-        report = CommandLine(capsys).succeed('replay', path, '--json', *arguments).json
+        report = CommandLine(capsys).succeed('replay', path, '--json', *arguments, *more).json
         assert not report['dropped']
-        return report['heading_rmse_rad']
+        return report
 
     return run
 
@@ -71,6 +73,18 @@ def written(value):
     return str(list(value)) if isinstance(value, tuple) else str(value)
 
 
-def test_with_one_tag_in_view_its_orientation_determines_the_heading(heading_error, tmp_path):
+def test_with_one_tag_in_view_its_orientation_determines_the_heading(replay, tmp_path):
     path = record(tmp_path / 'tags')
-    assert heading_error(path, 'true') < 0.5 * heading_error(path, 'false')
+    errors_rad = [replay(path, use)['heading_rmse_rad'] for use in ('true', 'false')]
+    assert errors_rad[0] < 0.5 * errors_rad[1]
+
+
+def test_orientations_are_smoothed_and_written_to_the_map(replay, tmp_path):
+    path, online, smoothed = record(tmp_path / 'tags'), tmp_path / 'a.yaml', tmp_path / 'b.yaml'
+    replay(path, 'true', '--map', online)
+    report = replay(path, 'true', '--map', smoothed, '--smooth')
+    assert report['smoothed_ate_rmse_m'] < report['ate_rmse_m']
+    before, after = read_map(online), read_map(smoothed)
+    np.testing.assert_array_equal(after.ids, before.ids)
+    turns = so3.log(after.orientations @ before.orientations.swapaxes(1, 2))
+    assert 0.0 < np.max(np.linalg.norm(turns, axis=1)) < 0.1

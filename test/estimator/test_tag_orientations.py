@@ -8,7 +8,6 @@ import logging
 import numpy as np
 import pytest
 
-from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
@@ -135,8 +134,3 @@ def test_what_is_no_rotation_is_refused(orientations, reason):
     event = ObservationEvent(0, np.array([1]), TAG[None], orientations=orientations)
     assert not estimator.add(event)
     assert estimator.dropped[reason] == 1
-
-
-def test_smoothing_says_that_it_takes_tags_for_points():
-    with pytest.raises(ParameterError, match='use_tag_orientation'):
-        drive(SETTINGS, 0.0, seconds=3).smooth()

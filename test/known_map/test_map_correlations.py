@@ -8,6 +8,7 @@ import re
 import zlib
 
 from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -168,6 +169,20 @@ class TestFile:
         path.write_text(re.sub('correlations: .*', line, path.read_text()))
         with pytest.raises(MapError, match=reason):
             read_map(path)
+
+    @given(st.data())
+    def test_with_a_wrong_byte_they_are_refused_or_as_they_were(self, tmp_path_factory, data):
+        path = write(tmp_path_factory.mktemp('map') / 'map.yaml', a_map())
+        whole = bytearray(path.read_bytes())
+        start = whole.index(b': {checksum')
+        whole[data.draw(st.integers(start, len(whole) - 1))] = data.draw(st.integers(0, 255))
+        path.write_bytes(bytes(whole))
+        try:
+            read = read_map(path)
+        except MapError as error:
+            assert '\n' not in str(error)
+        else:
+            assert_array_equal(read.joint_covariance, a_map().joint_covariance)
 
     def test_those_that_no_errors_can_have_are_refused(self, tmp_path):
         known = a_map()

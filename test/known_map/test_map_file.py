@@ -183,7 +183,8 @@ def changed(old, new):
 
 BAD_FILES = [
     ('', "no line 'format: slam_observer_ros map'"),
-    ('just text', "no line 'format"),
+    ('just text', "no line 'format.*; slam-observer map convert makes maps"),
+    ('image: hall.pgm\nresolution: 0.05\norigin: [0, 0, 0]', 'it is an occupancy grid'),
     ('[1, 2]', "no line 'format"),
     (SURVEYED[:-10], 'not valid YAML'),
     ('a: ]', 'not valid YAML'),

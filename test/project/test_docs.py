@@ -165,7 +165,7 @@ def test_all_counts_are_explained():
 
 
 def test_all_keys_of_json_are_explained():
-    page = (CHECKOUT / 'docs' / 'first_run.md').read_text()
+    page = (CHECKOUT / 'docs' / 'recordings.md').read_text()
     source = inspect.getsource(identity) + inspect.getsource(as_json)
     keys = re.findall(r"^        '(\w+)': ", source, re.MULTILINE)
     assert re.findall(r'^\| `(\w+)` ', page, re.MULTILINE) == keys

@@ -81,7 +81,11 @@ def _write_map(outcome: ReplayOutcome, map_frame: str, path: Path) -> None:
         logger.warning('%d landmarks that move are left out of the map.', moving)
     if smoothed is not None:
         # The covariances stay: what the filter knows of the map in the end is smoothed, too.
-        landmark_map = dataclasses.replace(landmark_map, world_points=smoothed.world_points)
+        landmark_map = dataclasses.replace(
+            landmark_map,
+            world_points=smoothed.world_points,
+            orientations=None if landmark_map.orientations is None else smoothed.orientations,
+        )
     write_map(path, landmark_map, estimator.settings)
 
 

@@ -3,7 +3,7 @@
 The errors are x = (ε, c̃, (ξ_1, ω_1) … ), with B̂_i = exp(ω_i) B_i of the tag's orientation in the
 reference frame. No motion changes ω_i, and what is seen of it, R_Â Z_i B̂_iᵀ = exp(φ_i), says
 φ_i = ε_Ω − ω_i, whatever the map is: the group is :mod:`slam_observer_ros.geometry.tag_group`.
-A landmark that has no orientation has columns of which nothing is ever used.
+A landmark that has no orientation may have any, and its columns say so.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import block_diagonal
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.observer.riccati.joint_covariance import (
     ExactMapCovariance,
     JointCovariance,
@@ -84,6 +85,11 @@ class TagCovariance(JointCovariance):
         G[self._turn_columns(np.arange(n)), :q] = np.tile(np.eye(q), (n, 1))
         return G
 
+    def forget_turns(self, rows: IntArray) -> None:
+        """Let orientations (m,) be unknown."""
+        q = self._axes.turn
+        self.add_known_turns(rows, np.tile(UNKNOWN_RAD**2 * np.eye(q), (len(rows), 1, 1)))
+
     def add_turns(self, rows: IntArray, covariances: FloatArray) -> None:
         """Take over orientations (m,) seen for the first time: ω_i = ε_Ω + noise (m, q, q)."""
         columns, q = self._turn_columns(rows), self._axes.turn
@@ -108,6 +114,10 @@ class TagCovariance(JointCovariance):
         """Return the same of ω_i alone."""
         columns = self._turn_columns(rows)
         return self.P[columns], self.P[np.ix_(columns, columns)]
+
+    def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        super()._insert(rows, C, noise)
+        self.forget_turns(rows)
 
     def _turn_columns(self, rows: IntArray) -> IntArray:
         first = self.first + self._axes.point + np.arange(self._axes.turn)

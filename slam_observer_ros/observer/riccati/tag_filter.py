@@ -14,18 +14,16 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose, with_blocks
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
-from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
+from slam_observer_ros.observer.orientations import (
+    flip_verdicts,
+    LandmarkOrientations,
+    SeenOrientations,
+)
 from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.observer.riccati.tag_covariance import ExactTagMapCovariance, TagCovariance
 from slam_observer_ros.observer.robust import distances, observation_weights
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors, RESOLUTION_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
-
-FLIP_EVIDENCE = 9.0
-"""By how much less, as −2 ln of likelihood, what is seen must cost than its flipped twin."""
-
-FLIP_DISTANCE = 3.0
-"""Standard deviations of the sensor's noise within which a flip does no harm."""
 
 
 class RiccatiTagFilter(RiccatiFilter):
@@ -112,17 +110,12 @@ class RiccatiTagFilter(RiccatiFilter):
     def _judge_flips(
         self, seen: SeenOrientations, phi: FloatArray, predicted: FloatArray, R: FloatArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Return which (m,) are less likely than their twins, and which hardly likelier.
-
-        Those that are as good as their twins are neither.
-        """
+        """Return which (m,) are flipped, and of which that is unclear."""
         twins = self._turns(seen.rows, seen.flipped)
         evidence = distances(twins, predicted, R) ** 2 - distances(phi, predicted, R) ** 2
         R_hat = self.observer.A[:3, :3]
         apart = self.axes.turns(so3.log(R_hat @ seen.Z @ transpose(R_hat @ seen.flipped)))
-        differ = distances(apart, np.zeros_like(predicted), R) > FLIP_DISTANCE
-        are_flipped = differ & (evidence < 0.0)
-        return are_flipped, differ & ~are_flipped & (evidence < FLIP_EVIDENCE)
+        return flip_verdicts(evidence, distances(apart, np.zeros_like(predicted), R))
 
     # Landmarks
 
