@@ -175,9 +175,11 @@ class ObserverCore:
 
     def _publish_new(self, source: str) -> None:
         """Publish what an input has given if it is due, else a little later."""
-        if self._is_catching_up or any(each.has_more for each in self._inputs):
+        if self._is_catching_up:
             return
-        if self._publisher.is_due(source):
+        # With what is still to be used; a little later, if nothing comes of that.
+        has_more = any(each.has_more for each in self._inputs)
+        if not has_more and self._publisher.is_due(source):
             self._catch_up()
             self._publisher.publish_state(source)
         if self._must_publish:
