@@ -13,7 +13,6 @@ from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
 from slam_observer_ros.common.errors import ParameterError
-from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.nodes.entities import Entities
@@ -178,20 +177,26 @@ class ObserverCore:
         """Publish what an input has given if it is due, else a little later."""
         if self._is_catching_up:
             return
-        if self._publisher.is_due(source):
+        # With what is still to be used; a little later, if nothing comes of that.
+        has_more = any(each.has_more for each in self._inputs)
+        if not has_more and self._publisher.is_due(source):
             self._catch_up()
             self._publisher.publish_state(source)
         if self._must_publish:
             _start(self._publish_timer)
 
     def _catch_up(self) -> None:
-        """Use the velocities that wait, so that what is published is not old."""
+        """Use what waits, so that what is published is not old."""
         self._is_catching_up = True  # their events are published with it
-        for source in self._inputs:
-            if source.name in MOTION_INPUTS:
-                source.read_until(MAX_STAMP_NS)
+        self._read_waiting()
         self._is_catching_up = False
         self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
+
+    def _read_waiting(self) -> None:
+        """Use what waits, in the order in which it was received."""
+        # Landmarks read the velocities before them: read after all of these they would be late.
+        for source in sorted(self._inputs, key=lambda source: source.name in MOTION_INPUTS):
+            source.read_waiting()
 
     def _publish_waiting(self) -> None:
         self._publisher.publish_state()
@@ -216,8 +221,7 @@ class ObserverCore:
     def _on_clock_jump(self, jump: TimeJump) -> None:
         """Use what still waits of the run that has ended, and then what has come of the next."""
         self._feed.begin_clock_jump(-jump.delta.nanoseconds)
-        for source in self._inputs:
-            source.read_until(MAX_STAMP_NS)
+        self._read_waiting()
         self._estimator.handle_clock_jump(jump.delta.nanoseconds)
         self._feed.end_clock_jump()
 

@@ -28,7 +28,8 @@ def test_topics_that_are_alive_are_named_with_what_a_node_needs_to_hear_them(
     arguments = ('-r', '__ns:=/a')
     with running('simulator_node', tmp_path / 'log', *arguments, **parameters):
         ros.wait_for_publisher('/a/twist', '/a/landmarks')
-        found = slam_observer.succeed('doctor', '--seconds', 3, '--json').json
+        # An announcement that is lost is repeated after 3 s.
+        found = slam_observer.succeed('doctor', '--seconds', 5, '--json').json
     topics = {topic['topic']: topic for topic in found['topics']}
     twist, landmarks = topics['/a/twist'], topics['/a/landmarks']
     assert (twist['role'], landmarks['role']) == ('twist', 'landmarks')

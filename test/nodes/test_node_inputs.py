@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 import importlib.util
 import inspect
+import math
 import sys
 import time
 from types import SimpleNamespace
@@ -114,6 +115,7 @@ def unstamped_input(node, received, is_simulated=False):
 
 
 QOS = QoSProfile(depth=1)
+QOS_DEEP = QoSProfile(depth=100)
 TWIST = serialize_message(Twist())
 NOW_NS = 1_700_000_000 * SECOND
 
@@ -522,6 +524,32 @@ def test_a_busy_node_reads_in_the_order_in_which_messages_came(ros):
         node.destroy_node()
         for publisher in (twists, landmarks):
             ros.node.destroy_publisher(publisher)
+
+
+def test_after_a_stall_all_that_waits_is_used_in_order_before_anything_is_published():
+    node, order = Mock(), []
+    node.get_clock.return_value = FakeClock()
+
+    def waiting_input(name, type_name, *received_s, max_wait_s=math.inf):
+        def take(_message, receive_ns):
+            is_due = not any(source.has_more for source in sources)
+            order.append((name, receive_ns // SECOND, is_due))
+
+        source = InputTopic(node, name, {type_name: lambda *_: name}, take, QOS_DEEP, max_wait_s)
+        queue = [(b'', {'received_timestamp': NOW_NS + at_s * SECOND}) for at_s in received_s]
+        source._take = lambda: queue.pop(0) if queue else None
+        return source
+
+    velocities = waiting_input('twist', 'geometry_msgs/msg/Twist', 0, 1, 3, 5)
+    landmarks = waiting_input('landmarks', 'geometry_msgs/msg/PoseArray', 2, 4, max_wait_s=1e10)
+    landmarks.read_first = [velocities]
+    sources = landmarks, velocities
+    for source in sources:
+        source.read_waiting()
+    assert [(name, at_s - NOW_NS // SECOND) for name, at_s, _ in order] == [
+        ('twist', 0), ('twist', 1), ('twist', 3), ('landmarks', 2), ('twist', 5), ('landmarks', 4)
+    ]  # fmt: skip
+    assert [is_due for *_, is_due in order] == [False] * 5 + [True]
 
 
 def test_publisher_of_another_quality_of_service_is_reported_or_heard(ros, tmp_path):

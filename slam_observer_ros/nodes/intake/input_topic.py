@@ -93,6 +93,8 @@ class InputTopic(Generic[MessageT]):
         What is dropped, and how much was, as they come faster than they can be used.
     advice : mapping of str to str
         Which parameter would make other message types that may be found be read.
+    has_more : bool
+        Whether messages were taken that are still to be used: all else that waits came later.
     is_shared : bool
         Whether several may publish on it, as several sensors of landmarks.
     read_first : sequence of InputTopic
@@ -116,6 +118,7 @@ class InputTopic(Generic[MessageT]):
         self._decoders = decoders
         self._on_message = on_message
         self._qos = qos
+        self.has_more = False
         self.is_shared = False
         self.advice: Mapping[str, str] = {}
         self.read_first: Sequence[InputTopic[Any]] = ()
@@ -196,6 +199,13 @@ class InputTopic(Generic[MessageT]):
         )
         self._node.get_logger().info(f"listening for {type_name} on '{self.topic}'")
 
+    def read_waiting(self) -> None:
+        """Read what waits now, each message after what the other inputs received before it."""
+        if not self._is_shedding:
+            self.read_until(time.time_ns())
+        elif (taken := self._take()) is not None:  # and all behind it, but none that comes then
+            self._receive(*taken)
+
     def read_until(self, received_ns: int) -> None:
         """Read what waits, up to what DDS has received at a time, nanoseconds."""
         for _ in range(self._qos.depth):
@@ -211,10 +221,13 @@ class InputTopic(Generic[MessageT]):
         return None if self._subscription is None else take(self._subscription)
 
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
-        for waiting in self._newest(raw, info) if self._is_shedding else self._decode(raw, info):
+        messages = self._newest(raw, info) if self._is_shedding else self._decode(raw, info)
+        for count, waiting in enumerate(messages, start=1):
+            self.has_more = True
             if waiting.received_ns:
                 for other in self.read_first:
                     other.read_until(waiting.received_ns)
+            self.has_more = count < len(messages)
             self._on_message(waiting.message, waiting.receive_ns)
 
     def _newest(self, raw: bytes, info: Mapping[str, int]) -> list[Waiting]:
