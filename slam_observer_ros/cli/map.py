@@ -9,7 +9,7 @@ from pathlib import Path
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.outputs import add_force_option, check_outputs
 from slam_observer_ros.known_map.map_file import write_map
-from slam_observer_ros.known_map.map_import import import_map
+from slam_observer_ros.known_map.map_import import import_map, TAG_AXES
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -20,8 +20,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'convert',
         help='make one of a CSV table, of TagSLAM or of a bundle of AprilTags',
         description='CSV: id, x, y and, if known, z and sigma, with or without these names in '
-        "the first line; TagSLAM: the YAML file of bodies, or its output; apriltag_ros's "
-        'tag_bundles: positions in the frame of the bundle.',
+        'the first line, and by name qx, qy, qz, qw, or the yaw in which an upright tag looks, '
+        'and orientation_sigma; TagSLAM: the YAML file of bodies, or its output; the tag_bundles '
+        'of apriltag_ros for ROS 1: poses in the frame of the bundle.',
     )
     convert.add_argument('file', type=Path, metavar='FILE', help='.csv, .txt or .yaml')
     convert.add_argument('output', type=Path, metavar='OUT.yaml', help='map file to make')
@@ -32,6 +33,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=0.02,
         metavar='M',
         help='standard deviation of coordinates that have none, metres (default 0.02)',
+    )
+    convert.add_argument(
+        '--orientation-sigma',
+        type=_deviation,
+        default=0.03,
+        metavar='RAD',
+        help="that of a tag's orientation about each axis, radians (default 0.03: put up by eye)",
+    )
+    convert.add_argument(
+        '--tag-axes',
+        choices=tuple(TAG_AXES),
+        default='right-up-out',
+        help='x, y and z of a tag as your detector reports them, seen from before the tag '
+        "(default right-up-out, as apriltag_ros's); none for positions only",
     )
     add_force_option(convert)
     convert.set_defaults(run=_run)
@@ -49,10 +64,15 @@ def _deviation(text: str) -> float:
 
 def _run(args: argparse.Namespace) -> None:
     check_outputs([args.output], args.force)
-    landmark_map = import_map(args.file, args.frame, args.sigma)
+    landmark_map = import_map(
+        args.file, args.frame, args.sigma, args.orientation_sigma, args.tag_axes
+    )
     write_map(args.output, landmark_map, None)
     low, high = landmark_map.world_points.min(axis=0), landmark_map.world_points.max(axis=0)
     spans = ', '.join(
         f'{axis} {lo:.2f} to {hi:.2f} m' for axis, lo, hi in zip('xyz', low, high, strict=True)
     )
-    print_table(str(args.output), {'landmarks': str(len(landmark_map.ids)), 'spans': spans})
+    tags = len(landmark_map.tags)
+    turned = f'{tags}, x y z of a tag: {args.tag_axes.replace("-", " ")}' if tags else 'none'
+    found = {'landmarks': str(len(landmark_map.ids)), 'spans': spans, 'orientations': turned}
+    print_table(str(args.output), found)

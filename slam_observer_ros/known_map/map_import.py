@@ -1,11 +1,16 @@
-"""Maps of other programs: tables as CSV, TagSLAM's bodies, bundles of apriltag_ros."""
+"""Maps of other programs: tables as CSV, TagSLAM's bodies, bundles of apriltag_ros.
+
+In all of them the axes of a tag are, seen from before the upright tag: x to the right, y up, z out
+of it. So TagSLAM and apriltag_ros have them, and AprilTags are upright as their makers print them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import csv
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,20 +28,45 @@ LAYOUTS = "TagSLAM's files, with 'bodies', or apriltag_ros's, with 'tag_bundles'
 COLUMNS = ('id', 'x', 'y', 'z', 'sigma')
 """Of a CSV file, in the order of one without a header; z and sigma may be left out."""
 
+QUATERNION = ('qx', 'qy', 'qz', 'qw')
+
+TAG_AXES: Mapping[str, Sequence[float]] = {
+    'right-up-out': (1.0, 1.0, 1.0),
+    'right-down-in': (1.0, -1.0, -1.0),
+    'left-down-out': (-1.0, -1.0, 1.0),
+    'none': (0.0, 0.0, 0.0),
+}
+"""The axes x, y, z that detectors give a tag, along those in the files; ``none`` for points."""
+
 UNKNOWN_M = 10.0
 """Standard deviation of a height that a table does not have."""
 
-Row = tuple[Any, FloatArray, FloatArray]
-"""Id, position (3,) in the map and its standard deviations (3,), metres; NaN is the default."""
-
-DEFAULT_SIGMAS_M = np.full(3, np.nan)
+MAX_YAW_RAD = 6.3
+"""A larger one is taken to be in degrees."""
 
 
-def import_map(path: Path, frame_id: str, sigma_m: float) -> LandmarkMap:
-    """Read a map in one of the formats; ``sigma_m`` is for landmarks that have none.
+class Row(NamedTuple):
+    """A landmark as a file has it; NaN stands for the default."""
 
-    Raise :exc:`MapError` if it can't be read, is in none of them, or has a value that can't be
-    right; the message names the file and the reason.
+    landmark_id: Any
+    position: FloatArray  # (3,) in the map, metres
+    orientation: FloatArray  # (3, 3) from the tag's own axes; zero of a point
+    sigmas_m: FloatArray = np.full(3, np.nan)  # (3,)
+    orientation_sigma_rad: float = np.nan
+
+
+def import_map(
+    path: Path,
+    frame_id: str,
+    sigma_m: float,
+    orientation_sigma_rad: float,
+    tag_axes: str = 'right-up-out',
+) -> LandmarkMap:
+    """Read a map in one of the formats; the sigmas are for landmarks that have none.
+
+    Orientations are from ``tag_axes``, one of :data:`TAG_AXES`. Raise :exc:`MapError` if it can't
+    be read, is in none of the formats, or has a value that can't be right; the message names the
+    file, the line or tag, and the reason.
     """
     try:
         rows = _csv_rows(path) if path.suffix.lower() in ('.csv', '.txt') else _yaml_rows(path)
@@ -50,11 +80,21 @@ def import_map(path: Path, frame_id: str, sigma_m: float) -> LandmarkMap:
         raise MapError(f'{path}: it is not laid out as {LAYOUTS}') from error
     if not rows:
         raise MapError(f'{path}: there are no landmarks in it')
-    return _as_map(path, rows, frame_id, sigma_m)
+    _check_ids(path, rows)
+    return _as_map(rows, frame_id, sigma_m, orientation_sigma_rad, np.array(TAG_AXES[tag_axes]))
 
 
 def _reason(error: Exception) -> str:
     return f'{shown(error.args[0])} is missing' if isinstance(error, KeyError) else str(error)
+
+
+@contextmanager
+def _naming(what: str) -> Iterator[None]:
+    """Name what it is of that can't be right."""
+    try:
+        yield
+    except (MapError, KeyError, ValueError) as error:
+        raise MapError(f'{what}: {_reason(error)}') from error
 
 
 def _csv_rows(path: Path) -> list[Row]:
@@ -67,30 +107,81 @@ def _csv_rows(path: Path) -> list[Row]:
         names = [cell.lower() for cell in lines.pop(0)[1]]
     if missing := {'id', 'x', 'y'} - set(names):
         raise MapError(f"there is no column '{min(missing)}'; it needs id, x and y, with commas")
-    return [_csv_row(number, dict(zip(names, line, strict=False))) for number, line in lines]
+    rows = []
+    for number, line in lines:
+        with _naming(f'line {number}'):
+            if any(line[len(names) :]):
+                raise MapError(f'it has more values than columns, which are {", ".join(names)}')
+            rows.append(_csv_row(dict(zip(names, line, strict=False))))
+    return rows
 
 
-def _csv_row(number: int, cells: Mapping[str, str]) -> Row:
-    x, y, z, sigma_m = (_number(number, cells, name) for name in ('x', 'y', 'z', 'sigma'))
+def _csv_row(cells: Mapping[str, str]) -> Row:
+    x, y, z = (_cell(cells, name) for name in 'xyz')
     if x is None or y is None:
-        raise MapError(f'line {number}: it needs id, x and y, with commas between them')
+        raise MapError('it needs id, x and y, with commas between them')
     try:
         landmark_id = int(cells['id'])
     except ValueError as error:
-        raise MapError(f"line {number}: the id '{cells['id']}' is no whole number") from error
-    sigma_m = np.nan if sigma_m is None else sigma_m
+        raise MapError(f"the id '{cells['id']}' is no whole number") from error
+    sigma_m, sigma_rad = (_sigma(cells, name) for name in ('sigma', 'orientation_sigma'))
     sigmas_m = np.array([sigma_m, sigma_m, UNKNOWN_M if z is None else sigma_m])
-    return landmark_id, np.array([x, y, z or 0.0]), sigmas_m
+    position = np.array([x, y, z or 0.0])
+    return Row(landmark_id, position, _orientation(cells), sigmas_m, sigma_rad)
 
 
-def _number(line: int, cells: Mapping[str, str], name: str) -> float | None:
+def _sigma(cells: Mapping[str, str], name: str) -> float:
+    """Return the standard deviation in a column; NaN if there is nothing."""
+    sigma = _cell(cells, name)
+    if sigma is not None and sigma < 0.0:
+        raise MapError(f'{name} is negative')
+    return np.nan if sigma is None else sigma
+
+
+def _orientation(cells: Mapping[str, str]) -> FloatArray:
+    """Return the orientation (3, 3) in a table, zero if there is none."""
+    yaw_rad, values = _cell(cells, 'yaw'), [_cell(cells, name) for name in QUATERNION]
+    quaternion = [value for value in values if value is not None]
+    if yaw_rad is not None and quaternion:
+        raise MapError('it has a yaw and a quaternion: leave one')
+    if yaw_rad is not None:
+        return _facing(yaw_rad)
+    if not quaternion:
+        return np.zeros((3, 3))
+    if len(quaternion) < len(QUATERNION):
+        raise MapError('a quaternion needs qx, qy, qz and qw')
+    return _turned(quaternion)
+
+
+def _facing(yaw_rad: float) -> FloatArray:
+    """Return the orientation (3, 3) of an upright tag that looks in a direction."""
+    if abs(yaw_rad) > MAX_YAW_RAD:
+        raise MapError(f'yaw is {yaw_rad:g}, more than a turn: it must be in radians')
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[-s, 0.0, c], [c, 0.0, s], [0.0, 1.0, 0.0]])
+
+
+def _turned(quaternion: Sequence[float]) -> FloatArray:
+    """Return the orientation (3, 3) of a quaternion x y z w."""
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1.0) > so3.QUATERNION_NORM_TOLERANCE:
+        raise MapError(f'the quaternion has norm {norm:.3g}, not 1')
+    return so3.from_quaternion(np.array(quaternion))
+
+
+def _cell(cells: Mapping[str, str], name: str) -> float | None:
     """Return the number in a column; None if there is nothing."""
-    text = cells.get(name)
-    if not text:
-        return None
-    if not _is_number(text) or not np.isfinite(float(text)):
-        raise MapError(f"line {line}: {name} is '{text}', which is not a finite number")
-    return float(text)
+    return _finite(cells[name], name) if cells.get(name) else None
+
+
+def _finite(written: Any, name: str) -> float:
+    try:
+        number = float(written)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise MapError(f'{name} is {shown(written)}, which is not a finite number')
+    return number
 
 
 def _is_number(text: str) -> bool:
@@ -108,52 +199,75 @@ def _yaml_rows(path: Path) -> list[Row]:
     if isinstance(content, list):  # TagSLAM's output
         return [row for body in content for row in _tagslam_rows(body)]
     if isinstance(content, Mapping) and 'tag_bundles' in content:
-        return [row for bundle in content['tag_bundles'] for row in _bundle_rows(bundle)]
+        return _bundle_rows(content['tag_bundles'])
     raise MapError(f'it is not laid out as {LAYOUTS}; tables are named .csv')
 
 
 def _tagslam_rows(named: Mapping[str, Any]) -> list[Row]:
     """Return the tags of a body that stands still; its pose, if it has one, is in the map."""
-    ((_, body),) = named.items()
+    ((name, body),) = named.items()
     if not body.get('is_static', False):
         return []
-    in_map = _tagslam_pose(body['pose']) if 'pose' in body else np.eye(4)
-    return [
-        (tag['id'], (in_map @ _tagslam_pose(tag['pose']))[:3, 3], DEFAULT_SIGMAS_M)
-        for tag in body.get('tags') or ()
-        if 'pose' in tag
-    ]
+    with _naming(f'body {shown(name)}'):
+        in_map = _tagslam_pose(body['pose']) if 'pose' in body else np.eye(4)
+        tags = [tag for tag in body.get('tags') or () if 'pose' in tag]
+        return [_tagslam_row(in_map, tag['id'], tag['pose']) for tag in tags]
+
+
+def _tagslam_row(in_map: FloatArray, tag_id: Any, written: Mapping[str, Any]) -> Row:
+    with _naming(f'tag {shown(tag_id)}'):
+        pose = in_map @ _tagslam_pose(written)
+        return Row(tag_id, pose[:3, 3], pose[:3, :3])
 
 
 def _tagslam_pose(written: Mapping[str, Any]) -> FloatArray:
     """Return a pose (4, 4) of position and rotation vector."""
     position, rotation = (
-        np.array([float(written[name][axis]) for axis in 'xyz'])
+        np.array([_finite(written[name][axis], f'{name} {axis}') for axis in 'xyz'])
         for name in ('position', 'rotation')
     )
     return se3.pose(so3.exp(rotation), position)
 
 
-def _bundle_rows(bundle: Mapping[str, Any]) -> list[Row]:
-    return [
-        (tag['id'], np.array([float(tag.get(axis, 0.0)) for axis in 'xyz']), DEFAULT_SIGMAS_M)
-        for tag in bundle['layout']
-    ]
+def _bundle_rows(bundles: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Return the tags of the one bundle in a file; what is left out of a pose is none."""
+    if len(bundles) > 1:
+        raise MapError(f'it has {len(bundles)} bundles, each in a frame of its own: leave one')
+    return [_bundle_row(tag) for bundle in bundles for tag in bundle['layout']]
 
 
-def _as_map(path: Path, rows: list[Row], frame_id: str, sigma_m: float) -> LandmarkMap:
-    """Return the map, if ids and numbers can be right."""
-    ids = [landmark_id for landmark_id, _, _ in rows]
+def _bundle_row(tag: Mapping[str, Any]) -> Row:
+    with _naming(f'tag {shown(tag["id"])}'):
+        position = np.array([_finite(tag.get(axis, 0.0), axis) for axis in 'xyz'])
+        quaternion = [_finite(tag.get(name, float(name == 'qw')), name) for name in QUATERNION]
+        return Row(tag['id'], position, _turned(quaternion))
+
+
+def _check_ids(path: Path, rows: Sequence[Row]) -> None:
+    ids = [row.landmark_id for row in rows]
     for landmark_id in ids:
         if type(landmark_id) is not int or not 0 <= landmark_id <= MAX_ID:
             raise MapError(f'{path}: the id {shown(landmark_id)} is not one from 0 to {MAX_ID}')
         if ids.count(landmark_id) > 1:
             raise MapError(f'{path}: landmark {landmark_id} is there more than once')
-    points = np.array([position for _, position, _ in rows])
-    sigmas_m = np.array([sigmas for _, _, sigmas in rows])
+
+
+def _as_map(
+    rows: Sequence[Row], frame_id: str, sigma_m: float, sigma_rad: float, axes: FloatArray
+) -> LandmarkMap:
+    """Return the map with orientations from a detector's ``axes`` (3,), signs of the files'."""
+    sigmas_m = np.array([row.sigmas_m for row in rows])
     sigmas_m[np.isnan(sigmas_m)] = sigma_m
-    if not np.isfinite(points).all() or not (sigmas_m >= 0.0).all():
-        raise MapError(f'{path}: a position is not finite, or sigma is negative')
-    covariances = sigmas_m[:, :, None] ** 2 * np.eye(3)
-    counts = np.zeros(len(ids), dtype=np.int64)
-    return LandmarkMap(np.array(ids, dtype=np.int64), points, covariances, counts, frame_id)
+    orientations = np.array([row.orientation for row in rows]) * axes
+    are_tags = orientations.any(axis=(1, 2))
+    sigmas_rad = np.array([row.orientation_sigma_rad for row in rows])
+    sigmas_rad[np.isnan(sigmas_rad)] = sigma_rad
+    return LandmarkMap(
+        np.array([row.landmark_id for row in rows], dtype=np.int64),
+        np.array([row.position for row in rows]),
+        sigmas_m[:, :, None] ** 2 * np.eye(3),
+        np.zeros(len(rows), dtype=np.int64),
+        frame_id,
+        orientations if are_tags.any() else None,
+        sigmas_rad * are_tags if are_tags.any() else None,
+    )

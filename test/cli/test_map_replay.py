@@ -372,3 +372,15 @@ def test_a_table_becomes_a_map_file(slam_observer, tmp_path):
     table.write_text('7,1\n')
     error = slam_observer.fail('map', 'convert', table, made, '--force')
     assert 'line 1: it needs id, x and y' in error
+
+
+def test_a_table_becomes_a_map_of_tags(slam_observer, tmp_path):
+    table, made = tmp_path / 'tags.csv', tmp_path / 'tags.yaml'
+    table.write_text('id,x,y,yaw\n7,1.5,-2,1.57\n8,9,1,\n')
+    convert = ('map', 'convert', table, made, '--force')
+    output = slam_observer.succeed(*convert, '--orientation-sigma', '0.1').output
+    assert '1, x y z of a tag: right up out' in output
+    assert read_map(made).orientation_sigmas.tolist() == [0.1, 0.0]
+    assert 'orientations' in slam_observer.succeed(*convert, '--tag-axes', 'none').output
+    assert read_map(made).orientations is None
+    assert 'no standard deviation' in slam_observer.fail(*convert, '--orientation-sigma', 'nan')
