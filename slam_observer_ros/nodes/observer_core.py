@@ -180,23 +180,25 @@ class ObserverCore:
         # With what is still to be used; a little later, if nothing comes of that.
         has_more = any(each.has_more for each in self._inputs)
         if not has_more and self._publisher.is_due(source):
-            self._catch_up()
+            self._catch_up(source)
             self._publisher.publish_state(source)
         if self._must_publish:
             _start(self._publish_timer)
 
-    def _catch_up(self) -> None:
+    def _catch_up(self, source: str) -> None:
         """Use what waits, so that what is published is not old."""
         self._is_catching_up = True  # their events are published with it
-        self._read_waiting()
+        self._read_waiting(just_read=source)
         self._is_catching_up = False
         self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
 
-    def _read_waiting(self) -> None:
+    def _read_waiting(self, just_read: str = '') -> None:
         """Use what waits, in the order in which it was received."""
         # Landmarks read the velocities before them: read after all of these they would be late.
+        # Landmarks that came while others were used can wait: there may be more after these.
         for source in sorted(self._inputs, key=lambda source: source.name in MOTION_INPUTS):
-            source.read_waiting()
+            if source.name in MOTION_INPUTS or source.name != just_read:
+                source.read_waiting()
 
     def _publish_waiting(self) -> None:
         self._publisher.publish_state()

@@ -69,7 +69,7 @@ def test_demo_converges_and_leaves_figures_and_a_recording(tmp_path):
     with AnyReader([folder / 'recording.mcap'], default_typestore=typestore) as recording:
         counts = {topic: info.msgcount for topic, info in recording.topics.items()}
     assert counts['/twist'] == counts['/landmarks'] == counts['/ground_truth/pose'] == 1401
-    assert counts['/observer_node/odometry'] == counts['/lyapunov'] > 100
+    assert min(counts['/observer_node/odometry'], counts['/lyapunov']) > 100
     assert {'/landmark_map', '/markers', '/path', '/diagnostics', '/landmark_estimates'} <= set(
         counts
     )
