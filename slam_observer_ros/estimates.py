@@ -20,6 +20,9 @@ UNUSED_POINTS = {
 MAX_REJECTED = 0.1
 """Share of the points beyond which they are more than a sensor's outliers."""
 
+MAX_REJECTED_ORIENTATIONS = 0.5
+"""Share of the points beyond which they are more than the flips of small or frontal tags."""
+
 IMPLAUSIBLE = 4.0
 """Stated standard deviations by which no calibration is off: something else is wrong."""
 

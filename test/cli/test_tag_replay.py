@@ -9,7 +9,7 @@ import pytest
 import ros_messages as ros
 from rosbags import rosbag2
 from rosbags.rosbag2 import StoragePlugin
-from tag_drives import past_tags, SETTINGS
+from tag_drives import past_tags, SEED, SETTINGS, true_tags
 
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.known_map.map_file import read_map
@@ -53,8 +53,8 @@ def record(path):
 
 
 @pytest.fixture
-def replay(capsys):
-    """Replay a recording; return the report."""
+def ended(capsys):
+    """Replay a recording; return how it ended."""
     # So large a noise of the velocity leaves the ids in doubt, which takes most of the time.
     settings = SETTINGS | {'max_hypotheses': 1}
     options = [f'{name}={written(value)}' for name, value in settings.items()]
@@ -62,9 +62,20 @@ def replay(capsys):
     def run(path, use_tag_orientation, *more):
         chosen = [*options, f'use_tag_orientation={use_tag_orientation}']
         arguments = [word for option in chosen for word in ('--set', option)]
-        report = CommandLine(capsys).succeed('replay', path, '--json', *arguments, *more).json
-        assert not report['dropped']
-        return report
+        return CommandLine(capsys)('replay', path, '--json', *arguments, *more)
+
+    return run
+
+
+@pytest.fixture
+def replay(ended):
+    """Replay a recording without a word of complaint; return the report."""
+
+    def run(*arguments):
+        result = ended(*arguments)
+        assert (result.code, result.errors) == (0, '')
+        assert not result.json['dropped']
+        return result.json
 
     return run
 
@@ -88,3 +99,34 @@ def test_orientations_are_smoothed_and_written_to_the_map(replay, tmp_path):
     np.testing.assert_array_equal(after.ids, before.ids)
     turns = so3.log(after.orientations @ before.orientations.swapaxes(1, 2))
     assert 0.0 < np.max(np.linalg.norm(turns, axis=1)) < 0.1
+
+
+@pytest.fixture
+def in_a_map(tmp_path, capsys, ended):
+    """Replay from a known start, in a map of the true tags that was a table; return the end."""
+    path, table, made = (tmp_path / name for name in ('tags', 'tags.csv', 'map.yaml'))
+    points, orientations = true_tags(np.random.default_rng(SEED))
+    values = np.hstack([points, so3.to_quaternion(orientations)])
+    rows = [','.join(map(str, [tag_id, *row])) for tag_id, row in enumerate(values)]
+    table.write_text('\n'.join(['id,x,y,z,qx,qy,qz,qw', *rows]))
+    record(path)
+
+    def run(tag_axes, use_tag_orientation='true'):
+        convert = ('map', 'convert', table, made, '--tag-axes', tag_axes, '--force')
+        CommandLine(capsys).succeed(*convert)
+        chosen = ('--set', 'set_initial_pose=true', '--set', 'localization_mode=uncertain')
+        return ended(path, use_tag_orientation, '--load-map', made, *chosen)
+
+    return run
+
+
+def test_orientations_of_a_table_improve_the_pose(in_a_map):
+    tags, points = in_a_map('right-up-out'), in_a_map('none', 'false')
+    assert tags.errors == ''
+    assert tags.json['heading_rmse_rad'] < 0.5 * points.json['heading_rmse_rad']
+
+
+@pytest.mark.parametrize('tag_axes', ['right-down-in', 'left-down-out'])
+def test_other_tag_axes_than_the_detectors_are_reported(in_a_map, tag_axes):
+    errors = in_a_map(tag_axes).errors
+    assert 'has the map other tag axes than the detector' in errors

@@ -322,6 +322,17 @@ def test_more_rejected_points_than_outliers_are_reported_once_there_are_enough(
     assert status.level == (DiagnosticStatus.WARN if warns else DiagnosticStatus.OK)
 
 
+@pytest.mark.parametrize(('rejected', 'warns'), [(11, True), (10, False)])
+def test_more_rejected_orientations_than_flips_are_reported(rejected, warns):
+    publishing = Publishing()
+    for _ in range(5):
+        status = publishing.publish(
+            observation=1, observed_point=20, rejected_orientation=rejected
+        )
+    text = 'the orientations of 55 % of the tags seen lately were rejected'
+    assert status.message.startswith(text if warns else 'running')
+
+
 def test_a_detector_that_finds_nothing_is_reported_and_logged_once():
     publishing = Publishing()
     assert publishing.publish(observation=199).message == 'running'

@@ -11,7 +11,12 @@ import numpy as np
 
 from slam_observer_ros.cli.replay.dropped import list_dropped, unused_messages
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.estimates import (
+    MAX_REJECTED,
+    MAX_REJECTED_ORIENTATIONS,
+    point_share,
+    UNUSED_POINTS,
+)
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.inputs.event_builder import NO_TRANSFORM
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -179,6 +184,13 @@ def _warn_of_rejections(result: Replay) -> None:
             'velocity and of the points, then at their noise%s.',
             100.0 * share,
             ', and whether the map is still true' if result.in_known_map else '',
+        )
+    share = point_share(result.estimator.counts, 'rejected_orientation')
+    if share > MAX_REJECTED_ORIENTATIONS and result.in_known_map:
+        logger.warning(
+            'The orientations of %.0f %% of the points were rejected: has the map other tag axes '
+            'than the detector (slam-observer map convert --tag-axes)?',
+            100.0 * share,
         )
 
 

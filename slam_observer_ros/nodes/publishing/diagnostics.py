@@ -10,7 +10,12 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from slam_observer_ros.estimates import MAX_REJECTED, point_share, UNUSED_POINTS
+from slam_observer_ros.estimates import (
+    MAX_REJECTED,
+    MAX_REJECTED_ORIENTATIONS,
+    point_share,
+    UNUSED_POINTS,
+)
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
@@ -139,7 +144,7 @@ class DiagnosticsPublisher:
             warnings.append(f'{dropped.total()} message{plural} dropped ({reasons})')
         warnings.append(self._empty_warning())
         warnings.append(self._points_warning(new))
-        warnings.append(self._rejections_warning(new))
+        warnings += self._rejection_warnings(new)
         warnings += estimator_warnings(self._estimator)
         warnings.append(self._estimate_publisher.problem)
         if not self._estimator.is_localised:
@@ -177,14 +182,24 @@ class DiagnosticsPublisher:
             return ''
         return 'points have no ids: give the pose on initialpose'
 
-    def _rejections_warning(self, new: Counter[str]) -> str:
-        """Report that more points were rejected of late than a sensor has outliers."""
+    def _rejection_warnings(self, new: Counter[str]) -> list[str]:
+        """Report that more points or orientations were rejected of late than are outliers."""
         self._recent_counts.append(new)
         recent = sum(self._recent_counts, Counter())
-        share = point_share(recent, 'rejected_landmark')
-        if recent['observed_point'] < MIN_POINTS or share <= MAX_REJECTED:
-            return ''
-        return f'{100.0 * share:.0f} % of the points seen lately were rejected'
+        if recent['observed_point'] < MIN_POINTS:
+            return []
+        points, orientations = (
+            point_share(recent, f'rejected_{what}') for what in ('landmark', 'orientation')
+        )
+        warnings = []
+        if points > MAX_REJECTED:
+            warnings.append(f'{100.0 * points:.0f} % of the points seen lately were rejected')
+        if orientations > MAX_REJECTED_ORIENTATIONS:
+            warnings.append(
+                f'the orientations of {100.0 * orientations:.0f} % of the tags seen lately were '
+                'rejected: has the map other tag axes than the detector?'
+            )
+        return warnings
 
     @staticmethod
     def _points_warning(new: Counter[str]) -> str:
