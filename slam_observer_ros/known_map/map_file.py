@@ -51,7 +51,7 @@ FORMAT_VERSION = 1
 
 _MAX_INT64 = 2**63 - 1
 
-_MAX_NUMBER = 1e12
+MAX_NUMBER = 1e12
 """Metres; nothing larger is meant seriously, and its square still has all digits."""
 
 _ROUNDING = 1e-6
@@ -321,7 +321,7 @@ def _numbers(value: Any, count: int, what: str) -> list[float]:
         raise MapError(f'{what} is {shown(value)}, not a list of {count} numbers')
     for entry in value:
         # Written so that NaN is refused too.
-        if type(entry) not in (int, float) or not abs(entry) <= _MAX_NUMBER:
+        if type(entry) not in (int, float) or not abs(entry) <= MAX_NUMBER:
             raise MapError(f'{what} has {shown(entry)}, no finite number')
     return [float(entry) for entry in value]
 

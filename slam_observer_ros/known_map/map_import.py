@@ -20,6 +20,7 @@ from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_file import MAX_NUMBER
 
 MAX_BYTES = 20_000_000
 
@@ -179,7 +180,7 @@ def _finite(written: Any, name: str) -> float:
         number = float(written)
     except (TypeError, ValueError, OverflowError):
         number = np.nan
-    if not np.isfinite(number):
+    if not abs(number) <= MAX_NUMBER:  # nor NaN
         raise MapError(f'{name} is {shown(written)}, which is not a finite number')
     return number
 
@@ -205,6 +206,9 @@ def _yaml_rows(path: Path) -> list[Row]:
 
 def _tagslam_rows(named: Mapping[str, Any]) -> list[Row]:
     """Return the tags of a body that stands still; its pose, if it has one, is in the map."""
+    if len(named) != 1:
+        names = ', '.join(shown(name) for name in named)
+        raise MapError(f'each body is an entry of its own in the list: {names}')
     ((name, body),) = named.items()
     if not body.get('is_static', False):
         return []

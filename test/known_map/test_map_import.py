@@ -152,6 +152,8 @@ def test_what_was_imported_can_be_saved_and_loaded(load, tmp_path):
             "tag 3: position x is 'two', which",
         ),
         (TAGSLAM.replace('id: 3', 'id: three'), 'tags.yaml', "the id 'three' is not one"),
+        ('bodies: [{a: {}, b: {}}]', 'tags.yaml', "each body is an entry .*: 'a', 'b'"),
+        ('7,1,1e300\n', 'tags.csv', "line 1: y is '1e300', which is not a finite number"),
         ('bodies: [1, 2]\n', 'tags.yaml', 'it is not laid out as TagSLAM'),
         (
             BUNDLE.replace('y: -0.5', 'y: .nan'),
