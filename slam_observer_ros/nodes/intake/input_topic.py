@@ -223,7 +223,7 @@ class InputTopic(Generic[MessageT]):
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
         messages = self._newest(raw, info) if self._is_shedding else self._decode(raw, info)
         for count, waiting in enumerate(messages, start=1):
-            self.has_more = True
+            self.has_more = len(messages) > 1
             if waiting.received_ns:
                 for other in self.read_first:
                     other.read_until(waiting.received_ns)
