@@ -180,7 +180,7 @@ class ObserverCore:
         if self._is_catching_up:
             return
         # With what is still to be used; a little later, if nothing comes of that.
-        has_more = any(each.has_more for each in self._inputs)
+        has_more = self._are_late_if_they_wait and any(each.has_more for each in self._inputs)
         if not has_more and self._publisher.is_due(source):
             self._catch_up()
             self._publisher.publish_state(source)
