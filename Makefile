@@ -63,7 +63,7 @@ benchmark-accuracy: $(READY_TO_DEVELOP)  ## compare with GTSAM's iSAM2 on real r
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/accuracy.py
 
-benchmark: $(READY_TO_DEVELOP)  ## what it costs, as ratios: rewrites docs/performance.md
+benchmark: $(READY_TO_DEVELOP)  ## what it costs, as ratios; rewrites docs/performance.md
 	$(PYTHON_IN_VENV) -m pip install --quiet $(PIP_LIMITS) --editable '.[benchmark]'
 	$(PYTHON_IN_VENV) benchmark/performance.py --write-docs
 

@@ -1,8 +1,8 @@
 """Tags with orientations against their positions alone, where few are in view.
 
 ``python benchmark/tags.py`` drives a camera by hand past 20 tags for two laps, with at most one,
-two or five of them in view, and prints errors and consistency, means over ``--runs`` seeds. All
-estimators are given the same points and velocities.
+two or five of them in view, and prints errors and consistency, means over ``--runs`` seeds with
+the standard error of each ANEES. All estimators are given the same points and velocities.
 """
 
 from __future__ import annotations
@@ -41,14 +41,15 @@ class Case:
     name: str
     sigma_rad: float = 0.0  # of each axis of an orientation; 0: positions only
     flipped_share: float = 0.0
-    relinearises: bool = True  # which only positions are
+    relinearises: bool = True
 
 
 CASES = (
     Case('positions, not relinearised', relinearises=False),
     Case('positions'),
+    Case(f'with orientations, {SIGMAS_RAD[1]:g} rad, not relinearised', SIGMAS_RAD[1], 0.0, False),
     *(Case(f'with orientations, {sigma:g} rad', sigma) for sigma in SIGMAS_RAD),
-    Case(f'the same, {FLIPPED_SHARE:.0%} flipped', SIGMAS_RAD[1], FLIPPED_SHARE),
+    Case(f'{SIGMAS_RAD[1]:g} rad, {FLIPPED_SHARE:.0%} flipped', SIGMAS_RAD[1], FLIPPED_SHARE),
 )
 
 
@@ -64,16 +65,19 @@ def main() -> None:
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
     for max_seen in args.seen:
         sys.stdout.write(f'\nAt most {max_seen} in view, {args.runs} runs\n\n')
-        print_table([np.mean(runs(case, max_seen, args.runs), axis=0) for case in CASES])
+        print_table([np.array(runs(case, max_seen, args.runs)) for case in CASES])
 
 
 def print_table(scores: Sequence[FloatArray]) -> None:
-    """Print the scores (5,) of each case; ratios are to positions that are not relinearised."""
+    """Print scores (runs, 5) of each case; ratios are to positions that are not relinearised."""
     head = ('', 'configuration', 'ratio', 'heading', 'ANEES: configuration', 'heading', 'pose')
     sys.stdout.write('| ' + ' | '.join(head) + ' |\n' + '|---' * len(head) + '|\n')
-    for case, (error_m, heading_rad, *anees) in zip(CASES, scores, strict=True):
-        cells = [f'{error_m:.3f} m', f'× {error_m / scores[0][0]:.2f}', f'{heading_rad:.3f} rad']
-        cells += [f'{value:.2f}' for value in anees]
+    first_m = np.mean(scores[0][:, 0])
+    for case, of_runs in zip(CASES, scores, strict=True):
+        error_m, heading_rad, *anees = np.mean(of_runs, axis=0)
+        errors = np.std(of_runs[:, 2:], axis=0) / np.sqrt(max(len(of_runs) - 1, 1))
+        cells = [f'{error_m:.3f} m', f'× {error_m / first_m:.2f}', f'{heading_rad:.3f} rad']
+        cells += [f'{value:.2f} ± {own:.2f}' for value, own in zip(anees, errors, strict=True)]
         sys.stdout.write(f'| {case.name} | ' + ' | '.join(cells) + ' |\n')
     sys.stdout.flush()
 

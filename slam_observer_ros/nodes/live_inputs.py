@@ -34,7 +34,10 @@ from slam_observer_ros.nodes.message_classes import message_class
 from slam_observer_ros.settings.input_settings import InputSettings
 
 DISCOVERY_S = 1.0
-"""Time after which publishers have been found."""
+"""Time after which publishers have been found, unless an announcement was lost."""
+
+LOOK_PERIOD_S = 0.25
+"""How often those are looked for whose announcement comes later: DDS repeats it after 3 s."""
 
 ROLES: dict[str, tuple[str, str]] = {
     **dict.fromkeys(VELOCITY_DECODERS, ('twist', '')),
@@ -59,6 +62,7 @@ class HeardTopic:
 
     name: str
     type_name: str
+    heard_s: float  # for how long
     problem: str = ''
     messages: int = 0
     last: bytes = b''
@@ -70,6 +74,11 @@ class HeardTopic:
         is_static = self.type_name == TRANSFORMS and self.name.endswith('/tf_static')
         return '/tf_static' if is_static else ROLES[self.type_name][0]
 
+    @property
+    def rate_hz(self) -> float:
+        """Messages a second."""
+        return self.messages / self.heard_s
+
     def take(self, raw: bytes) -> None:
         """Take in a message."""
         self.messages += 1
@@ -78,12 +87,12 @@ class HeardTopic:
             for seen in observed_tags(decode_transforms(raw), InputSettings.tag_frame_prefix):
                 self.fiducials |= set(seen.event.ids.tolist())
 
-    def text(self, seconds: float) -> str:
+    def text(self) -> str:
         """Say what comes at which rate, and how the node gets it."""
         role, setting = self.role, ROLES[self.type_name][1]
         remapping = '' if self.name == f'/{role.lstrip("/")}' else f'-r {role}:={self.name}'
         needed = ' '.join(part for part in (remapping, setting and f'-p {setting}') if part)
-        rate = f'{self.messages / seconds:.1f} Hz' if self.messages else 'no message'
+        rate = f'{self.rate_hz:.1f} Hz' if self.messages else 'no message'
         found = [self.type_name, rate, self.problem or self._content()]
         found.append(f'as {role}' + (f' with {needed}' if needed else ''))
         return ', '.join(part for part in found if part)
@@ -114,11 +123,7 @@ def main() -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        _spin(executor, DISCOVERY_S)
-        topics = list(_usable_topics(node))
-        for topic in topics:
-            _subscribe(node, topic)
-        _spin(executor, seconds)
+        topics = _listen(node, executor, seconds)
     finally:
         executor.shutdown()
         node.destroy_node()
@@ -128,27 +133,38 @@ def main() -> int:
             'topic': topic.name,
             'type': topic.type_name,
             'role': topic.role,
-            'rate_hz': topic.messages / seconds,
-            'text': topic.text(seconds),
+            'rate_hz': topic.rate_hz,
+            'text': topic.text(),
         }
-        for topic in topics
+        for topic in sorted(topics, key=lambda topic: topic.name)
     ]
     sys.stdout.write(json.dumps(heard) + '\n')
     return 0
 
 
-def _spin(executor: SingleThreadedExecutor, seconds: float) -> None:
-    end_s = time.monotonic() + seconds
-    while (left_s := end_s - time.monotonic()) > 0.0:
-        executor.spin_once(timeout_sec=left_s)
+def _listen(node: Node, executor: SingleThreadedExecutor, seconds: float) -> list[HeardTopic]:
+    """Return what is heard within some seconds once discovery had its time, or later."""
+    topics: dict[tuple[str, str], HeardTopic] = {}
+    look_s = time.monotonic() + DISCOVERY_S
+    end_s = look_s + seconds
+    while (now_s := time.monotonic()) < end_s:
+        if now_s >= look_s:
+            look_s = now_s + LOOK_PERIOD_S
+            for name, type_name in _usable_topics(node):
+                if (name, type_name) not in topics:
+                    topic = HeardTopic(name, type_name, end_s - now_s)
+                    topics[name, type_name] = topic
+                    _subscribe(node, topic)
+        executor.spin_once(timeout_sec=min(look_s, end_s) - now_s)
+    return list(topics.values())
 
 
-def _usable_topics(node: Node) -> Iterator[HeardTopic]:
-    """Yield the topics that somebody publishes with a type that the node reads."""
-    for name, types in sorted(node.get_topic_names_and_types()):
+def _usable_topics(node: Node) -> Iterator[tuple[str, str]]:
+    """Yield the topics, and their types, that somebody publishes and the node reads."""
+    for name, types in node.get_topic_names_and_types():
         for type_name in types:
             if type_name in ROLES and node.count_publishers(name):
-                yield HeardTopic(name, type_name)
+                yield name, type_name
 
 
 def _subscribe(node: Node, topic: HeardTopic) -> None:

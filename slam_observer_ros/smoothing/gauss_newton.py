@@ -80,6 +80,12 @@ class Smoother:
             start = step.end
         return step
 
+    def ungated(self, start: Solution) -> Solution:
+        """Return ``start``, if something is gated there after an iteration without the gate."""
+        if not self._observations.some_are_gated(start):
+            return start
+        return self._moved(start, *Factors(self._linearise(start, gated=False)).solve())
+
     def _moved(
         self, solution: Solution, change: FloatArray, border_change: FloatArray
     ) -> Solution:
@@ -98,12 +104,12 @@ class Smoother:
             orientations,
         )
 
-    def _linearise(self, solution: Solution) -> Equations:
+    def _linearise(self, solution: Solution, gated: bool = True) -> Equations:
         c, k, keyframes = self._shared, self._unknowns, self._keyframes
         S, b = len(solution.poses), c + k * len(solution.points)
         d = self._axes.p + self._chained
         # What the observations say of poses, landmarks, and of both together.
-        H, gradient = self._observations.normal_equations(solution, self._chained)
+        H, gradient = self._observations.normal_equations(solution, self._chained, gated)
         poses, landmarks, n = keyframes.keyframes + 1, keyframes.landmarks, len(solution.points)
         columns = landmark_columns(np.arange(n), c, k)
         corner, border_gradient = np.zeros((b, b)), np.zeros(b)

@@ -23,22 +23,21 @@ class Observations:
     def __init__(self, axes: EstimatedAxes, keyframes: Keyframes, settings: Settings) -> None:
         self._axes, self._keyframes, self._settings = axes, keyframes, settings
 
-    def normal_equations(self, solution: Solution, chained: int) -> tuple[FloatArray, FloatArray]:
+    def normal_equations(
+        self, solution: Solution, chained: int, gated: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the equations (M, q, q) and their gradients (M, q), with Huber's weights.
 
         q unknowns are those of the chain's pose, the last ``chained`` of which no observation
-        depends on, and of the landmark: its position, then its turn if that is estimated.
+        depends on, and of the landmark: its position, then its turn if that is estimated. If
+        ``gated``, what a filter would reject at the solution has less weight.
         """
         keyframes, k = self._keyframes, self._axes.point
-        poses = solution.poses[keyframes.keyframes + 1]
-        R = poses[:, :3, :3]
-        arms = solution.points[keyframes.landmarks] - poses[:, :3, 3]
-        predicted = (transpose(R) @ arms[:, :, None])[:, :, 0]
-        error = (predicted - keyframes.points)[:, :k]
+        R, predicted, error = self._of_points(solution)
         J_point = transpose(R)[:, :k, :k]
         C, unseen = self._axes.output_matrix(predicted), np.zeros((len(error), k, chained))
         squared = _squared_distances(error, keyframes.information)
-        counted = keyframes.shares * self._weights(squared)
+        counted = keyframes.shares * self._weights(squared, gated)
         information = keyframes.information * counted[:, None, None]
         if keyframes.turns is None:
             return normal(np.concatenate([-C, unseen, J_point], axis=2), information, error)
@@ -46,9 +45,25 @@ class Observations:
         J = np.concatenate([-C, unseen, J_point, unturned], axis=2)
         H, gradient = normal(J, information, error)
         # An orientation counts for as little as the point it was seen with.
-        counted = keyframes.shares * self._falloff(squared)
-        H_turn, gradient_turn = self._of_turns(keyframes.turns, R, solution, chained, counted)
+        counted = keyframes.shares * self._falloff(squared, gated)
+        seen = self._of_turns(keyframes.turns, R, solution, chained, counted, gated)
+        H_turn, gradient_turn = seen
         return H + H_turn, gradient + gradient_turn
+
+    def some_are_gated(self, solution: Solution) -> bool:
+        """Return whether a filter would reject some of the points."""
+        _, _, error = self._of_points(solution)
+        squared = _squared_distances(error, self._keyframes.information)
+        return bool(np.max(squared, initial=0.0) > self._settings.rejection_threshold**2)
+
+    def _of_points(self, solution: Solution) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return rotations (M, 3, 3) of the poses, points as seen there (M, 3), errors (M, k)."""
+        keyframes = self._keyframes
+        poses = solution.poses[keyframes.keyframes + 1]
+        R = poses[:, :3, :3]
+        arms = solution.points[keyframes.landmarks] - poses[:, :3, 3]
+        predicted = (transpose(R) @ arms[:, :, None])[:, :, 0]
+        return R, predicted, (predicted - keyframes.points)[:, : self._axes.point]
 
     def _of_turns(
         self,
@@ -57,6 +72,7 @@ class Observations:
         solution: Solution,
         chained: int,
         counted: FloatArray,
+        gated: bool,
     ) -> tuple[FloatArray, FloatArray]:
         """Return what orientations say, seen from poses turned by ``R`` (M, 3, 3).
 
@@ -82,17 +98,19 @@ class Observations:
         distances = np.sqrt(_squared_distances(apart, turns.information))
         are_flipped, are_unclear = flip_verdicts(evidence, distances)
         used = B.any(axis=(1, 2)) & ~(are_flipped | are_unclear)
-        counted = counted * used * self._weights(squared)
+        counted = counted * used * self._weights(squared, gated)
         return normal(J, turns.information * counted[:, None, None], error)
 
-    def _falloff(self, squared: FloatArray) -> FloatArray:
-        """Return weights (M,) that are below 1 where a filter would reject."""
+    def _falloff(self, squared: FloatArray, gated: bool) -> FloatArray:
+        """Return weights (M,) that are below 1 where a filter would reject, if ``gated``."""
+        if not gated:
+            return np.ones(len(squared))
         rejection = self._settings.rejection_threshold
         return np.minimum(1.0, rejection**2 / np.maximum(squared, rejection**2))
 
-    def _weights(self, squared: FloatArray) -> FloatArray:
+    def _weights(self, squared: FloatArray, gated: bool) -> FloatArray:
         """Return Huber's weights (M,), which fall off faster where a filter would reject."""
-        huber, weights = self._settings.huber_threshold, self._falloff(squared)
+        huber, weights = self._settings.huber_threshold, self._falloff(squared, gated)
         if huber > 0.0:
             weights = weights * huber / np.sqrt(np.maximum(squared, huber**2))
         return weights

@@ -174,7 +174,7 @@ class Relinearisation:
         history = self.history
         try:
             smoother = Smoother(self._axes, history.prior, history.keyframes(), self._settings)
-            start = self._solution_from(0)
+            start = self._start_for(smoother, 0)
             return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE).end
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
@@ -253,7 +253,7 @@ class Relinearisation:
             smoother = Smoother(
                 self._axes, history.summary, history.latest_keyframes(), self._settings
             )
-            step = smoother.smooth(self._solution_from(first), ITERATIONS, TOLERANCE)
+            step = smoother.smooth(self._start_for(smoother, first), ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             self._warning.give()
@@ -283,6 +283,15 @@ class Relinearisation:
         tags = self._filter.orientations
         if tags is not None and end.orientations is not None:
             tags.B = end.orientations
+
+    def _start_for(self, smoother: Smoother, first: int) -> Solution:
+        """Return where iterations begin, with the poses from before keyframe ``first`` on."""
+        start = self._solution_from(first)
+        if start.orientations is None:
+            return start
+        # The poses are those of their time, the map is that of now: after a loop was closed much
+        # of what was seen from them is far off, and would be taken for outliers.
+        return smoother.ungated(start)
 
     def _solution_from(self, first: int) -> Solution:
         """Return the present estimates, of poses those from before keyframe ``first`` on."""

@@ -46,13 +46,13 @@ def test_fiducials_on_tf_are_told_from_the_rest_of_it():
             MESSAGES.transform_stamped(1, parent, child, np.eye(4)) for parent, child in places
         ]
     )
-    tf = HeardTopic('/tf', TRANSFORMS)
+    tf = HeardTopic('/tf', TRANSFORMS, heard_s=3.0)
     for _ in range(6):
         tf.take(serialize_message(message))
-    assert tf.text(seconds=3.0) == (
+    assert tf.text() == (
         f'{TRANSFORMS}, 2.0 Hz, 2 fiducials, as landmarks with -p landmarks_type:=tf, as /tf'
     )
-    assert HeardTopic('/tf_static', TRANSFORMS).text(seconds=3.0).endswith('as /tf_static')
+    assert HeardTopic('/tf_static', TRANSFORMS, 3.0).text().endswith('as /tf_static')
 
 
 def test_it_says_that_nothing_is_heard(slam_observer):

@@ -72,12 +72,34 @@ def test_two_robots_have_statuses_of_different_names():
     assert Watched().status.name == 'robot1/observer_node: localisation'
 
 
+def test_a_robot_near_the_limit_is_not_lost_and_found_all_the_time():
+    watched = Watched()
+    outcomes = []
+    for sigma_m in (0.29, 0.31, 0.29, 0.31, 0.25, 0.23, 0.29):
+        watched.estimator.pose_covariance = np.diag([0, 0, 0, sigma_m, 0, 0]) ** 2
+        outcomes.append(watched.published[-1])
+    assert outcomes == [True, False, False, False, False, True, True]
+
+
 def test_it_is_published_when_it_changes():
     watched = Watched(is_localised=False)
     assert watched.published == [False]
     assert watched.published == [False]
     watched.estimator.is_localised = True
     assert watched.published == [False, True]
+
+
+def test_that_the_robot_is_lost_and_found_again_is_logged():
+    watched = Watched()
+    log = watched.node.get_logger()
+    assert watched.published == [True]
+    log.info.assert_not_called()
+    watched.estimator.pose_covariance = np.diag((0, 0, 0, 0.4, 0, 0)) ** 2
+    assert watched.published == [True, False]
+    log.warning.assert_called_once_with('not localised any more: position uncertain: σ = 0.40 m')
+    watched.estimator.pose_covariance = np.zeros((6, 6))
+    assert watched.published == [True, False, True]
+    log.info.assert_called_once_with('localised again')
 
 
 def innovations(times_as_large, count=200):

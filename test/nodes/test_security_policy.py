@@ -14,8 +14,11 @@ pytestmark = pytest.mark.ros
 POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
 NODE = 'observer_node'
 
-NOT_ALWAYS_USED = {('subscribe', f'/{name}') for name in ('imu', 'clock', 'parameter_events')}
-"""Those of ``use_imu`` and ``use_sim_time``, and one that rclpy has only in some releases."""
+NOT_ALWAYS_USED = {
+    *(('subscribe', f'/{name}') for name in ('imu', 'clock', 'parameter_events')),
+    *(('reply', f'/{NODE}/{name}') for name in ('load_map_from', 'save_map_to')),
+}
+"""Those of ``use_imu``, ``use_sim_time`` and nav2_msgs, and one of some releases of rclpy."""
 
 
 def allowed():

@@ -9,6 +9,7 @@ from hypothesis import given
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from smoothing_problems import Problem
 from strategies import generators
 
 from slam_observer_ros.estimator.estimator import Estimator
@@ -16,6 +17,7 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import PLANAR, SPATIAL
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.smoothing.gauss_newton import Smoother
 from slam_observer_ros.smoothing.keyframes import no_keyframes, SeenTurns, Solution
 from slam_observer_ros.smoothing.observations import Observations
 from slam_observer_ros.state.tag_orientations import flipped
@@ -301,3 +303,21 @@ def test_a_tag_that_is_seen_turned_only_later_has_its_orientation_then():
     turns = so3.log(known.orientations[are_tags] @ tags[known.ids[are_tags]].swapaxes(1, 2))
     assert np.all(np.linalg.norm(turns, axis=1) < 5.0 * known.orientation_sigmas[are_tags])
     assert np.max(known.orientation_sigmas) < 0.5
+
+
+@pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
+def test_what_is_off_since_the_map_has_moved_is_not_taken_for_outliers(axes):
+    """As after a loop was closed: the poses are those before, the map is that since."""
+    problem = Problem(axes, 0, seed=3, tags=True)
+    gated = replace(problem.settings, huber_threshold=1.345, rejection_threshold=6.0)
+    smoother = Smoother(axes, problem.prior, problem.keyframes, gated)
+    solution = smoother.smooth(problem.start, 100, 1e-9).end
+    moved = axes.full_points(np.full(axes.point, 5.0))
+    start = replace(problem.start, poses=problem.start.poses.copy())
+    start.poses[2:, :3, 3] += moved
+
+    def miss_m(begin):
+        return np.max(np.abs(smoother.smooth(begin, 2, 0.0).end.poses - solution.poses))
+
+    assert miss_m(smoother.ungated(start)) < 0.5 * miss_m(start)
+    np.testing.assert_array_equal(smoother.ungated(solution).poses, solution.poses)

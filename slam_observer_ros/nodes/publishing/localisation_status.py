@@ -13,10 +13,12 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import Update
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 RECENT = 300  # observations over which innovations are compared with the noise that is stated
 MIN_DEGREES = 100  # of freedom, that it takes to say so; the factor is then known to 7 %
+FOUND_AGAIN = 0.8  # of the error level: near it the robot would be lost and found all the time
 TOO_SMALL = 2.0  # times as large as stated: neither chance nor a sensor's usual correlation
 
 
@@ -73,16 +75,25 @@ class LocalisationStatus:
         self._settings = settings
         self._estimator = estimator
         self._noise = noise
+        self._log = ThrottledLog(node)
         self._is_localised: bool | None = None
+        self._was_localised = False
         self._publisher = node.create_publisher(Bool, '~/is_localised', LATCHED_QOS)
 
     def publish(self) -> None:
-        """Publish whether the robot is localised, if that has changed."""
-        level, _ = self._judge(self._deviations())
+        """Publish, and log, whether the robot is localised, if that has changed."""
+        share = FOUND_AGAIN if self._is_localised is False else 1.0
+        level, message = self._judge(self._deviations(), share)
         is_localised = level != DiagnosticStatus.ERROR and self._estimator.stamp_ns is not None
-        if is_localised != self._is_localised:
-            self._is_localised = is_localised
-            self._publisher.publish(Bool(data=is_localised))
+        if is_localised == self._is_localised:
+            return
+        if self._is_localised:
+            self._log.warning('lost', f'not localised any more: {message}')
+        elif self._was_localised:
+            self._log.info('found', 'localised again')
+        self._is_localised = is_localised
+        self._was_localised |= is_localised
+        self._publisher.publish(Bool(data=is_localised))
 
     def status(self, hardware_id: str) -> DiagnosticStatus:
         """Return the status for /diagnostics."""
@@ -112,8 +123,10 @@ class LocalisationStatus:
         covariance = self._estimator.pose_covariance
         return None if covariance is None else deviations(covariance)
 
-    def _judge(self, deviations: tuple[float, float] | None) -> tuple[bytes, str]:
-        """Return level and message."""
+    def _judge(
+        self, deviations: tuple[float, float] | None, share: float = 1.0
+    ) -> tuple[bytes, str]:
+        """Return level and message; the robot is lost from a share of the error level on."""
         settings, estimator = self._settings, self._estimator
         if estimator.stamp_ns is None:
             return DiagnosticStatus.WARN, 'no estimate yet'
@@ -123,14 +136,14 @@ class LocalisationStatus:
             return DiagnosticStatus.OK, 'localised; the gains know no standard deviation'
         position_m, heading_rad = deviations
         worst, reasons = DiagnosticStatus.OK, []
-        for name, value, unit, warn, error in (
+        for name, value, unit, warn, lost in (
             ('position', position_m, 'm', settings.position_warn, settings.position_error),
             ('heading', heading_rad, 'rad', settings.heading_warn, settings.heading_error),
         ):
+            error = share * lost
             if value > min(warn, error):
-                worst = max(
-                    worst, DiagnosticStatus.ERROR if value > error else DiagnosticStatus.WARN
-                )
+                level = DiagnosticStatus.ERROR if value > error else DiagnosticStatus.WARN
+                worst = max(worst, level)
                 reasons.append(f'{name} uncertain: σ = {value:.2f} {unit}')
         return worst, '; '.join(reasons) or 'localised'
 
