@@ -75,6 +75,8 @@ class ObserverCore:
         self._feed.on_waiting = self._begin_to_retry
         self._inputs = open_inputs(node, settings, self._feed)
         self._is_catching_up = False
+        window_s = estimator_settings.reorder_window
+        self._are_late_if_they_wait = settings.landmarks_max_wait > window_s
         _refuse_own_outputs(node, self._inputs)
         self._localisation = LocalisationStatus(node, settings, self._estimator, noise)
         namespace = node.get_namespace()
@@ -178,26 +180,25 @@ class ObserverCore:
         if self._is_catching_up:
             return
         # With what is still to be used; a little later, if nothing comes of that.
-        has_more = any(each.has_more for each in self._inputs)
+        has_more = self._are_late_if_they_wait and any(each.has_more for each in self._inputs)
         if not has_more and self._publisher.is_due(source):
-            self._catch_up(source)
+            self._catch_up()
             self._publisher.publish_state(source)
         if self._must_publish:
             _start(self._publish_timer)
 
-    def _catch_up(self, source: str) -> None:
+    def _catch_up(self) -> None:
         """Use what waits, so that what is published is not old."""
         self._is_catching_up = True  # their events are published with it
-        self._read_waiting(just_read=source)
+        self._read_waiting(but_landmarks=not self._are_late_if_they_wait)
         self._is_catching_up = False
         self._transforms.read_waiting()  # the odometry, to which the pose is put in relation
 
-    def _read_waiting(self, just_read: str = '') -> None:
+    def _read_waiting(self, but_landmarks: bool = False) -> None:
         """Use what waits, in the order in which it was received."""
-        # Landmarks read the velocities before them: read after all of these they would be late.
-        # Landmarks that came while others were used can wait: there may be more after these.
+        # Landmarks first, which read the velocities before them: after all of these they are late.
         for source in sorted(self._inputs, key=lambda source: source.name in MOTION_INPUTS):
-            if source.name in MOTION_INPUTS or source.name != just_read:
+            if source.name in MOTION_INPUTS or not but_landmarks:
                 source.read_waiting()
 
     def _publish_waiting(self) -> None:

@@ -15,6 +15,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.common.units import to_s
+from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.nodes.intake.backlog import Backlog
 from slam_observer_ros.nodes.intake.load_shedding import LoadShedding, Waiting
@@ -202,7 +203,7 @@ class InputTopic(Generic[MessageT]):
     def read_waiting(self) -> None:
         """Read what waits now, each message after what the other inputs received before it."""
         if not self._is_shedding:
-            self.read_until(time.time_ns())
+            self.read_until(MAX_STAMP_NS)
         elif (taken := self._take()) is not None:  # and all behind it, but none that comes then
             self._receive(*taken)
 
@@ -223,7 +224,7 @@ class InputTopic(Generic[MessageT]):
     def _receive(self, raw: bytes, info: Mapping[str, int]) -> None:
         messages = self._newest(raw, info) if self._is_shedding else self._decode(raw, info)
         for count, waiting in enumerate(messages, start=1):
-            self.has_more = True
+            self.has_more = len(messages) > 1
             if waiting.received_ns:
                 for other in self.read_first:
                     other.read_until(waiting.received_ns)
