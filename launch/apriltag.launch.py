@@ -57,7 +57,14 @@ def start(context):
         executable='apriltag_node',
         name='apriltag',
         namespace=given['namespace'],
-        parameters=[{'family': given['tag_family'], 'size': float(given['tag_size'])}],
+        parameters=[
+            {
+                'family': given['tag_family'],
+                'size': float(given['tag_size']),
+                # By homography the axes of the tag's frame are others.
+                'pose_estimation_method': 'pnp',
+            }
+        ],
         remappings=[
             ('image_rect', given['image']),
             *calibration(given),

@@ -190,6 +190,7 @@ def test_a_camera_is_mounted_where_its_pose_is_given(nodes):
     started = nodes('apriltag.launch.py', tag_size='0.2')
     assert set(started) == {'apriltag_node'}
     assert parameters(started['apriltag_node'])['size'] == 0.2
+    assert parameters(started['apriltag_node'])['pose_estimation_method'] == 'pnp'
     started = nodes(
         'apriltag.launch.py', tag_size='0.2', camera_frame='eye', camera_pose='0.2 0 0.4 0 0.1 0'
     )
