@@ -34,10 +34,10 @@ MAX_CORRELATED = 1000
 
 FIELDS = ('checksum', 'data')
 
-_ROUNDING = 1e-6
+ROUNDING = 1e-6
 """By how much correlations may be off, or have a negative eigenvalue."""
 
-_LEAST_DEVIATION = 1e-4
+LEAST_DEVIATION = 1e-4
 """Metres or rad; entries of smaller standard deviations are compared with this one."""
 
 _COUNTED = ('id', 'position', 'sigma', 'covariance', 'orientation', 'orientation_sigma')
@@ -104,17 +104,17 @@ def check_joint(joint: FloatArray, covariances: FloatArray) -> None:
     Raise :exc:`MapError` if there are others on its diagonal, or it is none.
     """
     # Whatever their scales, in units of their own deviations; of the tiny ones, rounding is left.
-    deviations = np.sqrt(np.maximum(np.diagonal(joint), _LEAST_DEVIATION**2))
+    deviations = np.sqrt(np.maximum(np.diagonal(joint), LEAST_DEVIATION**2))
     scaled = joint / deviations
     scaled /= deviations[:, None]
     n = len(covariances)
     units = deviations.reshape(-1, 3)[:n]
     own = covariances / (units[:, :, None] * units[:, None, :])
-    if np.abs(diagonal_blocks(scaled, 3)[:n] - own).max() > _ROUNDING:
+    if np.abs(diagonal_blocks(scaled, 3)[:n] - own).max() > ROUNDING:
         raise MapError('a landmark has another covariance there')
-    if np.abs(scaled - scaled.T).max() > _ROUNDING:
+    if np.abs(scaled - scaled.T).max() > ROUNDING:
         raise MapError('they are not symmetric')
-    scaled[np.diag_indices(len(scaled))] += _ROUNDING
+    scaled[np.diag_indices(len(scaled))] += ROUNDING
     try:
         np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError as error:

@@ -54,14 +54,8 @@ _MAX_INT64 = 2**63 - 1
 MAX_NUMBER = 1e12
 """Metres; nothing larger is meant seriously, and its square still has all digits."""
 
-_ROUNDING = 1e-6
-"""By how much a correlation of a covariance may miss being one."""
-
 _ROUNDED_NORM = 1e-2
 """By how much the norm of a quaternion that somebody wrote down may miss being one."""
-
-_LEAST_DEVIATION = 1e-4
-"""Metres; entries of smaller standard deviations are compared with this one."""
 
 _OPTIONAL = ('sigma', 'covariance', 'observations', 'orientation', 'orientation_sigma')
 
@@ -273,10 +267,11 @@ def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:
     covariances = np.array([_covariance(row) for row in rows])
     # Whatever their scales, in units of their own deviations; of the tiny ones, rounding is left.
     variances = np.diagonal(covariances, axis1=1, axis2=2)
-    deviations = np.sqrt(np.maximum(variances, _LEAST_DEVIATION**2))
+    deviations = np.sqrt(np.maximum(variances, map_correlations.LEAST_DEVIATION**2))
     scaled = covariances / (deviations[:, :, None] * deviations[:, None, :])
     skew = np.abs(scaled - transpose(scaled)).max(axis=(1, 2))
-    is_wrong = (skew > _ROUNDING) | (np.linalg.eigvalsh(scaled)[:, 0] < -_ROUNDING)
+    rounding = map_correlations.ROUNDING
+    is_wrong = (skew > rounding) | (np.linalg.eigvalsh(scaled)[:, 0] < -rounding)
     if is_wrong.any():
         who = f'landmark {rows[int(is_wrong.argmax())]["id"]}'
         what = 'is not symmetric, or negative in some direction'
