@@ -130,6 +130,26 @@ class AngularVelocityEvent:
 
 
 @dataclass(frozen=True, slots=True)
+class Sensed:
+    """What sensors showed of m points, before it was corrected by how they err; body frame."""
+
+    sensors: IntArray  # (m,) numbers of the sensors
+    origins: FloatArray  # (m, 3) where /tf has the sensor, metres
+    arms: FloatArray  # (m, 3) from there to the point, metres
+    orientations: FloatArray | None = None  # (m, 3, 3) as those of an observation
+
+    def select(self, mask: BoolArray) -> Sensed:
+        """Return the points that ``mask`` (m,) picks."""
+        Z = self.orientations
+        return Sensed(
+            self.sensors[mask],
+            self.origins[mask],
+            self.arms[mask],
+            None if Z is None else Z[mask],
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class ObservationEvent:
     """Landmarks seen at one instant."""
 
@@ -144,6 +164,9 @@ class ObservationEvent:
     # (m, 3, 3) of each landmark's own axes; all zero where unknown, as of a point
     orientations: FloatArray | None = None
     orientation_covariances: FloatArray | None = None  # (m, 3, 3) of rotation vectors, rad²
+    sensor_frame: str = ''  # of the sensor that saw them; each has a calibration of its own
+    sensor_axis: FloatArray | None = None  # (3,) along which it looks, x by default
+    sensed: Sensed | None = None  # as the sensor showed them, where they have been corrected
 
     def moved(self, pose: FloatArray) -> ObservationEvent:
         """Return it in the frame in which its own has ``pose`` (4, 4)."""
@@ -155,6 +178,7 @@ class ObservationEvent:
             covariances=None if self.covariances is None else _turned(self.covariances, R),
             velocities=None if self.velocities is None else se3.rotate(pose, self.velocities),
             sensor=se3.transform(pose, sensor),
+            sensor_axis=None if self.sensor_axis is None else R @ self.sensor_axis,
             orientations=None if self.orientations is None else R @ self.orientations,
             orientation_covariances=None
             if self.orientation_covariances is None
@@ -184,6 +208,7 @@ class ObservationEvent:
             covariances=None if self.covariances is None else self.covariances[mask],
             velocities=None if self.velocities is None else self.velocities[mask],
             sensor=None if self.sensor is None else self.sensor[mask],
+            sensed=None if self.sensed is None else self.sensed.select(mask),
             orientations=None if self.orientations is None else self.orientations[mask],
             orientation_covariances=None
             if self.orientation_covariances is None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.events import Sensed
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,7 @@ class Keyframes:
     # (M,) how much of it counts: less than 1 where its error is partly that of a point before
     shares: FloatArray
     turns: SeenTurns | None = None  # where orientations of landmarks are estimated
+    sensed: Sensed | None = None  # (M,) as the sensors showed them, where these are calibrated
 
     def only(self, kept: BoolArray) -> Keyframes:
         """Return the keyframes with only some of the points (M,)."""
@@ -53,6 +55,20 @@ class Keyframes:
             information=self.information[kept],
             shares=self.shares[kept],
             turns=None if self.turns is None else self.turns.only(kept),
+            sensed=None if self.sensed is None else self.sensed.select(kept),
+        )
+
+    def with_calibration(self, values: FloatArray) -> Keyframes:
+        """Return the same with more of a calibration (c,), which was of no effect before."""
+        S, d, c = self.sensitivities.shape
+        more = len(values)
+        drifts = np.zeros((S, c + more, c + more))
+        drifts[:, :c, :c] = self.drift_covariances
+        return replace(
+            self,
+            sensitivities=np.concatenate([self.sensitivities, np.zeros((S, d, more))], axis=2),
+            calibrations=np.hstack([self.calibrations, np.tile(values, (S, 1))]),
+            drift_covariances=drifts,
         )
 
 
@@ -61,7 +77,7 @@ class Solution:
     """Smoothed estimates."""
 
     poses: FloatArray  # (S + 1, 4, 4) of the prior, then of each keyframe
-    calibrations: FloatArray  # (S + 1, c) of the velocity; all the same unless it drifts
+    calibrations: FloatArray  # (S + 1, c); all the same unless it drifts
     points: FloatArray  # (n, 3) landmarks, metres
     # (n, 3, 3) how they are turned, zero where that is not known; None if it is not estimated
     orientations: FloatArray | None = None
@@ -69,10 +85,17 @@ class Solution:
 
 def joined(parts: list[Keyframes]) -> Keyframes:
     """Return the keyframes of one or more parts, one after the other."""
-    names = [field.name for field in fields(Keyframes) if field.name != 'turns']
+    optional = ('turns', 'sensed')
+    names = [field.name for field in fields(Keyframes) if field.name not in optional]
     together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     turns = [part.turns for part in parts if part.turns is not None]
-    return replace(parts[0], **together, turns=joined_turns(turns) if turns else None)
+    sensed = [part.sensed for part in parts if part.sensed is not None]
+    return replace(
+        parts[0],
+        **together,
+        turns=joined_turns(turns) if turns else None,
+        sensed=joined_sensed(sensed) if sensed else None,
+    )
 
 
 def no_keyframes(d: int, c: int, k: int, q: int = 0) -> Keyframes:
@@ -101,3 +124,12 @@ def joined_turns(parts: list[SeenTurns]) -> SeenTurns:
         np.concatenate([part.flipped for part in parts]),
         np.concatenate([part.information for part in parts]),
     )
+
+
+def joined_sensed(parts: list[Sensed]) -> Sensed:
+    """Return what sensors showed in several parts, one after the other."""
+    return Sensed(
+        np.concatenate([part.sensors for part in parts]),
+        np.concatenate([part.origins for part in parts]),
+        np.concatenate([part.arms for part in parts]),
+    )  # how tags are turned is in SeenTurns

@@ -87,6 +87,19 @@ class Prior:
             ),
         )
 
+    def with_calibration(
+        self, axes: EstimatedAxes, values: FloatArray, variances: FloatArray
+    ) -> Prior:
+        """Return the prior with more of a calibration (c,), independent of all else."""
+        first, more = self._first_point(axes), len(values)
+        at = np.append(np.arange(first), np.arange(first, len(self.covariance)) + more)
+        covariance = np.zeros((len(self.covariance) + more,) * 2)
+        covariance[np.ix_(at, at)] = self.covariance
+        new = np.arange(first, first + more)
+        covariance[new, new] = variances
+        calibration = np.append(self.calibration, values)
+        return replace(self, calibration=calibration, covariance=covariance)
+
     def with_unknown(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior with landmarks at ``rows`` that may be anywhere."""
         _, columns = self._known(axes, rows)

@@ -36,7 +36,7 @@ from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
-from slam_observer_ros.smoothing.keyframes import Solution
+from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 from slam_observer_ros.smoothing.prior import Prior
 
 logger = logging.getLogger(__name__)
@@ -152,6 +152,13 @@ class Relinearisation:
         elif self._window_is_full or self._is_due:
             self._sum_up(self._relinearise())
 
+    def add_calibration(self) -> None:
+        """Note what is estimated of the calibration from now on, beside what was so far."""
+        known = len(self.history.calibrations[-1])
+        values, variances = self._calibration.values, self._calibration.initial_variances
+        if len(values) > known:
+            self.history.add_calibration(values[known:], variances[known:])
+
     def relocate(self, rows: IntArray) -> None:
         """Forget all about landmarks (m,) but their latest observation."""
         self.history.relocate(rows)
@@ -173,7 +180,7 @@ class Relinearisation:
         self._check_smoothable()
         history = self.history
         try:
-            smoother = Smoother(self._axes, history.prior, history.keyframes(), self._settings)
+            smoother = self._smoother(history.prior, history.keyframes())
             start = self._start_for(smoother, 0)
             return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE).end
         except np.linalg.LinAlgError as error:
@@ -250,9 +257,7 @@ class Relinearisation:
         # Smooth them, after the summary of those before, …
         history, first = self.history, self.history.summarised
         try:
-            smoother = Smoother(
-                self._axes, history.summary, history.latest_keyframes(), self._settings
-            )
+            smoother = self._smoother(history.summary, history.latest_keyframes())
             step = smoother.smooth(self._start_for(smoother, first), ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
@@ -283,6 +288,9 @@ class Relinearisation:
         tags = self._filter.orientations
         if tags is not None and end.orientations is not None:
             tags.B = end.orientations
+
+    def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
+        return Smoother(self._axes, prior, keyframes, self._settings, self._calibration)
 
     def _start_for(self, smoother: Smoother, first: int) -> Solution:
         """Return where iterations begin, with the poses from before keyframe ``first`` on."""

@@ -13,6 +13,7 @@ from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
+from slam_observer_ros.state.sensing import corrected, sensitivity
 from slam_observer_ros.state.state import State
 
 SAME_POSITION = 4.0
@@ -33,6 +34,7 @@ class MatchedObservation:
 
 def match(state: State, event: ObservationEvent) -> MatchedObservation:
     """Match an observation made at the state's instant with landmarks by their ids."""
+    event = corrected(state, event)
     m, rows = len(event.ids), state.landmarks.rows_of(event.ids)
     if not state.is_mapping:
         event, rows = mapped(state, event)
@@ -58,7 +60,10 @@ def residuals_of(
 ) -> Residuals:
     """Return the residuals (29) of landmarks ``rows`` (m,) seen with ``covariances``, m²."""
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    return state.filter.residuals(rows, event.points, covariances, dt_s)
+    D = None
+    if event.sensed is not None:
+        D = sensitivity(state, event, state.filter.expected_points(rows))
+    return state.filter.residuals(rows, event.points, covariances, dt_s, D)
 
 
 def keyframe_of(
@@ -72,7 +77,16 @@ def keyframe_of(
     is_stated = event.covariances is not None
     stated = noise.covariances(event, lines_of_sight) if is_stated else None
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    return Keyframe(event.stamp_ns, rows, event.points, lines_of_sight, stated, dt_s, orientations)
+    return Keyframe(
+        event.stamp_ns,
+        rows,
+        event.points,
+        lines_of_sight,
+        stated,
+        dt_s,
+        orientations,
+        event.sensed,
+    )
 
 
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:

@@ -19,6 +19,7 @@ from slam_observer_ros.state.matching import (
     positions,
     residuals_of,
 )
+from slam_observer_ros.state.sensing import sensitivity
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.tag_orientations import (
     correct_by_orientations,
@@ -123,7 +124,7 @@ def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> Non
     state.counts['unmapped_landmark'] += new - m
     if m:
         event = event.select(np.arange(new) < m)
-        state.filter.add(event.points, noise[:m])
+        state.filter.add(event.points, noise[:m], sensitivity(state, event))
         state.landmarks.add(event.ids, event.stamp_ns)
 
 
@@ -135,9 +136,11 @@ def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> In
     moved = far & (state.landmarks.counts[rows] >= state.settings.confirmations)
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
-        state.relocate(rows[far], event.points[far], noise[far])
+        moved_to = event.select(far)
+        D = sensitivity(state, moved_to)
+        state.relocate(rows[far], moved_to.points, noise[far], D)
         state.landmarks.take_for_new(rows[far], event.stamp_ns)
-        take_over_orientations(state, event.select(far), rows[far])
+        take_over_orientations(state, moved_to, rows[far])
     return event.ids[moved]
 
 

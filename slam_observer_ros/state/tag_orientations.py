@@ -14,6 +14,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.state.matching import MatchedObservation, residuals_of
+from slam_observer_ros.state.sensing import turning
 from slam_observer_ros.state.state import State
 
 _NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
@@ -70,7 +71,12 @@ def seen_orientations(
     """Return how tags of landmarks ``rows`` (m,) are turned, zero for none; None of points."""
     if state.filter.orientations is None or event.orientations is None:
         return None
-    return _all_seen(state, event, rows, event.orientations)
+    seen = _all_seen(state, event, rows, event.orientations)
+    if event.sensed is None or event.sensed.orientations is None:
+        return seen
+    # As the sensor showed them: what is known of it will have changed.
+    Z = event.sensed.orientations
+    return replace(seen, Z=Z, flipped=flipped(Z, event.sensed.arms))
 
 
 def flipped(Z: FloatArray, lines_of_sight: FloatArray) -> FloatArray:
@@ -99,7 +105,8 @@ def _all_seen(
     """Return the orientations (m, 3, 3) in an observation, with their noise."""
     noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    return SeenOrientations(rows, Z, flipped(Z, event.lines_of_sight), noise, dt_s)
+    twins = flipped(Z, event.lines_of_sight)
+    return SeenOrientations(rows, Z, twins, noise, dt_s, turning(state, event))
 
 
 def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:
