@@ -36,20 +36,10 @@ UNITS = ('rad',) * 3 + ('m',) * 3 + ('',)
 
 SCALE = NAMES.index('range_scale')
 
-PLANAR_MOUNT_RAD = 0.035
-"""How far a sensor's bracket is turned about the vertical, if nobody states it: two degrees."""
-
 LEAST_COSINE = 0.2
 """Cosine of the angle off its axis, 78°, beyond which no sensor sees depth."""
 
 _ALONG_X = np.array([1.0, 0.0, 0.0])
-
-
-def rotation_stddev(settings: Settings) -> tuple[float, float, float]:
-    """Return how far a sensor may be turned: as stated, or what is usual."""
-    if min(settings.sensor_rotation_stddev) >= 0.0:
-        return settings.sensor_rotation_stddev
-    return (0.0, 0.0, PLANAR_MOUNT_RAD if settings.two_d_mode else 0.0)
 
 
 class SensorCalibration:
@@ -64,7 +54,7 @@ class SensorCalibration:
         self.nominal = np.append(np.zeros(6), math.log(settings.range_scale))
         self.deviations = np.array(
             [
-                *rotation_stddev(settings),
+                *settings.sensor_rotation_stddev,
                 *settings.sensor_translation_stddev,
                 settings.range_scale_stddev / settings.range_scale,
             ]
@@ -73,6 +63,7 @@ class SensorCalibration:
         self.estimated: IntArray = possible[self.deviations[possible] > 0.0]
         self.variances: FloatArray = self.deviations[self.estimated] ** 2
         self._values: FloatArray = self.nominal.copy()
+        self.set(self.values)
 
     @property
     def values(self) -> FloatArray:
@@ -83,6 +74,7 @@ class SensorCalibration:
     def set(self, values: FloatArray) -> None:
         """Take ``values`` (c_s,) for the estimates."""
         self._values[self.estimated] = values
+        self._rotation, self._scale = so3.exp(self._values[:3]), math.exp(self._values[SCALE])
 
     def full(self, values: FloatArray) -> FloatArray:
         """Return all of ψ, d and s (…, 7), given those that are estimated (…, c_s)."""
@@ -123,26 +115,31 @@ class SensorCalibration:
         if self._is_depth:
             arms = arms / _cosines(arms, event.sensor_axis)[:, None]
         sensed = Sensed(np.full(len(arms), self.number), origins, arms, event.orientations)
-        R, shift, scale = so3.exp(self._values[:3]), self._values[3:6], math.exp(self._values[6])
-        points, sensor = shown_at(self._values, sensed), origins + shift
-        if self._is_planar:  # the line of sight keeps its height
-            sensor[:, 2] -= points[:, 2]
-            points[:, 2] = 0.0
-        covariances, velocities, Z = event.covariances, event.velocities, event.orientations
+        covariances, velocities, R = event.covariances, event.velocities, self._rotation
         if covariances is not None:
             squared = np.einsum('ij,ij->i', arms, arms)
             shown = np.einsum('ij,ij->i', event.lines_of_sight, event.lines_of_sight)
-            longer = scale**2 * squared / np.maximum(shown, np.finfo(np.float64).tiny)
+            longer = self._scale**2 * squared / np.maximum(shown, np.finfo(np.float64).tiny)
             covariances = longer[:, None, None] * (R @ covariances @ R.T)
-        return replace(
-            event,
-            points=points,
-            covariances=covariances,
-            velocities=None if velocities is None else velocities @ R.T,
-            sensor=sensor,
-            orientations=None if Z is None else R @ Z,
-            sensed=sensed,
-        )
+        if velocities is not None:
+            velocities = velocities @ R.T
+        event = replace(event, covariances=covariances, velocities=velocities, sensed=sensed)
+        return self.corrected_again(event)
+
+    def corrected_again(self, event: ObservationEvent) -> ObservationEvent:
+        """Return a corrected observation as it is by the estimates now."""
+        sensed, Z = event.sensed, event.orientations
+        if sensed is None:
+            raise TypeError('an observation that was never corrected')
+        points = sensed.arms.dot(self._scale * self._rotation.T)
+        sensor = sensed.origins + self._values[3:6]
+        points += sensor
+        if self._is_planar:  # the line of sight keeps its height
+            sensor[:, 2] -= points[:, 2]
+            points[:, 2] = 0.0
+        if sensed.orientations is not None:
+            Z = self._rotation @ sensed.orientations
+        return replace(event, points=points, sensor=sensor, orientations=Z)
 
     def sensitivity(self, arms: FloatArray) -> FloatArray:
         """Return D (m, 3, c_s) for points at l = ``arms`` (m, 3) from the sensor."""
@@ -177,4 +174,5 @@ def _cosines(arms: FloatArray, axis: FloatArray | None) -> FloatArray:
     """Return cos b (m,) of lines of sight (m, 3) off the sensor's axis (3,), x by default."""
     lengths = np.sqrt(np.einsum('ij,ij->i', arms, arms))
     along = arms.dot(_ALONG_X if axis is None else axis)
-    return np.maximum(along / np.maximum(lengths, np.finfo(np.float64).tiny), LEAST_COSINE)
+    cosines = along / np.maximum(lengths, np.finfo(np.float64).tiny)
+    return np.asarray(np.maximum(cosines, LEAST_COSINE))

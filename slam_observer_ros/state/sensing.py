@@ -19,6 +19,13 @@ def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
     return calibration.sensors[event.sensor_frame].corrected(event)
 
 
+def corrected_again(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation as it is by what is known of its sensor now, after a correction."""
+    if event.sensed is None or not state.filter.calibration.calibrates_sensors:
+        return event
+    return state.filter.calibration.sensors[event.sensor_frame].corrected_again(event)
+
+
 def sensitivity(
     state: State, event: ObservationEvent, points: FloatArray | None = None
 ) -> FloatArray | None:

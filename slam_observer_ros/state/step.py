@@ -19,7 +19,7 @@ from slam_observer_ros.state.matching import (
     positions,
     residuals_of,
 )
-from slam_observer_ros.state.sensing import sensitivity
+from slam_observer_ros.state.sensing import corrected_again, sensitivity
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.tag_orientations import (
     correct_by_orientations,
@@ -123,13 +123,14 @@ def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> Non
     m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
     state.counts['unmapped_landmark'] += new - m
     if m:
-        event = event.select(np.arange(new) < m)
+        event = corrected_again(state, event.select(np.arange(new) < m))
         state.filter.add(event.points, noise[:m], sensitivity(state, event))
         state.landmarks.add(event.ids, event.stamp_ns)
 
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
     """Relocate landmarks in doubt that are still far off; return ids of those that have moved."""
+    event = corrected_again(state, event)
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
     far = state.filter.distances(residuals) > state.settings.rejection_threshold

@@ -14,7 +14,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.state.matching import MatchedObservation, residuals_of
-from slam_observer_ros.state.sensing import turning
+from slam_observer_ros.state.sensing import corrected_again, turning
 from slam_observer_ros.state.state import State
 
 _NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
@@ -42,7 +42,9 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
     tags.count(seen.rows[judged], weights[judged] > 0.0)
     state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
     covariances = matched.covariances[matched.rows >= 0]
-    return replace(matched, residuals=residuals_of(state, event, rows, covariances))
+    event = corrected_again(state, event)
+    residuals = residuals_of(state, event, rows, covariances)
+    return replace(matched, known=event, residuals=residuals)
 
 
 def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray) -> None:
@@ -56,6 +58,8 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
         return
     in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     is_used = state.landmarks.rejections[rows] == 0
+    event = corrected_again(state, event)
+    Z = Z if event.orientations is None else event.orientations
     seen = _seen(state, event, rows, Z, is_used & (in_doubt | ~tags.are_known[rows]))
     if not len(seen.rows):
         return
