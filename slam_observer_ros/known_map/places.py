@@ -4,8 +4,8 @@ Each point is one of the landmarks in view with the probability 1 − f, else it
 How many points are of no landmark is not known beforehand: f has a beta distribution. The *mass*
 of a place is the likelihood of all points, integrated over where exactly it is; its *share* is its
 part of all masses, that of 'none of them' among these. Where the points lie by chance, the mean of
-the masses of all places together is that of 'none of them': so a place gets a share of 1 − ε by
-chance with a probability of ε at most.
+the likelihoods of all places together is that of 'none of them' (in halls with 2000 reflectors it
+is a twentieth): so chance seldom gives a place a large share.
 """
 
 from __future__ import annotations
@@ -44,6 +44,9 @@ FALSE, TRUE = 1.0, 4.0
 """Parameters of the beta distribution of f: one point in five is of no landmark, or none, or most
 of them.
 """
+
+NOWHERE = 0.1
+"""Probability beforehand that the robot is not in the map."""
 
 LEAST_VIEW_M = 1.0
 """Radius of what is in view at least, metres."""
@@ -166,7 +169,7 @@ class Weighing:
         self._view_m = max(LEAST_VIEW_M, 1.1 * float(spread_m))
         unit = math.pi if k == 2 else 4.0 / 3.0 * math.pi
         self._log_view = math.log(unit) + k * math.log(self._view_m)
-        self.log_none = -len(seen) * self._log_view
+        self.log_none = math.log(NOWHERE / (1.0 - NOWHERE)) - len(seen) * self._log_view
         # Around some landmarks all over the map.
         some = known.points[:: max(1, len(known) // SAMPLED), :k]
         counts = known.tree.query_ball_point(some, self._view_m, return_length=True)
