@@ -17,6 +17,7 @@ again: then it is given up. Among tags the covariance stays dense, but from
 
 from __future__ import annotations
 
+from functools import partial
 import logging
 import math
 from typing import Protocol
@@ -38,6 +39,7 @@ from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 from slam_observer_ros.smoothing.prior import Prior
+from slam_observer_ros.smoothing.slips import confirmed_slips
 
 logger = logging.getLogger(__name__)
 
@@ -171,23 +173,32 @@ class Relinearisation:
         """Forget landmarks; those behind move up."""
         self.history.remove(rows)
 
-    def smooth(self) -> Solution:
-        """Return all smoothed estimates, iterated from the present ones, which stay as they are.
+    def smooth(self) -> tuple[Solution, int]:
+        """Return all smoothed estimates, and how many slips they confirm (:mod:`.slips`).
 
-        Raise :exc:`ParameterError` if what the smoother takes for constant is not, or no history
-        is kept, :exc:`SmoothingError` if the observations don't determine everything.
+        They are iterated from the present ones, which stay as they are. Raise
+        :exc:`ParameterError` if what the smoother takes for constant is not, or no history is
+        kept, :exc:`SmoothingError` if the observations don't determine everything.
         """
         self._check_smoothable()
-        history = self.history
         try:
-            smoother = self._smoother(history.prior, history.keyframes())
-            start = self._start_for(smoother, 0)
-            return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE).end
+            return self._smoothed()
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
                 'can not smooth: the observations leave some pose or landmark open, or contradict '
                 'covariances that say they are exact'
             ) from error
+
+    def _smoothed(self) -> tuple[Solution, int]:
+        smoother_of = partial(self._smoother, self.history.prior)
+        keyframes, start, slips = self.history.keyframes(), self._solution_from(0), 0
+        if len(keyframes.slips):
+            are_slips, start = confirmed_slips(smoother_of, keyframes, start)
+            keyframes, slips = keyframes.with_slips(are_slips), int(np.sum(are_slips))
+        smoother = smoother_of(keyframes)
+        start = self._without_outliers_of_then(smoother, start)
+        smoothed = smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE)
+        return smoothed.end, slips
 
     def _check_smoothable(self) -> None:
         if self._settings.relinearization_interval == 0:
@@ -258,7 +269,8 @@ class Relinearisation:
         history, first = self.history, self.history.summarised
         try:
             smoother = self._smoother(history.summary, history.latest_keyframes())
-            step = smoother.smooth(self._start_for(smoother, first), ITERATIONS, TOLERANCE)
+            start = self._without_outliers_of_then(smoother, self._solution_from(first))
+            step = smoother.smooth(start, ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             self._warning.give()
@@ -292,9 +304,8 @@ class Relinearisation:
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
         return Smoother(self._axes, prior, keyframes, self._settings, self._calibration)
 
-    def _start_for(self, smoother: Smoother, first: int) -> Solution:
-        """Return where iterations begin, with the poses from before keyframe ``first`` on."""
-        start = self._solution_from(first)
+    def _without_outliers_of_then(self, smoother: Smoother, start: Solution) -> Solution:
+        """Return where iterations begin among tags, given the present estimates."""
         if start.orientations is None:
             return start
         # The poses are those of their time, the map is that of now: after a loop was closed much
