@@ -323,6 +323,8 @@ def damage_reported(path: Path, mends: bool = True) -> Iterator[None]:
     """
     try:
         yield
+    except ImportError:  # of a package that is not installed, and named as such
+        raise
     except Exception as error:
         reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
         if isinstance(error, UnicodeError):  # bytes where text should be
