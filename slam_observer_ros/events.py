@@ -17,7 +17,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.geometry.matrices import limited
+from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
@@ -30,13 +30,6 @@ FIRST_AUTOMATIC_ID = 10_000_000
 
 LAST_AUTOMATIC_ID = 2**24 - 1
 """They are numbered up to here: float32, as in a PointCloud, has these numbers exactly."""
-
-
-MAX_DEVIATION = 1e6
-"""Standard deviation (m, rad, m/s, rad/s) beyond which a message only says 'unknown'.
-
-The largest number there is, which drivers write for it, can't be turned without overflow.
-"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import suppress
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -21,13 +23,12 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.geometry import se3, so3
+from slam_observer_ros.geometry.matrices import are_covariances, transpose
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_correlations import check_joint
-from slam_observer_ros.settings.estimator_settings import Settings
-
-ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
-"""Relative error of a covariance whose message has it in single precision."""
+from slam_observer_ros.known_map.map_file import MAX_NUMBER
+from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
 
 ROTATION_TOLERANCE = 1e-3
 """How far RᵀR of a pose may be from identity: much further than single precision puts it."""
@@ -86,10 +87,10 @@ def check_velocities(velocities: VelocityBlock, settings: Settings) -> None:
         raise InvalidEventError('negative_stamp', 'a stamp is negative')
 
 
-def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
-    """Check that ``pose`` (4, 4) is a rigid motion, and ``covariance`` (6, 6) a covariance.
+def rigid(pose: FloatArray, covariance: FloatArray | None = None) -> FloatArray:
+    """Return ``pose`` (4, 4), whose rotation may be off by rounding, as a rigid motion.
 
-    Raise :exc:`ParameterError` if one of them is not.
+    Raise :exc:`ParameterError` if it is none, or ``covariance`` (6, 6) no covariance.
     """
     try:
         _check_array('pose', pose, (4, 4))
@@ -98,13 +99,16 @@ def check_pose(pose: FloatArray, covariance: FloatArray | None = None) -> None:
             _check_definite('pose covariance', covariance)
     except InvalidEventError as error:
         raise ParameterError(str(error)) from error
-    R = pose[:3, :3]
+    R, x = pose[:3, :3], pose[:3, 3]
     if not _are_rotations(R) or (pose[3] != (0.0, 0.0, 0.0, 1.0)).any():
         raise ParameterError('pose: no matrix [[R, x], [0, 1]] with a rotation R')
+    if np.abs(x).max() > MAX_POSITION_M:
+        raise ParameterError(f'pose: its position has an entry beyond {MAX_POSITION_M:g} m')
+    return se3.pose(so3.exact(R), x)
 
 
-def check_map(landmark_map: LandmarkMap) -> None:
-    """Check a map's shapes and values.
+def usable_map(landmark_map: LandmarkMap) -> LandmarkMap:
+    """Return a map, whose orientations may be off by rounding, with rotations.
 
     Raise :exc:`MapError` if an array does not fit, a value can't be right, or an id is repeated.
     """
@@ -115,17 +119,17 @@ def check_map(landmark_map: LandmarkMap) -> None:
         ids, n = landmark_map.ids, len(landmark_map.ids)
         _check_array('map ids', ids, (n,))
         _check_array('map counts', landmark_map.counts, (n,))
-        _check_array('map points', landmark_map.world_points, (n, 3))
+        _check_numbers('map points', landmark_map.world_points, (n, 3))
         if landmark_map.covariances is not None:
-            _check_array('map covariances', landmark_map.covariances, (n, 3, 3))
+            _check_numbers('map covariances', landmark_map.covariances, (n, 3, 3))
             _check_definite('map covariances', landmark_map.covariances)
         if landmark_map.joint_covariance is not None:
             size = 3 * (n + len(landmark_map.tags))
-            _check_array('joint map covariance', landmark_map.joint_covariance, (size, size))
+            _check_numbers('joint map covariance', landmark_map.joint_covariance, (size, size))
         if landmark_map.orientations is not None:
             _check_rotations('map orientations', landmark_map.orientations, n)
         if landmark_map.orientation_sigmas is not None:
-            _check_array('map orientation sigmas', landmark_map.orientation_sigmas, (n,))
+            _check_numbers('map orientation sigmas', landmark_map.orientation_sigmas, (n,))
     except InvalidEventError as error:
         raise MapError(str(error)) from error
     _check_joint(landmark_map)
@@ -135,11 +139,17 @@ def check_map(landmark_map: LandmarkMap) -> None:
         raise MapError('map counts: one is negative')
     if len(np.unique(ids)) < n:
         raise MapError('an id is there more than once in the map')
+    R, sigmas = landmark_map.orientations, landmark_map.orientation_sigmas
+    if (R is None) != (sigmas is None):
+        raise MapError('map orientations and their sigmas: there is only one of them')
+    if sigmas is not None and np.any(sigmas < 0.0):
+        raise MapError('map orientation sigmas: one is negative')
+    return landmark_map if R is None else replace(landmark_map, orientations=so3.exact(R))
 
 
 def _check_joint(landmark_map: LandmarkMap) -> None:
     joint, covariances = landmark_map.joint_covariance, landmark_map.covariances
-    if joint is None:
+    if joint is None or not len(landmark_map.ids):
         return
     if covariances is None:
         raise MapError('joint map covariance: it needs the covariances of its landmarks, too')
@@ -267,16 +277,29 @@ def _is_plain(array: object) -> bool:
     return isinstance(array, np.ndarray) and not isinstance(array, np.ma.MaskedArray | np.matrix)
 
 
+def _check_numbers(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+    """Check numbers of a map, none of which may be larger than in a file."""
+    _check_array(name, array, shape)
+    if np.abs(array).max(initial=0.0) > MAX_NUMBER:
+        raise InvalidEventError('too_large', f'an entry of the {name} is beyond {MAX_NUMBER:g}')
+
+
 def _check_definite(name: str, covariances: FloatArray) -> None:
-    """Check that covariances (…, d, d) are symmetric and have no negative eigenvalue."""
-    with np.errstate(over='ignore'):  # the largest number there is means 'unknown'
-        diagonals = np.diagonal(covariances, axis1=-2, axis2=-1)
-        allowed = (ROUNDING * diagonals).sum(axis=-1)  # finite, whatever the trace is
-        skew = np.abs(covariances - transpose(covariances)).max(axis=(-2, -1))
-    if np.any(skew > allowed) or np.any(np.linalg.eigvalsh(covariances)[..., 0] < -allowed):
-        raise InvalidEventError(
-            'bad_covariance', f'{name}: asymmetric, or with a negative eigenvalue'
-        )
+    """Check that covariances (…, d, d) are symmetric and have no negative eigenvalue.
+
+    Zeros are exact: in one's row and column there must be nothing else.
+    """
+    if (covariances == transpose(covariances)).all():
+        with suppress(np.linalg.LinAlgError):  # of those with zeros, or off by rounding
+            np.linalg.cholesky(covariances)
+            return
+    if are_covariances(covariances).all():
+        return
+    exact = np.diagonal(covariances, axis1=-2, axis2=-1) == 0.0
+    what = 'asymmetric, or with a negative eigenvalue'
+    if (exact[..., None] & (covariances != 0.0)).any():
+        what = 'a variance of zero, which says exact, has other entries in its row than zeros'
+    raise InvalidEventError('bad_covariance', f'{name}: {what}')
 
 
 def usable_points(
@@ -289,6 +312,8 @@ def usable_points(
     """Return an observation as the states use it; count its points, warn of those left out."""
     counts['observed_point'] += len(event.ids)
     event = flatten(event) if settings.two_d_mode else event
+    if event.orientations is not None and settings.use_tag_orientation:
+        event = replace(event, orientations=so3.exact(event.orientations))
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
         warnings.reserved_ids(event.ids[reserved].tolist())

@@ -17,9 +17,9 @@ from slam_observer_ros.common.units import to_ns, to_s
 from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
 from slam_observer_ros.estimator.checks import (
     check_event,
-    check_map,
-    check_pose,
     check_velocities,
+    rigid,
+    usable_map,
     usable_points,
 )
 from slam_observer_ros.estimator.event_queue import EventQueue
@@ -102,9 +102,7 @@ class Estimator:
         At ``pose`` (4, 4), body to world; by default at that of the settings, or else at identity,
         or unknown in a loaded map. Raise :exc:`ParameterError` if it is no rigid motion.
         """
-        if pose is not None:
-            check_pose(pose)
-        self._start_pose = pose
+        self._start_pose = pose = None if pose is None else rigid(pose)
         self._was_placed = pose is not None
         if pose is None and self.settings.set_initial_pose:
             self._start_where_settings_say()
@@ -156,11 +154,11 @@ class Estimator:
         frame. Raise MapError or ParameterError if one of them can't be right; nothing is changed
         then.
         """
-        check_map(landmark_map)
+        landmark_map = usable_map(landmark_map)
         if self.settings.localization_mode == 'off':
             self._warnings.loaded_map(len(landmark_map.ids), self.settings.max_landmarks)
         if pose is not None:
-            check_pose(pose, pose_covariance)
+            pose = rigid(pose, pose_covariance)
             self._timeline.catch_up()
         self._localiser.load(landmark_map, self.settings.two_d_mode)
         # The pose in it: the given one, the one of the settings, or the one that landmarks show.
@@ -182,7 +180,7 @@ class Estimator:
         :attr:`pose_covariance`; default exact. Raise :exc:`ParameterError` if one of them can't be
         right; nothing is changed then.
         """
-        check_pose(pose, covariance)
+        pose = rigid(pose, covariance)
         self._timeline.catch_up()
         self._move_robot(pose, covariance)
 
@@ -448,8 +446,7 @@ class Estimator:
 
     def _process_velocities(self, velocities: VelocityBlock) -> None:
         """Use velocities, as far as possible at once."""
-        # By how it is delayed, what is known at a stamp depends on the velocities after it.
-        if self.settings.velocity_delay_stddev or not self._timeline.takes(velocities):
+        if not self._timeline.takes(velocities):
             for event in velocities.events():
                 self._process(event)
             return

@@ -5,13 +5,28 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg.lapack import dgesv, dposv
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray
 
 LARGE = 500
 """Equations whose solution takes longer than NumPy's overhead."""
 
 VERY_LARGE = 1500
 """Equations that take so long that other threads would wait, which SciPy keeps from running."""
+
+MAX_DEVIATION = 1e3
+"""Standard deviation (m, rad, m/s, rad/s) beyond which a message only says 'unknown'.
+
+The largest number there is, which drivers write for it, can't be turned without overflow.
+"""
+
+LEAST_DEVIATION = 1e-4
+"""Entries of smaller standard deviations (m, rad, m/s, rad/s) are judged beside this one."""
+
+LEAST_SHARE = 1e-4
+"""The same as a share of the largest one: what is below is lost in rounding where both turn."""
+
+COVARIANCE_ROUNDING = 1e-6
+"""By how much correlations may be off, or have a negative eigenvalue."""
 
 
 def transpose(M: FloatArray) -> FloatArray:
@@ -109,6 +124,32 @@ def limited(covariances: FloatArray, largest: FloatArray) -> FloatArray:
     deviations = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
     scales = largest / np.maximum(deviations, largest)
     scaled: FloatArray = covariances * scales[..., :, None] * scales[..., None, :]
+    return scaled
+
+
+def are_covariances(matrices: FloatArray) -> BoolArray:
+    """Return which matrices (…, d, d) are symmetric, and negative in no direction.
+
+    Each entry is judged in its own standard deviations: a large variance hides no wrong one.
+    """
+    largest = np.full(matrices.shape[-1], MAX_DEVIATION)
+    with np.errstate(over='ignore'):
+        scaled = in_own_deviations(limited(matrices, largest), LEAST_SHARE)
+        are_small = np.abs(scaled).max(axis=(-2, -1)) <= 1.0 + COVARIANCE_ROUNDING
+    scaled = np.where(are_small[..., None, None], scaled, 0.0)
+    skew = np.abs(scaled - transpose(scaled)).max(axis=(-2, -1))
+    least = np.linalg.eigvalsh(scaled)[..., 0]
+    fit: BoolArray = are_small & (skew <= COVARIANCE_ROUNDING) & (least >= -COVARIANCE_ROUNDING)
+    return fit
+
+
+def in_own_deviations(matrices: FloatArray, least_share: float = 0.0) -> FloatArray:
+    """Return covariances (…, d, d) as correlations, whatever the scales of their entries are."""
+    variances = np.diagonal(matrices, axis1=-2, axis2=-1)
+    least = least_share**2 * variances.max(axis=-1, keepdims=True)
+    deviations = np.sqrt(np.maximum(variances, np.maximum(least, LEAST_DEVIATION**2)))
+    scaled: FloatArray = matrices / deviations[..., None, :]
+    scaled /= deviations[..., :, None]
     return scaled
 
 

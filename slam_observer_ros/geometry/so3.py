@@ -30,6 +30,9 @@ _THREE = 3.0 * _IDENTITY
 # Added to θ²: 0/0 becomes 0 / 1e-300, and any angle above 1e-142 rad keeps all its bits.
 _ZERO_GUARD = 1e-300
 
+ROUNDING = 1e-12
+"""How far RᵀR may be from identity after many products."""
+
 QUATERNION_NORM_TOLERANCE = 0.1
 """How far the norm of a quaternion that is a rotation may be from 1."""
 
@@ -141,6 +144,18 @@ def normalise(R: FloatArray) -> FloatArray:
         return one
     normalised: FloatArray = 0.5 * R @ (_THREE - R.swapaxes(-1, -2) @ R)
     return normalised
+
+
+def exact(R: FloatArray) -> FloatArray:
+    """Return rotations (…, 3, 3) that are off by a thousandth at most as rotations.
+
+    Those that are off by no more than products round remain as they are, bit for bit, and zeros
+    in place of one, too.
+    """
+    off = np.abs(R.swapaxes(-1, -2) @ R - _IDENTITY).max(axis=(-2, -1), keepdims=True)
+    near = normalise(normalise(normalise(R)))
+    rotations: FloatArray = np.where(off > ROUNDING, near, R)
+    return rotations
 
 
 def _square(K: FloatArray) -> FloatArray:

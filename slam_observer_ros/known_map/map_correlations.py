@@ -25,7 +25,12 @@ import numpy as np
 
 from slam_observer_ros.common.errors import MapError, shown
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry.matrices import diagonal_blocks
+from slam_observer_ros.geometry.matrices import (
+    COVARIANCE_ROUNDING,
+    diagonal_blocks,
+    in_own_deviations,
+    LEAST_DEVIATION,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -33,12 +38,6 @@ MAX_CORRELATED = 1000
 """Landmarks of a map up to which correlations are saved, in 46 MB then."""
 
 FIELDS = ('checksum', 'data')
-
-ROUNDING = 1e-6
-"""By how much correlations may be off, or have a negative eigenvalue."""
-
-LEAST_DEVIATION = 1e-4
-"""Metres or rad; entries of smaller standard deviations are compared with this one."""
 
 _COUNTED = ('id', 'position', 'sigma', 'covariance', 'orientation', 'orientation_sigma')
 
@@ -103,18 +102,15 @@ def check_joint(joint: FloatArray, covariances: FloatArray) -> None:
 
     Raise :exc:`MapError` if there are others on its diagonal, or it is none.
     """
-    # Whatever their scales, in units of their own deviations; of the tiny ones, rounding is left.
-    deviations = np.sqrt(np.maximum(np.diagonal(joint), LEAST_DEVIATION**2))
-    scaled = joint / deviations
-    scaled /= deviations[:, None]
-    n = len(covariances)
-    units = deviations.reshape(-1, 3)[:n]
-    own = covariances / (units[:, :, None] * units[:, None, :])
-    if np.abs(diagonal_blocks(scaled, 3)[:n] - own).max() > ROUNDING:
+    joint = np.asarray(joint, dtype=np.float64)
+    blocks, scaled = diagonal_blocks(joint, 3)[: len(covariances)], in_own_deviations(joint)
+    deviations = np.sqrt(np.maximum(np.diagonal(blocks, axis1=1, axis2=2), LEAST_DEVIATION**2))
+    differences = np.abs(blocks - covariances) / (deviations[:, :, None] * deviations[:, None, :])
+    if differences.max(initial=0.0) > COVARIANCE_ROUNDING:
         raise MapError('a landmark has another covariance there')
-    if np.abs(scaled - scaled.T).max() > ROUNDING:
+    if np.abs(scaled - scaled.T).max() > COVARIANCE_ROUNDING:
         raise MapError('they are not symmetric')
-    scaled[np.diag_indices(len(scaled))] += ROUNDING
+    scaled[np.diag_indices(len(scaled))] += COVARIANCE_ROUNDING
     try:
         np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError as error:

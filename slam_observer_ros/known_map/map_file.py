@@ -38,10 +38,11 @@ from slam_observer_ros.common.yaml_files import (
     FAST_LOADER,
     load_yaml,
     plain_value,
+    refuse_special,
 )
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.geometry.matrices import are_covariances
 from slam_observer_ros.known_map import map_correlations
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -138,8 +139,7 @@ def read_map(path: Path) -> LandmarkMap:
     the reason.
     """
     try:
-        if path.exists() and not path.is_file():  # reading it might never end
-            raise MapError(f"can't read map {path}: it is no regular file")
+        refuse_special(path)
         content = load_yaml(path, MAX_BYTES, _plain_value, FAST_LOADER)
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error
@@ -265,13 +265,7 @@ def _covariances(rows: Sequence[Mapping[str, Any]]) -> FloatArray | None:
     if not any('sigma' in row or 'covariance' in row for row in rows):
         return None
     covariances = np.array([_covariance(row) for row in rows])
-    # Whatever their scales, in units of their own deviations; of the tiny ones, rounding is left.
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    deviations = np.sqrt(np.maximum(variances, map_correlations.LEAST_DEVIATION**2))
-    scaled = covariances / (deviations[:, :, None] * deviations[:, None, :])
-    skew = np.abs(scaled - transpose(scaled)).max(axis=(1, 2))
-    rounding = map_correlations.ROUNDING
-    is_wrong = (skew > rounding) | (np.linalg.eigvalsh(scaled)[:, 0] < -rounding)
+    is_wrong = ~are_covariances(covariances)
     if is_wrong.any():
         who = f'landmark {rows[int(is_wrong.argmax())]["id"]}'
         what = 'is not symmetric, or negative in some direction'

@@ -18,6 +18,12 @@ _TINY = np.finfo(np.float64).tiny
 LEAST_RANGE = 1.0
 """Range, in edges of the tag, nearer than which no camera has all of it in view."""
 
+LARGEST_RANGE = 1e6
+"""Range, in edges of the tag, beyond which its corners are one point but for rounding."""
+
+LEAST_NOISE = 1e-6
+"""Noise of corners, in focal lengths, beside which less is lost in rounding."""
+
 
 def along_and_across(range_squared: FloatArray, s: Settings) -> tuple[FloatArray, FloatArray]:
     """Return the variances (m,) of a tag's position along and across the line of sight, m²."""
@@ -30,10 +36,19 @@ def orientation_covariances(Z: FloatArray, lines_of_sight: FloatArray, s: Settin
     """Return the covariances (m, 3, 3) of tags' orientations, rad², of tags turned by ``Z``.
 
     That of least squares, (Jᵀ J)⁻¹ σ² of the corners' derivatives by the pose, without position.
+    Of tags whose ``Z`` is zero nothing is known.
     """
+    covariances = np.tile(np.pi**2 * np.eye(3), (len(Z), 1, 1))
+    are_known = Z.any(axis=(1, 2))
+    if are_known.any():
+        covariances[are_known] = _of_known(Z[are_known], lines_of_sight[are_known], s)
+    return covariances
+
+
+def _of_known(Z: FloatArray, lines_of_sight: FloatArray, s: Settings) -> FloatArray:
     # The camera looks along the line of sight: its axes U, and the corners q in them.
     range_m = np.linalg.norm(lines_of_sight, axis=1)
-    range_m = np.maximum(range_m, LEAST_RANGE * s.tag_size)
+    range_m = np.clip(range_m, LEAST_RANGE * s.tag_size, LARGEST_RANGE * s.tag_size)
     U = _looking_along(lines_of_sight)
     arms = s.tag_size * _CORNERS @ (U @ Z).swapaxes(-1, -2)  # (m, 4, 3)
     q = arms + range_m[:, None, None] * np.array([0.0, 0.0, 1.0])
@@ -46,7 +61,8 @@ def orientation_covariances(Z: FloatArray, lines_of_sight: FloatArray, s: Settin
     # What turns are known by once the position is.
     N = J.swapaxes(-1, -2) @ J
     turns = N[:, :3, :3] - N[:, :3, 3:] @ np.linalg.solve(N[:, 3:, 3:], N[:, 3:, :3])
-    information = turns / s.pixel_noise**2 + np.eye(3) / np.pi**2  # nothing is off by more
+    noise = max(s.pixel_noise, LEAST_NOISE * s.focal_length)
+    information = turns / noise**2 + np.eye(3) / np.pi**2  # nothing is off by more
     covariances: FloatArray = U.swapaxes(-1, -2) @ np.linalg.inv(information) @ U
     return covariances
 

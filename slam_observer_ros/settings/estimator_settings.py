@@ -13,6 +13,9 @@ Vector3 = tuple[float, float, float]
 MAX_DELAY_S = 1.0
 """Delay of velocities that is made up for at most."""
 
+MAX_POSITION_M = 1e7
+"""Coordinate of a given pose at most: a map's origin may be that of UTM."""
+
 
 @dataclass(frozen=True)
 class Settings(Immutable):
@@ -364,8 +367,8 @@ class Settings(Immutable):
         (0.0, 0.0, 0.0),
         'Where the robot starts, x y z, with set_initial_pose',
         unit='m',
-        minimum=-1e7,
-        maximum=1e7,
+        minimum=-MAX_POSITION_M,
+        maximum=MAX_POSITION_M,
     )
     initial_yaw: float = parameter(
         0.0,

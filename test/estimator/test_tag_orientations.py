@@ -110,6 +110,21 @@ def test_points_and_tags_may_be_in_one_observation():
     np.testing.assert_array_equal(are_known, [True, False])
 
 
+@pytest.mark.parametrize('gains', ['constant', 'scheduled', 'riccati'])
+@pytest.mark.parametrize('model', ['range_bearing', 'cartesian', 'stereo', 'fiducial'])
+def test_by_every_noise_model_a_tag_may_come_without_its_orientation(model, gains):
+    settings = replace(UNSURE, observation_model=model, gains=gains)
+    estimator, ids = Estimator(settings), np.array([1, 2])
+    points = np.array([TAG, TAG + [0.0, 1.0, 0.0]])
+    for k in range(6):
+        Z = np.stack([FACING, FACING])
+        Z[: 1 + k % 2] *= k > 3  # none, one or both
+        assert estimator.add(ObservationEvent(k * 10**8, ids, points, orientations=Z))
+    np.testing.assert_allclose(estimator.pose, np.eye(4), atol=1e-6)
+    if gains == 'riccati':
+        np.testing.assert_allclose(estimator.landmark_map.orientations[1], FACING, atol=1e-6)
+
+
 def test_a_late_tag_is_used_as_it_would_be_seen_now():
     settings = replace(UNSURE, angular_velocity_noise=(0.01,) * 3)
     estimator = drive(settings, 0.0)

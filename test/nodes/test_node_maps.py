@@ -331,7 +331,7 @@ def test_an_initial_pose_whose_covariance_is_none_is_refused():
     message.pose.covariance[1] = 0.1  # and its mirror image is zero
     given.receive(serialize_message(message))
     (reason,) = given.node.get_logger().error.call_args.args
-    assert reason.startswith('the pose given is not used: pose covariance: asymmetric')
+    assert reason.startswith('the pose given is not used: its covariance is not finite, not sym')
     given.see()
     assert_allclose(given.estimator.pose, np.eye(4), atol=1e-9)
 

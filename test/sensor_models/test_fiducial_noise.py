@@ -9,6 +9,7 @@ import pytest
 
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
+from slam_observer_ros.sensor_models.fiducial_noise import orientation_covariances
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -93,3 +94,31 @@ def test_nothing_is_known_of_a_tag_that_is_seen_as_a_point():
     _, orientation = noise(1e4)
     assert np.all(np.isfinite(orientation))
     assert np.sqrt(orientation[0, 0]) == pytest.approx(np.pi, rel=1e-3)
+
+
+def test_where_one_has_no_orientation_those_of_others_are_as_they_were():
+    settings = Settings(observation_model='fiducial')
+    Z, points = np.stack([np.eye(3), np.zeros((3, 3))]), np.array([[2.0, 0, 0], [2.0, 1, 0]])
+    both = orientation_covariances(Z, points, settings)
+    np.testing.assert_array_equal(both[0], orientation_covariances(Z[:1], points[:1], settings)[0])
+    np.testing.assert_allclose(both[1], np.pi**2 * np.eye(3))
+
+
+@pytest.mark.parametrize('size', [1e-3, 100.0])
+@pytest.mark.parametrize('focal_length', [1.0, 1e5])
+@pytest.mark.parametrize('pixel_noise', [1e-6, 1e3])
+@pytest.mark.parametrize('range_m', [0.0, 1e-6, 1.0, 1e3, 1e6])
+def test_whatever_is_set_covariances_are_positive(size, focal_length, pixel_noise, range_m):
+    settings = Settings(
+        observation_model='fiducial',
+        tag_size=size,
+        focal_length=focal_length,
+        pixel_noise=pixel_noise,
+    )
+    rng = np.random.default_rng(0)
+    towards = rng.normal(size=(50, 3))
+    towards *= range_m / np.linalg.norm(towards, axis=1, keepdims=True)
+    covariances = orientation_covariances(so3.exp(rng.normal(size=(50, 3))), towards, settings)
+    variances = np.linalg.eigvalsh(covariances)
+    assert variances.min() > 0.0
+    assert variances.max() < 1.001 * np.pi**2

@@ -11,19 +11,16 @@ from rclpy.node import Node
 from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
-from slam_observer_ros.geometry.matrices import limited
+from slam_observer_ros.geometry.matrices import are_covariances, limited
 from slam_observer_ros.messages.poses_and_velocities import (
     decode_pose_with_covariance_stamped,
     PoseMessage,
 )
 from slam_observer_ros.nodes.qos import RELIABLE_QOS
-from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.parameter_table import table
+from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
 from slam_observer_ros.state.covariances import MAX_POSE_ERRORS
 
 TOPICS = ('initialpose', '~/set_pose')
-
-_MAX_POSITION_M = next(row.maximum for row in table(Settings) if row.name == 'initial_position')
 
 
 class InitialPoseListener:
@@ -60,8 +57,8 @@ class InitialPoseListener:
             raise MessageError(f"it is in frame '{message.frame_id}', not '{self._map_frame}'")
         if not np.isfinite(message.position).all():
             raise MessageError('its position has a NaN or infinite entry')
-        if np.abs(message.position).max() > _MAX_POSITION_M:
-            raise MessageError(f'its position has an entry beyond {_MAX_POSITION_M:g} m')
+        if np.abs(message.position).max() > MAX_POSITION_M:
+            raise MessageError(f'its position has an entry beyond {MAX_POSITION_M:g} m')
 
 
 def filled_in(covariance: FloatArray | None) -> FloatArray:
@@ -69,13 +66,12 @@ def filled_in(covariance: FloatArray | None) -> FloatArray:
 
     RViz's 2D Pose Estimate, for one, gives those of x, y and yaw only, and zeros else. Those
     that are so large that they only say 'unknown' are made less, lest they drown all others.
-    Raises a MessageError if the covariance is not finite, or negative in some direction.
+    Raises a MessageError if it is not finite, not symmetric, or negative in some direction.
     """
     given = np.zeros((6, 6)) if covariance is None else covariance
-    if np.isfinite(given).all():
-        given = limited(given, MAX_POSE_ERRORS)
-    rounding = 1e-9 + 1e-12 * np.trace(given)
-    if not (np.isfinite(given).all() and np.linalg.eigvalsh(given).min() > -rounding):
-        raise MessageError('its covariance is not finite, or negative in some direction')
+    if not (np.isfinite(given).all() and are_covariances(given)):
+        raise MessageError(
+            'its covariance is not finite, not symmetric, or negative in some direction'
+        )
     assumed: FloatArray = np.where(np.diagonal(given) == 0.0, GIVEN_POSE_STD**2, 0.0)
-    return given + np.diag(assumed)
+    return limited(given, MAX_POSE_ERRORS) + np.diag(assumed)
