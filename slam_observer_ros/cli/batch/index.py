@@ -11,8 +11,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from slam_observer_ros.cli.batch.run_log import FIGURES, FILES, Line
-from slam_observer_ros.cli.replay.summary import ACCURACY_ROWS
+from slam_observer_ros.cli.batch.run_log import FILES, Line
+from slam_observer_ros.cli.figures import ACCURACY_ROWS, FIGURES
 from slam_observer_ros.report.run_index import Cell, IndexTable, Link, write_index_page
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import table

@@ -16,15 +16,12 @@ from pathlib import Path
 import sys
 from typing import Any, BinaryIO
 
-from slam_observer_ros.cli.replay.summary import ACCURACY_ROWS
+from slam_observer_ros.cli.figures import FIGURES
 from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.output_files import unfinished_file
 
 Line = dict[str, Any]
-
-FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')
-"""Figures of a run that the index shows; those that are not known may be left out, or null."""
 
 FILES = ('report', 'trajectory')
 """What may be written of a run; the line has where, or null."""
@@ -76,7 +73,8 @@ def opened_log(path: Path) -> Iterator[RunLog]:
             file.write(b'\n')
             file.flush()
         else:  # a power cut has: that run is to be done again
-            file.truncate(file.tell() - len(end))
+            file.seek(-len(end), os.SEEK_END)
+            file.truncate()
         yield RunLog(file)
 
 
