@@ -18,6 +18,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
+from slam_observer_ros.geometry.sensor_mounting import Sensed
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
@@ -119,26 +120,6 @@ class AngularVelocityEvent:
             self,
             angular_velocity=R @ self.angular_velocity,
             covariance=None if covariance is None else _turned(covariance, R),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Sensed:
-    """What sensors showed of m points, before it was corrected by how they err; body frame."""
-
-    sensors: IntArray  # (m,) numbers of the sensors
-    origins: FloatArray  # (m, 3) where /tf has the sensor, metres
-    arms: FloatArray  # (m, 3) from there to the point, metres
-    orientations: FloatArray | None = None  # (m, 3, 3) as those of an observation
-
-    def select(self, mask: BoolArray) -> Sensed:
-        """Return the points that ``mask`` (m,) picks."""
-        Z = self.orientations
-        return Sensed(
-            self.sensors[mask],
-            self.origins[mask],
-            self.arms[mask],
-            None if Z is None else Z[mask],
         )
 
 

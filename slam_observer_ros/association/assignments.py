@@ -31,7 +31,7 @@ from slam_observer_ros.geometry.axes import SPATIAL
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
-from slam_observer_ros.state.sensing import sensitivity
+from slam_observer_ros.state.matching import sensitivity
 from slam_observer_ros.state.state import State
 
 MAX_CANDIDATES = 10

@@ -36,8 +36,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
-from slam_observer_ros.state.matching import match, MatchedObservation
-from slam_observer_ros.state.sensing import corrected
+from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, Outcome, step
 

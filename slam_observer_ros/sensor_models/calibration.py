@@ -9,6 +9,7 @@ sensor's part, which begins with the first observation from its frame, is in
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
-from slam_observer_ros.sensor_models.sensor_calibration import SensorCalibration
+from slam_observer_ros.sensor_models.sensor_calibration import SCALE, SensorCalibration
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 NAMES = (
@@ -65,7 +66,13 @@ class Calibration:
         # τ; where it is negative the latest velocity is held for longer.
         self.delay_ns = 0
         self.sensors: dict[str, SensorCalibration] = {}
-        self.corrects_points = SensorCalibration('', 0, settings, axes).corrects_points
+        stated, deviations = _of_a_sensor(settings)
+        of_sensor = np.append(pose, SCALE)
+        self._of_sensor: IntArray = of_sensor[deviations[of_sensor] > 0.0]
+        self._stated, self._sensor_variances = stated, deviations[self._of_sensor] ** 2
+        self.corrects_points = bool(
+            settings.range_is_depth or stated.any() or len(self._of_sensor)
+        )
         self.count = self.of_velocity = len(self._estimated)  # c, and how many are no sensor's
         self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
         self._set_variances(errors[self._estimated] ** 2)
@@ -77,7 +84,8 @@ class Calibration:
 
     def add_sensor(self, frame: str) -> SensorCalibration:
         """Append what is estimated of the sensor of a new frame."""
-        sensor = SensorCalibration(frame, len(self.sensors), self._settings, self.axes)
+        number, variances = len(self.sensors), self._sensor_variances
+        sensor = SensorCalibration(frame, number, self._stated, self._of_sensor, variances)
         self.sensors[frame] = sensor
         self.count += len(sensor.estimated)
         self._set_variances(np.append(self.initial_variances, sensor.variances))
@@ -89,7 +97,8 @@ class Calibration:
         values: FloatArray = self._all[self._estimated]
         if not self.sensors:
             return values
-        return np.concatenate([values, *(sensor.values for sensor in self.sensors.values())])
+        sensors = self.sensors.values()
+        return np.concatenate([values, *(part.values[part.estimated] for part in sensors)])
 
     @property
     def calibrates_sensors(self) -> bool:
@@ -101,6 +110,15 @@ class Calibration:
         before = [other for other in self.sensors.values() if other.number < sensor.number]
         first = self.of_velocity + sum(len(other.estimated) for other in before)
         return slice(first, first + len(sensor.estimated))
+
+    def sensor_columns(self) -> tuple[FloatArray, IntArray]:
+        """Return ψ, d and s of all sensors (s, 7), and which of the c entries they are, or −1."""
+        columns = np.full((len(self.sensors), 7), -1)
+        for sensor in self.sensors.values():
+            entries = np.arange(self.count)[self.columns(sensor)]
+            columns[sensor.number, sensor.estimated] = entries
+        values = [sensor.values for sensor in self.sensors.values()]
+        return np.array(values).reshape(-1, 7), columns
 
     def estimates(self, variances: FloatArray) -> list[CalibrationEstimate]:
         """Return the estimates with ``variances`` (c,), what the filter knows of them."""
@@ -212,9 +230,19 @@ class Calibration:
         """Add ``change`` (c,) to the estimates."""
         self._all[self._estimated] += change[: self.of_velocity]
         for sensor in self.sensors.values():
-            sensor.set(sensor.values + change[self.columns(sensor)])
+            sensor.shift(change[self.columns(sensor)])
         self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)
         self.delay_ns = to_ns(float(self._all[DELAY]))
+
+
+def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
+    """Return ψ, d and s (7,) of a sensor as stated, and their standard deviations (7,)."""
+    deviations = [
+        *settings.sensor_rotation_stddev,
+        *settings.sensor_translation_stddev,
+        settings.range_scale_stddev / settings.range_scale,
+    ]
+    return np.append(np.zeros(6), math.log(settings.range_scale)), np.array(deviations)
 
 
 def without_calibration(settings: Settings) -> Settings:

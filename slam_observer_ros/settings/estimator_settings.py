@@ -299,7 +299,7 @@ class Settings(Immutable):
     range_scale_stddev: float = parameter(
         0.0,
         'Riccati gains: how far range_scale may be off, to be estimated: its standard deviation; '
-        'without a surveyed map it can hardly be told from the scale of the velocity',
+        'without a surveyed map it can hardly be distinguished from the scale of velocities',
         minimum=0.0,
     )
     range_is_depth: bool = parameter(

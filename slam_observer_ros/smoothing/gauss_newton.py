@@ -24,12 +24,12 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
-from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 from slam_observer_ros.smoothing.observations import normal, Observations
-from slam_observer_ros.smoothing.prior import EXACT_M, Prior
+from slam_observer_ros.smoothing.prior import inverse, Prior
+from slam_observer_ros.smoothing.sensed_points import SensedPoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Smoother:
     ``axes`` are the d of the pose and k of a point that are estimated; of the settings,
     ``huber_threshold`` and ``rejection_threshold`` weigh outliers, and ``calibration_drift`` says
     whether there is one calibration, of the border, or one at each of the chain's poses.
-    ``calibration`` says which sensors are calibrated, where any is.
+    ``sensed`` are the points where their sensors are calibrated.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class Smoother:
         prior: Prior,
         keyframes: Keyframes,
         settings: Settings,
-        calibration: Calibration | None = None,
+        sensed: SensedPoints | None = None,
     ) -> None:
         self._axes = axes
         self._prior = prior
         self._keyframes = keyframes
-        self._observations = Observations(axes, keyframes, settings, calibration)
+        self._observations = Observations(axes, keyframes, settings, sensed)
         # Unknowns of a landmark: its position, then its turn if that is estimated.
         self._unknowns = axes.point + (axes.turn if keyframes.turns is not None else 0)
         drifts, c = settings.calibration_drift > 0.0, len(prior.calibration)
@@ -249,9 +249,3 @@ def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:
     information[:, :d, :d] = of_motions
     information[:, d:, d:] = inverse(keyframes.drift_covariances)
     return information
-
-
-def inverse(covariances: FloatArray) -> FloatArray:
-    """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
-    jitter = EXACT_M**2 * np.eye(covariances.shape[-1])
-    return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)

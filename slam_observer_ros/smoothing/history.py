@@ -9,16 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.events import Sensed
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
 from slam_observer_ros.smoothing.keyframes import (
     joined,
-    joined_sensed,
     joined_turns,
     Keyframes,
     Links,

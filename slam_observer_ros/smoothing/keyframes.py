@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import Sensed
+from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,12 +169,3 @@ def joined_turns(parts: list[SeenTurns]) -> SeenTurns:
         np.concatenate([part.flipped for part in parts]),
         np.concatenate([part.information for part in parts]),
     )
-
-
-def joined_sensed(parts: list[Sensed]) -> Sensed:
-    """Return what sensors showed in several parts, one after the other."""
-    return Sensed(
-        np.concatenate([part.sensors for part in parts]),
-        np.concatenate([part.origins for part in parts]),
-        np.concatenate([part.arms for part in parts]),
-    )  # how tags are turned is in SeenTurns

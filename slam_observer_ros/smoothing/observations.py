@@ -14,7 +14,6 @@ from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.orientations import flip_verdicts
-from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, SeenTurns, Solution
 from slam_observer_ros.smoothing.sensed_points import SensedPoints
@@ -23,7 +22,7 @@ from slam_observer_ros.smoothing.sensed_points import SensedPoints
 class Observations:
     """M observations of landmarks; ``huber_threshold`` and ``rejection_threshold`` weigh them.
 
-    ``sensors`` (c_s) entries of the calibration, its last ones, are those of calibrated sensors.
+    ``sensed`` are the points where their sensors are calibrated.
     """
 
     def __init__(
@@ -31,14 +30,10 @@ class Observations:
         axes: EstimatedAxes,
         keyframes: Keyframes,
         settings: Settings,
-        calibration: Calibration | None = None,
+        sensed: SensedPoints | None = None,
     ) -> None:
         self._axes, self._keyframes, self._settings = axes, keyframes, settings
-        self._sensed: SensedPoints | None = None
-        self.sensors = 0
-        if calibration is not None and keyframes.sensed is not None:
-            self._sensed = SensedPoints(calibration, keyframes.sensed)
-            self.sensors = self._sensed.count
+        self._sensed = sensed
 
     def normal_equations(
         self, solution: Solution, chained: int, gated: bool = True
@@ -47,7 +42,7 @@ class Observations:
 
         q unknowns are those of the chain's pose, the last ``chained`` of which are a calibration,
         and of the landmark: its position, then its turn if that is estimated; without a chained
-        calibration then those of its ``sensors``. If ``gated``, what a filter would reject at the
+        calibration then those of sensors. If ``gated``, what a filter would reject at the
         solution has less weight.
         """
         keyframes, k = self._keyframes, self._axes.point

@@ -219,6 +219,12 @@ class Prior:
         return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()
 
 
+def inverse(covariances: FloatArray) -> FloatArray:
+    """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
+    jitter = EXACT_M**2 * np.eye(covariances.shape[-1])
+    return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)
+
+
 def _with_unknown(covariance: FloatArray, columns: IntArray, sigma: float) -> FloatArray:
     """Return a covariance in which ``columns`` are independent of all else, and all but free."""
     changed: FloatArray = covariance.copy()

@@ -17,7 +17,6 @@ again: then it is given up. Among tags the covariance stays dense, but from
 
 from __future__ import annotations
 
-from functools import partial
 import logging
 import math
 from typing import Protocol
@@ -39,6 +38,7 @@ from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 from slam_observer_ros.smoothing.prior import Prior
+from slam_observer_ros.smoothing.sensed_points import SensedPoints
 from slam_observer_ros.smoothing.slips import confirmed_slips
 
 logger = logging.getLogger(__name__)
@@ -71,6 +71,9 @@ ITERATIONS, TOLERANCE = 2, 2e-2
 
 SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
 """The same for smoothing everything."""
+
+SLIP_TOLERANCE = 1e-4
+"""Change below which a solution will do to judge slips by."""
 
 
 class JointFilter(Protocol):
@@ -190,12 +193,20 @@ class Relinearisation:
             ) from error
 
     def _smoothed(self) -> tuple[Solution, int]:
-        smoother_of = partial(self._smoother, self.history.prior)
-        keyframes, start, slips = self.history.keyframes(), self._solution_from(0), 0
+        prior, keyframes = self.history.prior, self.history.keyframes()
+        start, slips = self._solution_from(0), 0
+
+        def solve(links: Keyframes, before: Solution) -> Solution:
+            smoother = self._smoother(prior, links)
+            return smoother.smooth(before, SMOOTHING_ITERATIONS, SLIP_TOLERANCE, gated=False).end
+
+        def motion_errors(links: Keyframes, solution: Solution) -> FloatArray:
+            return self._smoother(prior, links).motion_errors(solution)
+
         if len(keyframes.slips):
-            are_slips, start = confirmed_slips(smoother_of, keyframes, start)
+            are_slips, start = confirmed_slips(solve, motion_errors, keyframes, start)
             keyframes, slips = keyframes.with_slips(are_slips), int(np.sum(are_slips))
-        smoother = smoother_of(keyframes)
+        smoother = self._smoother(prior, keyframes)
         start = self._without_outliers_of_then(smoother, start)
         smoothed = smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE)
         return smoothed.end, slips
@@ -302,7 +313,11 @@ class Relinearisation:
             tags.B = end.orientations
 
     def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
-        return Smoother(self._axes, prior, keyframes, self._settings, self._calibration)
+        calibration, sensed = self._calibration, None
+        if keyframes.sensed is not None:
+            stated, columns = calibration.sensor_columns()
+            sensed = SensedPoints(keyframes.sensed, stated, columns, calibration.count)
+        return Smoother(self._axes, prior, keyframes, self._settings, sensed)
 
     def _without_outliers_of_then(self, smoother: Smoother, start: Solution) -> Solution:
         """Return where iterations begin among tags, given the present estimates."""

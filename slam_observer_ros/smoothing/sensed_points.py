@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.events import Sensed
+from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import so3
-from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.sensor_calibration import sensitivity, shown_at
+from slam_observer_ros.geometry.sensor_mounting import Sensed, sensitivity, shown_at, turning
 
 
 class SensedPoints:
-    """M points; the last ``count`` entries c_s of the calibration are those of their sensors."""
+    """M points; the last ``count`` entries c_s of the calibration are those of their sensors.
 
-    def __init__(self, calibration: Calibration, sensed: Sensed) -> None:
-        self._sensed, self._calibration = sensed, calibration
-        self._first = calibration.of_velocity
-        self.count = calibration.count - self._first
-        sensors = calibration.sensors.values()
-        self._points = [np.flatnonzero(sensed.sensors == sensor.number) for sensor in sensors]
+    ``stated`` (s, 7) has the values of s sensors, and ``columns`` (s, 7) where in the calibration
+    (c,) those are that are estimated, −1 for others.
+    """
+
+    def __init__(self, sensed: Sensed, stated: FloatArray, columns: IntArray, c: int) -> None:
+        self._sensed = sensed
+        self._stated, self._columns = stated[sensed.sensors], columns[sensed.sensors]
+        self._are_estimated = self._columns >= 0
+        self._first = int(np.min(columns, where=columns >= 0, initial=c))
+        self.count = c - self._first
 
     def shown(self, calibrations: FloatArray) -> FloatArray:
         """Return y (M, 3), metres, body frame, with one calibration for each point (M, c)."""
@@ -38,23 +40,18 @@ class SensedPoints:
 
     def turning(self, calibrations: FloatArray) -> FloatArray:
         """Return J(ψ) (M, 3, c_s): how orientations turn with the calibration."""
-        turns = np.zeros((len(self._sensed.arms), 3, 7))
-        turns[:, :, :3] = so3.left_jacobian(self._values(calibrations)[:, :3])
-        return self._estimated(turns)
+        return self._estimated(turning(self._values(calibrations)))
 
     def _values(self, calibrations: FloatArray) -> FloatArray:
         """Return ψ, d and s (M, 7) of each point's sensor."""
-        values = np.empty((len(calibrations), 7))
-        for sensor, at in zip(self._calibration.sensors.values(), self._points, strict=True):
-            columns = self._calibration.columns(sensor)
-            values[at] = sensor.full(calibrations[at, columns])
-        return values
+        if not self.count:
+            return self._stated
+        estimated = np.take_along_axis(calibrations, np.maximum(self._columns, 0), axis=1)
+        return np.where(self._are_estimated, estimated, self._stated)
 
     def _estimated(self, D: FloatArray) -> FloatArray:
         """Return the columns (M, 3, c_s) of D (M, 3, 7) that are estimated, of its own sensor."""
         estimated = np.zeros((len(D), 3, self.count))
-        for sensor, at in zip(self._calibration.sensors.values(), self._points, strict=True):
-            columns = np.arange(self.count + self._first)[self._calibration.columns(sensor)]
-            own = D[at][:, :, sensor.estimated]
-            estimated[np.ix_(at, np.arange(3), columns - self._first)] = own
+        rows, parts = np.nonzero(self._are_estimated)
+        estimated[rows, :, self._columns[rows, parts] - self._first] = D[rows, :, parts]
         return estimated

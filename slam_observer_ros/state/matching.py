@@ -11,9 +11,9 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
-from slam_observer_ros.state.sensing import corrected, sensitivity
 from slam_observer_ros.state.state import State
 
 SAME_POSITION = 4.0
@@ -46,6 +46,33 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
     known = event.select(is_known)
     residuals = residuals_of(state, known, rows[is_known], covariances[is_known])
     return MatchedObservation(event, rows, covariances, known, residuals, left_out)
+
+
+def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation as it is by the calibration of its sensor, unless it is already."""
+    calibration = state.filter.calibration
+    if not calibration.corrects_points or event.sensed is not None:
+        return event
+    if event.sensor_frame not in calibration.sensors:
+        state.add_sensor(event.sensor_frame)
+    return sensing.corrected(calibration, state.settings, event)
+
+
+def corrected_again(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation as it is by what a correction has made of the calibration."""
+    return sensing.corrected_again(state.filter.calibration, event)
+
+
+def sensitivity(
+    state: State, event: ObservationEvent, points: FloatArray | None = None
+) -> FloatArray | None:
+    """Return R̂ D_i (m, 3, c) at ``points`` (m, 3), body frame, or where an observation has them.
+
+    None where nothing of a sensor is estimated.
+    """
+    points = event.points if points is None else points
+    D = sensing.point_sensitivity(state.filter.calibration, event, points)
+    return None if D is None else state.observer.A[:3, :3] @ D
 
 
 def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:

@@ -12,14 +12,15 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
+    corrected_again,
     is_contradiction,
     keyframe_of,
     mapped,
     MatchedObservation,
     positions,
     residuals_of,
+    sensitivity,
 )
-from slam_observer_ros.state.sensing import corrected_again, sensitivity
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.tag_orientations import (
     correct_by_orientations,

@@ -13,8 +13,8 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.state.matching import MatchedObservation, residuals_of
-from slam_observer_ros.state.sensing import corrected_again, turning
+from slam_observer_ros.sensor_models.sensing import turn_sensitivity
+from slam_observer_ros.state.matching import corrected_again, MatchedObservation, residuals_of
 from slam_observer_ros.state.state import State
 
 _NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
@@ -109,8 +109,10 @@ def _all_seen(
     """Return the orientations (m, 3, 3) in an observation, with their noise."""
     noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    twins = flipped(Z, event.lines_of_sight)
-    return SeenOrientations(rows, Z, twins, noise, dt_s, turning(state, event))
+    twins, D = flipped(Z, event.lines_of_sight), turn_sensitivity(state.filter.calibration, event)
+    if D is not None:
+        D = state.observer.A[:3, :3] @ D
+    return SeenOrientations(rows, Z, twins, noise, dt_s, D)
 
 
 def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:

@@ -15,11 +15,10 @@ from strategies import generators
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.sensor_models import sensor_calibration
-from slam_observer_ros.sensor_models.sensor_calibration import SensorCalibration
+from slam_observer_ros.sensor_models import sensing, sensor_calibration
+from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.state import sensing
-from slam_observer_ros.state.matching import match
+from slam_observer_ros.state.matching import match, sensitivity
 
 NONE = (0.0, 0.0, 0.0)
 TURNED = np.array([0.02, -0.03, 0.035])
@@ -53,6 +52,14 @@ def erring(world, settings, turned=TURNED, shifted=SHIFTED, longer=LONGER, **whe
     return world.with_observations(shown)
 
 
+def calibrated(settings):
+    calibration = Calibration(
+        replace(settings, angular_bias_stddev=NONE), axes_of(settings.two_d_mode)
+    )
+    calibration.add_sensor('')
+    return calibration
+
+
 def observation(rng, m=5, **changes):
     points = rng.uniform([1.0, -1.0, -1.0], [5.0, 1.0, 1.0], (m, 3))
     return ObservationEvent(1, np.arange(m), points, **changes)
@@ -63,16 +70,17 @@ def observation(rng, m=5, **changes):
 @given(rng=generators())
 def test_derivatives_of_a_corrected_point_are_those_of_differences(settings, is_depth, rng):
     settings = replace(settings, range_is_depth=is_depth)
-    sensor = SensorCalibration('', 0, settings, axes_of(settings.two_d_mode))
-    sensor.set(0.1 * rng.normal(size=len(sensor.estimated)))
+    calibration = calibrated(settings)
+    calibration.shift(0.1 * rng.normal(size=calibration.count))
     event = observation(rng, sensor=np.tile([0.3, 0.1, 0.5], (5, 1)))
-    seen = sensor.corrected(event)
-    D, start, h = sensor.sensitivity(seen.points - seen.sensor), sensor.values, 1e-6
-    for column, unit in enumerate(np.eye(len(start))):
-        sensor.set(start + h * unit)
-        after = sensor.corrected(event).points
-        sensor.set(start - h * unit)
-        differences = (after - sensor.corrected(event).points) / (2.0 * h)
+    seen, h = sensing.corrected(calibration, settings, event), 1e-6
+    D = sensing.point_sensitivity(calibration, seen, seen.points)
+    for column, unit in enumerate(np.eye(calibration.count)):
+        calibration.shift(h * unit)
+        after = sensing.corrected_again(calibration, seen).points
+        calibration.shift(-2.0 * h * unit)
+        differences = (after - sensing.corrected_again(calibration, seen).points) / (2.0 * h)
+        calibration.shift(h * unit)
         k = 2 if settings.two_d_mode else 3
         np.testing.assert_allclose(D[:, :k, column], differences[:, :k], atol=1e-8)
 
@@ -107,18 +115,18 @@ def test_a_depth_becomes_the_range_that_it_is_of(rng):
         ranges = np.linalg.norm(points, axis=1)
         shown = points * (along / ranges / 1.1)[:, None]
         event = ObservationEvent(1, np.arange(6), shown, sensor_axis=axis)
-        sensor = SensorCalibration('', 0, settings, axes_of(False))
-        np.testing.assert_allclose(sensor.corrected(event).points, points, atol=1e-12)
+        seen = sensing.corrected(calibrated(settings), settings, event)
+        np.testing.assert_allclose(seen.points, points, atol=1e-12)
 
 
 @given(rng=generators())
 def test_what_a_message_states_turns_and_grows_with_the_point(rng):
     settings = Settings(range_scale=1.5, sensor_rotation_stddev=(0.1, 0.1, 0.1))
-    sensor = SensorCalibration('', 0, settings, axes_of(False))
-    sensor.set(np.array([0.0, 0.0, math.pi / 2]))
+    calibration = calibrated(settings)
+    calibration.shift(np.array([0.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2])[-calibration.count :])
     own = np.diag([0.04, 0.01, 0.01])
     event = observation(rng, covariances=np.tile(own, (5, 1, 1)), velocities=np.eye(3)[[0] * 5])
-    seen = sensor.corrected(event)
+    seen = sensing.corrected(calibration, settings, event)
     expected = 1.5**2 * np.diag([0.01, 0.04, 0.01])
     np.testing.assert_allclose(seen.covariances[0], expected, atol=1e-12)
     np.testing.assert_allclose(seen.velocities[0], [0.0, 1.0, 0.0], atol=1e-12)
@@ -169,9 +177,8 @@ def test_the_range_scale_is_not_biased_by_noise(monkeypatch):
     assert abs(np.mean(off)) < 3.0 / math.sqrt(20)
 
     def at_the_point_measured(state, event, points=None):
-        return at_points(state, event)
+        return sensitivity(state, event)
 
-    at_points = sensing.sensitivity
     monkeypatch.setattr('slam_observer_ros.state.matching.sensitivity', at_the_point_measured)
     assert np.mean(range_scales(20)) < -6.0 / math.sqrt(20)
 
