@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -41,6 +41,12 @@ MAX_MEASURED = 1e6
 
 NEARLY = 1.0 - 1e-9
 """Of a limit: what is below that is below the limit, however it is rounded."""
+
+MAX_WEIGHED = 100
+"""Points of one observation that are weighed against landmarks without ids, at most.
+
+It takes the cube of them, and memory the square: a second and 100 MB by then.
+"""
 
 _INTEGERS = (int, np.int64)
 
@@ -306,6 +312,7 @@ def usable_points(
     event: ObservationEvent,
     settings: Settings,
     needs_ids: bool,
+    known_ids: IntArray,
     counts: Counter[str],
     warnings: EventWarnings,
 ) -> ObservationEvent:
@@ -324,8 +331,26 @@ def usable_points(
         repeated = np.isin(event.ids, repeated_ids)
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
-    if needs_ids and (unknown := event.ids == UNKNOWN_ID).any():
+    unknown = event.ids == UNKNOWN_ID
+    if needs_ids and np.count_nonzero(unknown):
         warnings.unknown_ids(settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)
+    elif not needs_ids and len(event.ids) > MAX_WEIGHED:
+        warnings.many_points(len(event.ids))
+        if unknown.any() or is_automatic(known_ids).any():
+            counts['unweighed_point'] += len(event.ids) - MAX_WEIGHED
+            warnings.unweighed_points(len(event.ids), MAX_WEIGHED)
+            event = event.select(_first_weighed(event, unknown))
     return event
+
+
+def _first_weighed(event: ObservationEvent, unknown: BoolArray) -> BoolArray:
+    """Return which points (m,) are weighed, where not all can be: with ids first, and the nearest.
+
+    The nearest are measured best, and are the same in the next observation.
+    """
+    order = np.lexsort((np.linalg.norm(event.lines_of_sight, axis=1), unknown))
+    weighed = np.zeros(len(order), dtype=np.bool_)
+    weighed[order[:MAX_WEIGHED]] = True
+    return weighed
