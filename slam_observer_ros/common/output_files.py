@@ -22,9 +22,19 @@ _MARK = '.unfinished-'
 _DIRECTORY_MARK = f'.slam_observer{_MARK}'
 
 
+def checked_name(path: Path) -> Path:
+    """Return a path, or raise an OSError where no file can have its name."""
+    try:
+        if b'\0' not in os.fsencode(path):
+            return path
+    except UnicodeEncodeError:
+        pass
+    raise OSError(errno.EINVAL, 'no file can have this name', str(path))
+
+
 def destination(path: Path) -> Path:
     """Return which file to replace for new content; links stay. What is no file is an OSError."""
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(checked_name(path)))
     if target.is_symlink() or (target.exists() and not target.is_file()):
         raise FileExistsError(errno.EEXIST, 'it is there, and no regular file', str(path))
     return target

@@ -114,6 +114,7 @@ class EventBuilder:
     def clear(self) -> None:
         """Drop what waits, as after a jump of the clock."""
         self._waiting.clear()
+        self._poses.clear()
 
     def _difference(self, message: PoseMessage) -> VelocityEvent | None:
         try:

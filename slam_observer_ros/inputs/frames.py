@@ -45,6 +45,9 @@ class TransformSource(Protocol):
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) of ``source`` in ``target``; TransformError if unknown then."""
 
+    def lookup_child(self, parent: str, child: str, stamp_ns: int) -> FloatArray:
+        """As ``lookup``, but what came with this parent, if others give the frame one, too."""
+
     def parent_of(self, frame: str) -> str | None:
         """Return the parent of a frame; None if it has none."""
 
@@ -126,10 +129,14 @@ class BaseFrame:
     def _tag_pose(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) of a tag in the camera's frame, under either of its names."""
         try:
-            return self._transforms.lookup(camera, f'{family}:{number}', stamp_ns)
-        except TransformError:
+            return self._transforms.lookup_child(camera, f'{family}:{number}', stamp_ns)
+        except TransformError as error:
+            reason = error
+        try:
             frame = f'{self._tag_frame_prefix}{number}'
-            return self._transforms.lookup(camera, frame, stamp_ns)
+            return self._transforms.lookup_child(camera, frame, stamp_ns)
+        except TransformError as error:
+            raise TransformError(f'{reason}; {error}') from error
 
 
 def _sensor_pose(values: Pose6) -> FloatArray | None:

@@ -2,7 +2,8 @@
 
 The semantics are tf2's: each frame has one parent, dynamic transforms are interpolated between
 their stamps and never extrapolated, static ones hold at all times. A slash that leads, as ROS 1
-had it, is ignored.
+had it, is ignored. Of a fiducial that several cameras see, and that has each of them as its parent
+in turn, what each has seen is kept, too.
 """
 
 from __future__ import annotations
@@ -80,7 +81,8 @@ class TransformBuffer:
     """A tree of frames over the last seconds."""
 
     def __init__(self) -> None:
-        self._tracks: dict[str, _Track] = {}
+        self._tracks: dict[str, _Track] = {}  # of each frame in its newest parent
+        self._of_parents: dict[tuple[str, str], _Track] = {}  # by parent and frame
         self._refused: set[str] = set()
 
     def insert(
@@ -91,9 +93,10 @@ class TransformBuffer:
         if parent == child:
             self.refuse(child, 'it is to the frame itself')
             return
-        track = self._tracks.get(child)
-        if track is None or track.parent != parent or track.is_static != is_static:
-            track = self._tracks[child] = _Track(parent, is_static)
+        track = self._of_parents.get((parent, child))
+        if track is None or track.is_static != is_static:
+            track = self._of_parents[parent, child] = _Track(parent, is_static)
+        self._tracks[child] = track
         track.insert(stamp_ns, pose)
 
     def refuse(self, child: str, reason: str) -> None:
@@ -105,11 +108,18 @@ class TransformBuffer:
     def clear(self) -> None:
         """Forget what has a time, as after a jump of the clock; static transforms stay."""
         self._tracks = {child: track for child, track in self._tracks.items() if track.is_static}
+        self._of_parents = {(track.parent, child): track for child, track in self._tracks.items()}
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) of ``source`` in ``target``; TransformError if unknown then."""
         target_chain, source_chain = self._chains(target, source)
         return se3.inverse(self._pose(target_chain, stamp_ns)) @ self._pose(source_chain, stamp_ns)
+
+    def lookup_child(self, parent: str, child: str, stamp_ns: int) -> FloatArray:
+        """As :meth:`lookup`, but what came with this parent, if others give the frame one, too."""
+        track = self._of_parents.get((parent.lstrip('/'), child.lstrip('/')))
+        pose = None if track is None else track.pose_at(stamp_ns)
+        return self.lookup(parent, child, stamp_ns) if pose is None else pose
 
     def parent_of(self, frame: str) -> str | None:
         """Return the parent of a frame; None if it has none."""

@@ -38,6 +38,7 @@ from slam_observer_ros.common.yaml_files import (
     FAST_LOADER,
     load_yaml,
     plain_value,
+    refuse_special,
 )
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
@@ -138,8 +139,7 @@ def read_map(path: Path) -> LandmarkMap:
     the reason.
     """
     try:
-        if path.exists() and not path.is_file():  # reading it might never end
-            raise MapError(f"can't read map {path}: it is no regular file")
+        refuse_special(path)
         content = load_yaml(path, MAX_BYTES, _plain_value, FAST_LOADER)
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error

@@ -12,11 +12,12 @@ import yaml
 from slam_observer_ros.common.errors import MapError, YamlError
 from slam_observer_ros.common.output_files import unfinished_file
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.yaml_files import load_yaml, plain_value
+from slam_observer_ros.common.yaml_files import load_yaml, plain_value, refuse_special
 from slam_observer_ros.geometry import se3, so3
 
 FORMAT = 'slam_observer_ros pose'
 MAX_BYTES = 10_000
+MAX_NUMBER = 1e12
 SIZES = {'position': 3, 'orientation': 4, 'covariance': 36}
 
 
@@ -51,6 +52,7 @@ def write_pose(path: Path, stored: StoredPose) -> None:
 def read_pose(path: Path) -> StoredPose:
     """Read the file; MapError if it can't be read, or is no such file."""
     try:
+        refuse_special(path)
         content = load_yaml(path, MAX_BYTES, plain_value)
     except OSError as error:
         raise MapError(f"can't read the pose {path}: {error.strerror}") from error
@@ -75,7 +77,10 @@ def read_pose(path: Path) -> StoredPose:
 def _numbers(path: Path, content: dict[str, Any], name: str, size: int) -> FloatArray:
     written = content.get(name)
     numbers = written if isinstance(written, list) else []
-    are_finite = all(type(each) in (int, float) and np.isfinite(each) for each in numbers)
-    if len(numbers) != size or not are_finite:
-        raise MapError(f"the pose {path}: '{name}' is not {size} finite numbers")
+    # NaN is within no bounds, and an int may have more digits than any array takes.
+    are_usable = all(type(each) in (int, float) and abs(each) <= MAX_NUMBER for each in numbers)
+    if len(numbers) != size or not are_usable:
+        raise MapError(
+            f"the pose {path}: '{name}' is not {size} finite numbers, {MAX_NUMBER:g} at most"
+        )
     return np.array(numbers, dtype=np.float64)

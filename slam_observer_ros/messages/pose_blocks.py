@@ -74,8 +74,11 @@ _DECODERS: dict[str, Callable[[CdrBlockReader], PoseBlock]] = {
 def decode_poses(message_type: str, data: NDArray[np.uint8]) -> PoseBlock:
     """Decode messages (k, size) of a type.
 
-    Raise a :class:`MessageError` if one is malformed, or they do not have all in common.
+    Raise a :class:`MessageError` if one is malformed, or they do not have all in common, or no
+    blocks of the type are read.
     """
+    if message_type not in _DECODERS:
+        raise MessageError(f'{message_type} is read one by one')
     reader = CdrBlockReader(data)
     block = _DECODERS[message_type](reader)
     reader.finish()

@@ -61,7 +61,7 @@ BLOCK_DECODERS: dict[str, BlockDecoder] = {
     'geometry_msgs/msg/Twist': _twists,
     ODOMETRY: _odometry,
 }
-"""By the type of the messages."""
+"""By the type of the messages; those of other types are decoded one by one."""
 
 
 def _read_twists(reader: CdrBlockReader) -> FloatArray:

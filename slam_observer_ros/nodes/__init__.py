@@ -5,6 +5,6 @@ for signals from the first instant, and load ``plain_observer``, ``managed_obser
 ``simulator``. Both observers are shells around ``observer_core``, which joins ``intake/`` (topics
 to the estimator), ``publishing/`` (the estimate to topics) and ``services/``. ``demo/`` runs the
 simulator with the observer. For all there are ``stop_signal`` and ``runner`` (start and stop),
-``ros_parameters``, ``log_bridge``, ``throttled_log``, ``qos``, ``message_classes`` and
-``entities`` (what a managed node destroys again).
+``guarded_node`` (what callbacks raise), ``ros_parameters``, ``log_bridge``, ``throttled_log``,
+``qos``, ``message_classes`` and ``entities`` (what a managed node destroys again).
 """

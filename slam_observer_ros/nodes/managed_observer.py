@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -46,38 +47,27 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Create all parts."""
         entities = Entities(self)
-        try:
-            period_s = read_settings(self, ManagedNodeSettings).bond_heartbeat_period
-            self._bond = LifecycleBond(self, period_s)
-            self._core = ObserverCore(self)
-        except SlamObserverError as error:
+        outcome = self._attempt(self._create, 'not configured: ')
+        if outcome != TransitionCallbackReturn.SUCCESS:
             entities.remove_new()
-            self.get_logger().error(f'not configured: {error}')
-            return TransitionCallbackReturn.FAILURE
-        return TransitionCallbackReturn.SUCCESS
+        return outcome
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to estimate and to publish, or go on."""
-        if self._core is not None and self._bond is not None:
-            self._core.start()
-            self._bond.start()
-        return TransitionCallbackReturn.SUCCESS
+        return self._attempt(self._start)
 
     def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the estimate."""
-        if self._core is not None and self._bond is not None:
-            self._bond.end()
-            self._core.stop()
-        return TransitionCallbackReturn.SUCCESS
+        return self._attempt(self._stop)
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Save the map if that was asked for, and forget all."""
-        self._close_and_log()
+        self._attempt(self._close)
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Save the map if that was asked for, and end for good."""
-        self._close_and_log()
+        self._attempt(self._close)
         return TransitionCallbackReturn.SUCCESS
 
     def end_in_haste(self) -> int | None:
@@ -112,12 +102,32 @@ class LifecycleObserverNode(RepeatableParameters, LifecycleNode):  # type: ignor
 
         service.callback = change_if_possible
 
-    def _close_and_log(self) -> None:
-        """Close the core; a map that can't be saved keeps no transition from being made."""
+    def _attempt(self, act: Callable[[], None], says: str = '') -> TransitionCallbackReturn:
+        """Do a part of a transition; log why it fails, of which rclpy says nothing."""
         try:
-            self._close()
+            act()
         except SlamObserverError as error:
-            self.get_logger().error(str(error))
+            self.get_logger().error(f'{says}{error}')
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:  # noqa: BLE001
+            self.note_failure(error, f'{says}a transition')
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _create(self) -> None:
+        period_s = read_settings(self, ManagedNodeSettings).bond_heartbeat_period
+        self._bond = LifecycleBond(self, period_s)
+        self._core = ObserverCore(self)
+
+    def _start(self) -> None:
+        if self._core is not None and self._bond is not None:
+            self._core.start()
+            self._bond.start()
+
+    def _stop(self) -> None:
+        if self._core is not None and self._bond is not None:
+            self._bond.end()
+            self._core.stop()
 
     def _close(self) -> None:
         bond, self._bond = self._bond, None

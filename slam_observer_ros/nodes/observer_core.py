@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -16,6 +17,7 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.nodes.entities import Entities
+from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
@@ -53,7 +55,7 @@ class ObserverCore:
     can't be used.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: GuardedNode) -> None:
         self._node = node
         self._entities = Entities(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
@@ -107,7 +109,7 @@ class ObserverCore:
                 min_backward=Duration(nanoseconds=-CLOCK_JITTER_NS),
                 on_clock_change=False,
             ),
-            post_callback=self._on_clock_jump,
+            post_callback=node.guarded(self._on_clock_jump, 'a jump of the clock'),
         )
         changed = len(changed_names(estimator_settings)) + len(changed_names(settings))
         node.get_logger().info(
@@ -140,7 +142,6 @@ class ObserverCore:
             self._maps.save_at_end()
         finally:
             self._jump_handle.unregister()
-            self._node.remove_post_set_parameters_callback(self._apply_parameters)
             self._entities.remove_new()
 
     def end_in_haste(self) -> int | None:
@@ -167,6 +168,13 @@ class ObserverCore:
         ]
 
     def _check(self) -> None:
+        if not np.isfinite(self._estimator.pose).all():
+            self._node.get_logger().error(
+                'the estimate is not finite any more, as after numbers that are far too large: '
+                'starting again'
+            )
+            self._estimator.reset()
+            self._publisher.reset()
         for source in self._inputs:
             source.check_publishers()
         self._localisation.publish()

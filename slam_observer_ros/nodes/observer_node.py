@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from slam_observer_ros.common.threads import use_one_thread
 from slam_observer_ros.nodes.stop_signal import StopSignal
 
 
 def main() -> int:
     """Run the node until it is asked to stop; return the exit code."""
     stop = StopSignal()  # before all else: what is imported here takes seconds
+    from slam_observer_ros.common.threads import use_one_thread
+
     use_one_thread()
     from slam_observer_ros.nodes.plain_observer import ObserverNode
     from slam_observer_ros.nodes.runner import run

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from slam_observer_ros.common.errors import ParameterError
+from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.settings.parameter_file import misplaced_sections, names_of_others
 from slam_observer_ros.settings.parameter_table import (
     Dataclass,
@@ -30,7 +31,7 @@ from slam_observer_ros.settings.parameter_table import (
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
 
-class RepeatableParameters(Node):  # type: ignore[misc]  # rclpy comes untyped
+class RepeatableParameters(GuardedNode):
     """A node where setting a parameter to the value that it has is no failure.
 
     rclpy refuses that for those that are read-only, which most of a dumped file are.
@@ -132,7 +133,8 @@ def _warn_of_misplaced(node: Node, names: Collection[str]) -> None:
     """Warn of files on the command line whose parameters have the name of another node."""
     full_name = node.get_fully_qualified_name()
     for option, path in pairwise(sys.argv):
-        if option != '--params-file':
+        # A pipe, as of a shell's <(...), has been read to its end by ROS: it would block.
+        if option != '--params-file' or not Path(path).is_file():
             continue
         try:
             sections = misplaced_sections(Path(path), full_name, names)

@@ -77,6 +77,7 @@ def run(
         return _spin(make_node, stop)
     finally:
         rclpy.try_shutdown()
+        stop.ignore()
 
 
 def _spin(make_node: Callable[[], Node], stop: StopSignal) -> int:

@@ -36,6 +36,11 @@ class StopSignal:
         os.set_blocking(write_end, False)
         signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
 
+    def ignore(self) -> None:
+        """Take no notice of further ones: the interpreter would end by them where it clears up."""
+        for number in self._numbers:
+            signal.signal(number, signal.SIG_IGN)
+
     def wait(self) -> None:
         """Wait for the first signal, in a thread, even while the main one computes."""
         os.read(self._read_end, 1)

@@ -22,6 +22,11 @@ class ThrottledLog:
         self._quiet_until_s = time.monotonic() + quiet_s
         self._next_s: dict[str, float] = {}
 
+    def error(self, subject: str, text: str) -> None:
+        """Log an error, unless there was one about the subject lately."""
+        if self._is_due(subject):
+            self._node.get_logger().error(text)
+
     def warning(self, subject: str, text: str) -> None:
         """Log a warning, unless there was one about the subject lately."""
         if self._is_due(subject):

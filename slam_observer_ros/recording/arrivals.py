@@ -76,6 +76,11 @@ class Arrivals:
         after_s = max(end_s - self.last_s - self._timeout_s, 0.0)
         return before_s + self._silence_s + after_s
 
+    @property
+    def ahead_s(self) -> float:
+        """How far the stamps are ahead of when they were received, seconds, in the median."""
+        return -float(np.median(self._delays_s)) if self._delays_s else 0.0
+
     def behind_s(self, other: Arrivals) -> float:
         """Return how far the stamps are behind those of another topic, seconds.
 

@@ -64,10 +64,10 @@ def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topi
 
 
 def block_decoder(selected: SelectedTopics, inputs: InputSettings) -> BlockDecoder | None:
-    """Return what decodes velocities in blocks; None if they are differences of poses."""
+    """Return what decodes velocities in blocks; None if they come one by one."""
     if inputs.velocity_source == POSE_DIFFERENCES:
         return None
-    return BLOCK_DECODERS[selected.velocity.message_type]
+    return BLOCK_DECODERS.get(selected.velocity.message_type)
 
 
 def decode_landmarks(raw: RawMessage) -> Measurement[ObservationEvent]:

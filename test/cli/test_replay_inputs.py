@@ -495,6 +495,7 @@ class TestTiming:
             ('/tags', 2.0, 'Stamps of /tags are 2.0 s ahead of those of /odom'),
             ('/tags', -2.0, 'Stamps of /tags are 2.0 s behind those of /odom'),
             ('/tags', 3600.0, 'Stamps of /tags are 3600.0 s ahead of those of /odom'),
+            ('/tags', 0.4, 'Stamps of /tags are 0.4 s ahead of those of /odom'),
             ('/imu/data', -2.0, 'Stamps of /imu/data are 2.0 s behind those of /odom'),
         ],
     )
@@ -503,6 +504,11 @@ class TestTiming:
         assert warnings.count('Stamps of') == 1
         assert expected in warnings
         assert 'correct_clock_offset' in warnings
+
+    def test_velocities_of_the_future(self, warnings_of):
+        warnings = warnings_of(ahead_s=[('/odom', 0.4), ('/tags', 0.4)])
+        assert "Stamps of /odom are 0.4 s ahead of the recorder's clock" in warnings
+        assert warnings.count('Stamps of') == 1
 
     def test_one_clock_that_is_slower_than_the_recorders_is_no_other(self, warnings_of):
         assert 'Stamps of' not in warnings_of(ends=[('/odom', 4.0)], slow_down=3.0)

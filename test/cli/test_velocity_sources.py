@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -43,8 +45,64 @@ def test_velocity_from_poses_leads_from_one_to_the_next(start):
 
 def test_poses_far_apart_or_in_wrong_order_give_no_velocity():
     differences = PoseDifferences(SECOND)
-    for stamp_ns in (SECOND, 3 * SECOND, 3 * SECOND, 2 * SECOND):
+    for stamp_ns in (SECOND, 3 * SECOND):
         assert differences.add(stamp_ns, np.eye(4)) is None
+    for stamp_ns in (3 * SECOND, SECOND // 2):
+        with pytest.raises(InvalidEventError) as raised:
+            differences.add(stamp_ns, np.eye(4))
+        assert raised.value.reason == 'skipped_pose'
+
+
+def driven(stamps_ns, poses):
+    """Return the pose that velocities made of poses lead to, each held until the next one."""
+    differences = PoseDifferences(SECOND)
+    used, end_ns = [], stamps_ns[0]
+    for stamp_ns, pose in zip(stamps_ns, poses, strict=True):
+        with suppress(InvalidEventError):
+            if (event := differences.add(stamp_ns, pose)) is not None:
+                used.append(event)
+                end_ns = stamp_ns
+    moved = poses[0]
+    ends_ns = [*(event.stamp_ns for event in used[1:]), end_ns]
+    for event, until_ns in zip(used, ends_ns, strict=True):
+        moved = moved @ se3.exp(event.body_velocity * (until_ns - event.stamp_ns) * 1e-9)
+    return moved, used
+
+
+BURST = 5
+STAMPS = {
+    'of a coarse clock': lambda k: k // 2 * 2,
+    'of a very coarse clock': lambda k: k // 7 * 7,
+    'in bursts': lambda k: k // BURST * BURST + k % BURST * 0.03,
+    'in bursts of one stamp': lambda k: k // BURST * BURST,
+    'one too late': lambda k: k + 1.2 * (k % 10 == 4),
+    'one far ahead': lambda k: k + 10_000 * (k == 57),
+    'jittering': lambda k: k + 0.3 * (-1) ** k,
+}
+
+
+@pytest.mark.parametrize('stamps', STAMPS)
+def test_no_motion_is_lost_and_no_speed_made_up_by_stamps(stamps):
+    count, period_ns = 200, 20_000_000
+    true = [se3.exp(V * k * 0.02) for k in range(count + 1)]
+    stamps_ns = [START_NS + round(STAMPS[stamps](k) * period_ns) for k in range(count)]
+    # One that is clearly later ends it.
+    moved, used = driven([*stamps_ns, START_NS + (count + BURST) * period_ns], true)
+    assert_allclose(moved, true[-1], atol=1e-9)
+    later = [event for event in used if event.stamp_ns > START_NS + 50 * period_ns]
+    assert max(np.linalg.norm(event.body_velocity[3:]) for event in later) < 2.6
+
+
+def test_poses_after_a_clock_was_set_back_lead_on_from_the_first_that_shows_it():
+    differences = PoseDifferences(SECOND)
+    assert differences.add(START_NS, np.eye(4)) is None
+    back_ns = START_NS - 60 * SECOND
+    for count in range(4):
+        with pytest.raises(InvalidEventError):
+            differences.add(back_ns + count * SECOND // 50, np.eye(4))
+    assert differences.add(back_ns + 4 * SECOND // 50, np.eye(4)) is None
+    event = differences.add(back_ns + 5 * SECOND // 50, se3.exp(V / 50))
+    assert_allclose(event.body_velocity, V, atol=1e-9)
 
 
 @pytest.mark.parametrize('rate_hz', [10, 50, 1000])
@@ -70,10 +128,6 @@ def test_what_a_robot_can_do_is_no_jump():
     assert_allclose(
         differences.add(START_NS + SECOND // 50, se3.exp(fast / 50)).body_velocity, fast, atol=1e-9
     )
-    # Two stamps may be nearly the same: it has moved nevertheless.
-    differences = PoseDifferences(SECOND)
-    differences.add(START_NS, np.eye(4))
-    assert differences.add(START_NS + 1000, se3.exp(V / 50)) is not None
 
 
 def wheels(time_s, velocity, covariance=None):
@@ -254,6 +308,22 @@ def test_when_this_machines_clock_has_jumped_the_offset_is_found_again():
         assert (clock.offset_ns, clock.correction_ns) == (None, 0)
         clock.add(1000 * SECOND + index, 1000 * SECOND + index)
     assert clock.offset_ns == 0
+
+
+@pytest.mark.parametrize(('ahead_s', 'is_simulated', 'is_off'), [
+    (0.4, False, True), (0.06, False, True), (0.03, False, False), (-0.4, False, False),
+    (0.4, True, False), (1.1, True, True),
+])  # fmt: skip
+def test_stamps_of_the_future_are_of_another_clock(ahead_s, is_simulated, is_off):
+    """A message can be late, but not early; /clock, though, only comes every now and then."""
+    clock = ClockOffset(SECOND)
+    for index in range(SAMPLES):
+        receive_ns = START_NS + index * SECOND
+        clock.add(receive_ns + round(ahead_s * SECOND), receive_ns, is_simulated)
+    assert clock.is_off == is_off
+    text = clock.problem("'/landmarks'", is_simulated)
+    assert (f"'/landmarks' are {ahead_s:.3f} s ahead of this machine's clock" in text) == is_off
+    assert clock.correction_ns == (-round(ahead_s * SECOND) if is_off else 0)
 
 
 @pytest.mark.parametrize('straggler_s', [5, -5])

@@ -47,6 +47,21 @@ def test_dynamic_transforms_are_interpolated(share):
     assert_allclose(found[:3, :3], se3.exp(share * xi)[:3, :3], atol=1e-8)
 
 
+@given(st.booleans())
+def test_of_a_fiducial_that_two_cameras_see_each_has_its_own_transform(at_once):
+    """Both name the same frame, which /tf gives one parent: that of whoever came last."""
+    buffer = TransformBuffer()
+    later_ns = SECOND + (0 if at_once else SECOND // 20)
+    for stamp_ns in (0, 1, 2):
+        for camera, seen_ns, x in (('left', SECOND, 1.0), ('right', later_ns, 2.0)):
+            pose = se3.exp(np.array([0.0, 0.0, 0.3, x + stamp_ns, 0.0, 0.0]))
+            buffer.insert(camera, 'tag36h11:1', seen_ns + stamp_ns, pose)
+    left = buffer.lookup_child('left', 'tag36h11:1', SECOND + 1)
+    right = buffer.lookup_child('right', 'tag36h11:1', later_ns + 1)
+    assert_allclose(left, se3.exp(np.array([0.0, 0.0, 0.3, 2.0, 0.0, 0.0])))
+    assert_allclose(right, se3.exp(np.array([0.0, 0.0, 0.3, 3.0, 0.0, 0.0])))
+
+
 def test_nothing_is_extrapolated_and_old_transforms_are_forgotten():
     buffer = TransformBuffer()
     buffer.insert('odom', 'base', SECOND, np.eye(4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -57,6 +58,9 @@ def test_a_pose_is_read_as_it_was_written(tmp_path):
         ('slam_observer_ros pose', 'another', 'has no line'),
         ('- 1.0\n- -2.0', '- 1.0\n- .nan', "'position' is not 3 finite numbers"),
         ('time: 1000000000.0', 'time: yesterday', "'time' is not 1 finite numbers"),
+        ('time: 1000000000.0', f'time: {10**23}', "'time' is not 1 finite numbers"),
+        ('- 0.04', f'- -{10**400}', "'covariance' is not 36 finite numbers"),
+        ('- 0.04', '- 1.0e+300', "'covariance' is not 36 finite numbers"),
         ('frame', '  frame', 'is not valid YAML'),
     ],
 )
@@ -68,6 +72,21 @@ def test_a_damaged_file_is_refused_with_the_reason(tmp_path, old, new, reason):
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(MapError, match=reason):
         read_pose(path)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize('name', ['pipe', 'folder', '/dev/zero', 'n' * 300])
+def test_what_can_be_no_file_neither_blocks_nor_ends_the_node(tmp_path, name):
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'folder').mkdir()
+    node = Mock()
+    settings = ObserverNodeSettings(pose_file=str(tmp_path / name))
+    part = KeptPose(node, settings, Estimator(Settings()))
+    part.restore()
+    part._estimator.add(VelocityEvent(1, np.zeros(6)))
+    part._estimator.release()
+    part.keep()
+    node.get_logger().warning.assert_called()
 
 
 def test_the_robot_starts_where_it_was(kept):

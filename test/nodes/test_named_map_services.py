@@ -27,11 +27,13 @@ def fixture_services(monkeypatch):
     monkeypatch.setitem(sys.modules, 'nav2_msgs', Mock())
     monkeypatch.setitem(sys.modules, 'nav2_msgs.srv', Mock())
     node, estimator = Mock(), Estimator(Settings())
-    NamedMapServices(node, MapServices(node, ObserverNodeSettings(), estimator, Mock()))
+    maps = MapServices(node, ObserverNodeSettings(), estimator, Mock())
+    NamedMapServices(node, maps)
     calls = {call.args[1]: call.args[2] for call in node.create_service.call_args_list}
     return SimpleNamespace(
         save=calls['~/save_map_to'],
         load=calls['~/load_map_from'],
+        maps=maps,
         estimator=estimator,
         log=node.get_logger.return_value,
     )
@@ -76,4 +78,23 @@ def test_without_nav2_there_are_the_plain_services_alone(monkeypatch):
 
 def test_urls_and_paths():
     assert path_of('file:///data/my%20hall.yaml') == '/data/my hall.yaml'
+    assert path_of('FILE://localhost/data/a#b?c.yaml') == '/data/a#b?c.yaml'
     assert path_of('~/hall.yaml') == '~/hall.yaml'
+    assert path_of('//[') == '//['
+
+
+@pytest.mark.parametrize(
+    'map_url',
+    [
+        'file:///srv/a%00b', 'file://[x/y', 'http://[::1', 'file:///srv/%ff', 'file://other/srv/x',
+        'file://', 'file:x', 'file://a?b', '~nobody_there/x', 'a\0b', '\ud800',
+        f'file:///{5000 * "a"}',
+    ],
+)  # fmt: skip
+def test_a_url_that_names_no_file_is_refused_and_nothing_is_saved(services, tmp_path, map_url):
+    services.maps.save_to = Mock(wraps=services.maps.save_to)
+    request = SimpleNamespace(map_url=map_url)
+    assert services.load(request, LOADED).result == LOADED.RESULT_MAP_DOES_NOT_EXIST
+    assert services.save(request, SimpleNamespace(result=None)).result is False
+    services.log.error.assert_called()
+    assert all(call.args[0] for call in services.maps.save_to.call_args_list)

@@ -262,6 +262,16 @@ def test_the_buffer_of_ros_is_used_where_it_is_installed(monkeypatch):
         TransformStamped(header=header, child_frame_id='odom'), 'default_authority'
     )
     transforms.on_transform.assert_called_once_with('map', 'odom', SECOND)
+    # tf2 would take the first of these alone.
+    for _ in range(2):
+        for number in (1, 2):
+            stamped = TransformStamped(header=MESSAGES.header(SECOND, f'cam{number}'))
+            stamped.child_frame_id = 'tag_7'
+            stamped.transform.translation.x = float(number)
+            fake.TransformListener.call_args.args[0].set_transform(stamped, 'default_authority')
+    for number in (1, 2):
+        pose = transforms.lookup_child(f'cam{number}', 'tag_7', SECOND)
+        assert_allclose(pose[:3, 3], [number, 0.0, 0.0])
 
 
 def test_the_nodes_own_transform_takes_no_other_ones_place():

@@ -279,7 +279,7 @@ class Publishing:
     """The status that diagnostics publish of an estimator's counts."""
 
     def __init__(self, *inputs, **estimate):
-        self.node = Mock()
+        self.node = Mock(last_failure='')
         self.node.get_name.return_value = 'observer_node'
         self.node.get_namespace.return_value = '/robot'
         self.node.get_clock.return_value.now.return_value.to_msg.return_value = Time()
@@ -294,7 +294,9 @@ class Publishing:
             dropped=Counter(), is_paused=False, clock_problems=list,
             take_mean_processing_ms=lambda: 0.0,
         )  # fmt: skip
-        self.estimate_publisher = SimpleNamespace(problem='', rivals=str, odometry_age_s=None)
+        self.estimate_publisher = SimpleNamespace(
+            problem='', rivals=str, early_odometry=str, odometry_age_s=None
+        )
         localisation = SimpleNamespace(status=lambda _hardware_id: DiagnosticStatus())
         parts = self.estimator, self.feed, inputs, self.estimate_publisher, localisation
         self.diagnostics = DiagnosticsPublisher(self.node, *parts, hardware_id='base_link')

@@ -101,6 +101,22 @@ def test_a_signal_while_it_starts_stops_a_node_cleanly(tmp_path, name, loaded):
     assert 'Traceback' not in node.output
 
 
+def test_a_signal_while_the_interpreter_clears_up_does_not_end_it(tmp_path):
+    """Python gives signals back to the system then, which ends the process by the next one."""
+    program = tmp_path / 'program.py'
+    program.write_text(
+        'import signal, sys\n'
+        'from slam_observer_ros.nodes.observer_node import main\n'
+        'code = main()\n'
+        'print([signal.getsignal(n) == signal.SIG_IGN for n in (signal.SIGINT, signal.SIGTERM)])\n'
+        'sys.exit(code)\n'
+    )
+    node = NodeProcess('observer_node', tmp_path / 'log', program=program)
+    node.wait_for_output('estimating')
+    assert node.stop() == 0, node.output
+    assert '[True, True]' in node.output
+
+
 @pytest.mark.parametrize('autosave', [False, True])
 def test_a_signal_within_a_long_observation_stops_a_node_in_time_with_its_map(
     ros, tmp_path, autosave

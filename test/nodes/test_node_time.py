@@ -319,6 +319,35 @@ def test_fiducials_have_the_clock_of_tf():
     ]
 
 
+def test_of_several_cameras_the_one_whose_clock_is_ahead_is_named():
+    robot = AnotherClock(0)
+    robot.node.get_clock.return_value.ros_time_is_active = False
+    for step in range(40):
+        received_ns = 1000 * SECOND + step * SECOND // 20
+        robot.send(received_ns)
+        event = ObservationEvent(received_ns + 2 * SECOND // 5, np.array([5]), np.ones((1, 3)))
+        robot.feed.add_observation(Measurement('base_link', event), received_ns)
+    said = "stamps on '/landmarks' in frame 'base_link' are 0.400 s ahead of this machine's clock"
+    (problem,) = robot.feed.clock_problems()
+    assert problem.startswith(said)
+    warned = [call.args[0] for call in robot.node.get_logger().warning.call_args_list]
+    assert sum("frame 'base_link' was 0.400 s ahead of" in text for text in warned) == 1
+
+
+def test_one_stamp_of_the_future_is_named_while_it_is_recent():
+    robot = AnotherClock(0)
+    robot.node.get_clock.return_value.ros_time_is_active = False
+    last_ns = robot.send_all()
+    assert robot.feed.clock_problems() == []
+    event = VelocityEvent(last_ns + SECOND, STILL)
+    robot.feed.add('twist', Measurement('', event), last_ns + SECOND // 10)
+    (problem,) = robot.feed.clock_problems()
+    assert problem.startswith("a stamp on '/twist' was 0.900 s ahead of this machine's clock")
+    for step in range(20):
+        robot.send(last_ns + 2 * SECOND + step * SECOND // 20)
+    assert robot.feed.clock_problems() == []
+
+
 def test_until_the_offset_of_its_clock_is_known_what_an_input_says_is_dropped_and_counted():
     robot = AnotherClock(100 * SECOND, correct_clock_offset=True)
     robot.send_all()

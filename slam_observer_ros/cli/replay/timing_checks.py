@@ -12,6 +12,9 @@ from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 MAX_CLOCK_OFFSET_S = ObserverNodeSettings.max_clock_offset
 
+MAX_AHEAD_S = 0.05
+"""A message can be late, but not early."""
+
 MAX_SILENCE = 0.1
 """Share of the time beyond which velocities that are missing are more than a pause."""
 
@@ -73,11 +76,17 @@ def _warn_of_landmarks_end(
 
 
 def _warn_of_clocks(inputs: Mapping[str, Arrivals]) -> None:
-    """Say which inputs have stamps that are far from those of the first, the velocity's."""
+    """Say which inputs have stamps of the future, or far from those of the velocity."""
     (first_name, first), *others = inputs.items()
+    if first.ahead_s > MAX_AHEAD_S:
+        logger.warning(
+            "Stamps of %s are %.1f s ahead of the recorder's clock: synchronise the clocks.",
+            first_name, first.ahead_s,
+        )  # fmt: skip
     for name, arrivals in others:
         behind_s = arrivals.behind_s(first)
-        if abs(behind_s) > MAX_CLOCK_OFFSET_S:
+        is_early = min(arrivals.ahead_s, -behind_s) > MAX_AHEAD_S
+        if is_early or abs(behind_s) > MAX_CLOCK_OFFSET_S:
             logger.warning(
                 'Stamps of %s are %.1f s %s those of %s, by when both were received: synchronise '
                 'the clocks; a node with correct_clock_offset takes this recording, played with '

@@ -11,8 +11,15 @@ SAMPLES = 11
 """Messages whose median offset is looked at: five stragglers in a row change nothing."""
 
 
+FUTURE_NS = 50_000_000
+"""Stamps that are further ahead of their reception can only be of another clock, nanoseconds."""
+
+
 class ClockOffset:
-    """Offset of the stamps of one publisher; beyond ``limit_ns`` they are of another clock.
+    """Offset of the stamps of one publisher, by which they may be of another clock.
+
+    Behind this machine's by more than ``limit_ns``, or ahead of it by ``FUTURE_NS``: a message can
+    be late, but not early.
 
     Attributes
     ----------
@@ -25,7 +32,7 @@ class ClockOffset:
     """
 
     def __init__(self, limit_ns: int) -> None:
-        self._limit_ns = limit_ns
+        self._limit_ns = self._ahead_ns = limit_ns
         self._recent: deque[int] = deque(maxlen=SAMPLES)
         self.offset_ns: int | None = None
         self.correction_ns = 0
@@ -33,7 +40,7 @@ class ClockOffset:
     @property
     def is_off(self) -> bool:
         """Whether the stamps are from another clock."""
-        return self.offset_ns is not None and abs(self.offset_ns) > self._limit_ns
+        return self.offset_ns is not None and not self._is_near(self.offset_ns)
 
     def __str__(self) -> str:
         """Say how far off the stamps are."""
@@ -42,28 +49,38 @@ class ClockOffset:
         return f"{to_s(abs(offset_ns)):.3f} s {side} this machine's clock"
 
     def problem(self, topic: str, is_simulated: bool) -> str:
-        """Report how far off the stamps on a topic are; empty if they are right.
+        """Report how far off the stamps on a topic are, or one of late; empty if they are right.
 
         ``is_simulated``: this machine's clock is /clock.
         """
-        if not self.is_off:
-            return ''
         advice = 'synchronise the clocks, or set use_sim_time (for a recording)'
         if is_simulated:
             advice = 'see whether their publisher uses /clock, and this machine keeps up with it'
         late = ''
         if (self.offset_ns or 0) < 0:
             late = ', or what publishes them is that late: then make it faster; otherwise'
-        return f'stamps on {topic} are {self}{late or ":"} {advice}, or set correct_clock_offset'
+        if self.is_off:
+            what = f'stamps on {topic} are {self}{late or ":"}'
+            return f'{what} {advice}, or set correct_clock_offset'
+        ahead_ns = max(self._recent, default=0)
+        if ahead_ns > self._ahead_ns:
+            what = f"a stamp on {topic} was {to_s(ahead_ns):.3f} s ahead of this machine's clock"
+            return f'{what}: {advice}'
+        return ''
 
-    def add(self, stamp_ns: int, receive_ns: int) -> None:
-        """Take the stamp and the time of reception of a message."""
+    def add(self, stamp_ns: int, receive_ns: int, is_simulated: bool = False) -> None:
+        """Take the stamp and the time of reception of a message; by /clock if ``is_simulated``."""
+        # /clock stands still between two of its messages.
+        self._ahead_ns = self._limit_ns if is_simulated else min(FUTURE_NS, self._limit_ns)
         self._recent.append(stamp_ns - receive_ns)
         if len(self._recent) < SAMPLES:
             return
         self.offset_ns = median_low(self._recent)
-        if abs(self.offset_ns + self.correction_ns) > self._limit_ns:
+        if not self._is_near(self.offset_ns + self.correction_ns):
             self.correction_ns = -self.offset_ns if self.is_off else 0
+
+    def _is_near(self, offset_ns: int) -> bool:
+        return -self._limit_ns <= offset_ns <= self._ahead_ns
 
     def clear(self) -> None:
         """Forget all offsets, as after a jump of this machine's clock."""

@@ -29,6 +29,7 @@ from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.point_clouds import scan_problem
+from slam_observer_ros.nodes.guarded_node import described
 from slam_observer_ros.nodes.intake.clock_change import ClockChange
 from slam_observer_ros.nodes.intake.clock_offset import ClockOffset
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
@@ -41,6 +42,10 @@ SOURCES: dict[type[Event], str] = {
     ObservationEvent: 'landmarks',
 }
 """Inputs by the events that come of them; each has stamps of a clock of its own."""
+
+
+MAX_SENSORS = 100
+"""Frames whose clocks are looked at: somebody may publish under ever new names."""
 
 
 class EstimatorFeed:
@@ -87,6 +92,8 @@ class EstimatorFeed:
         self.clocks = {
             name: ClockOffset(to_ns(settings.max_clock_offset)) for name in SOURCES.values()
         }
+        # By input and frame: each camera's machine may have another time.
+        self._sensor_clocks: dict[tuple[str, str], ClockOffset] = {}
         # As they are after remapping, for the log.
         self._topics = {name: f"'{node.resolve_topic_name(name)}'" for name in self.clocks}
         if settings.landmarks_type == ON_TF:
@@ -136,7 +143,7 @@ class EstimatorFeed:
 
     def _use(self, name: str, measured: Measured, receive_ns: int) -> None:
         timed = with_receive_time(measured, receive_ns)
-        if not self._is_usable(name, timed.stamp_ns, receive_ns):
+        if not self._is_usable(name, timed, receive_ns):
             return
         if timed is not measured:
             reason = f'stamps are zero on {self._topics[name]}'
@@ -169,18 +176,19 @@ class EstimatorFeed:
     def clear(self) -> None:
         """Drop what waits, and what is known of clocks, as after a jump of the clock."""
         self._builder.clear()
-        for clock in self.clocks.values():
+        for clock in (*self.clocks.values(), *self._sensor_clocks.values()):
             clock.clear()
 
     def clock_problems(self) -> list[str]:
-        """Report the inputs with stamps of another clock that are not corrected."""
-        if self._settings.correct_clock_offset:
-            return []
-        return [
-            clock.problem(self._topics[name], self._is_simulated)
-            for name, clock in self.clocks.items()
-            if clock.is_off
-        ]
+        """Report the sensors with stamps of another clock that are not corrected."""
+        problems = [self._clock_problem(*sensor) for sensor in self._sensor_clocks]
+        return [problem for problem in problems if problem]
+
+    def _clock_problem(self, name: str, frame_id: str) -> str:
+        frames = [frame for other, frame in self._sensor_clocks if other == name]
+        whose = f" in frame '{frame_id}'" if len(frames) > 1 else ''
+        clock = self._sensor_clocks[name, frame_id]
+        return clock.problem(f'{self._topics[name]}{whose}', self._is_simulated)
 
     @property
     def _usable_from_ns(self) -> int:
@@ -203,7 +211,10 @@ class EstimatorFeed:
         # All before the first is used: if that shows a jump of the clock, offsets are forgotten.
         for event in [self._in_own_time(event) for event in events]:
             start_s = time.perf_counter()
-            self._estimator.add(event)
+            try:
+                self._estimator.add(event)
+            except Exception as error:  # noqa: BLE001  # whatever it is, the next one may be used
+                self._drop('internal_error', described(error))
             self._processing_s += time.perf_counter() - start_s
             self._processed += 1
         if events:
@@ -221,7 +232,7 @@ class EstimatorFeed:
         why = f"no transform to '{self._settings.base_frame}': " if is_unplaced else ''
         self._drop(drop_reason(error), f'{why}{error}')
 
-    def _is_usable(self, name: str, stamp_ns: int, receive_ns: int) -> bool:
+    def _is_usable(self, name: str, measured: Measured, receive_ns: int) -> bool:
         if not self.is_active:
             return False
         if self.is_paused:
@@ -230,22 +241,34 @@ class EstimatorFeed:
         if receive_ns == 0:
             self._drop('no_clock', 'use_sim_time is set and /clock has not begun')
             return False
-        self._check_clock(name, stamp_ns, receive_ns)
-        if self._settings.correct_clock_offset and self.clocks[name].offset_ns is None:
+        if not self._settings.correct_clock_offset:
+            self._check_clock(name, measured, receive_ns)
+            return True
+        self._follow_clock(name, measured.stamp_ns, receive_ns)
+        if self.clocks[name].offset_ns is None:
             self._drop('clock_unknown', f'the clock of {self._topics[name]} is not known yet')
             return False
         return True
 
-    def _check_clock(self, name: str, stamp_ns: int, receive_ns: int) -> None:
+    def _check_clock(self, name: str, measured: Measured, receive_ns: int) -> None:
         """Compare a stamp with this machine's clock, and report if that is another one."""
-        clock, topic = self.clocks[name], self._topics[name]
+        sensor = name, measured.frame_id
+        if sensor not in self._sensor_clocks:
+            if len(self._sensor_clocks) >= MAX_SENSORS:
+                return
+            self._sensor_clocks[sensor] = ClockOffset(to_ns(self._settings.max_clock_offset))
+        self._sensor_clocks[sensor].add(measured.stamp_ns, receive_ns, self._is_simulated)
+        if problem := self._clock_problem(*sensor):
+            self._log.warning(f'clock of {sensor}', problem)
+
+    def _follow_clock(self, name: str, stamp_ns: int, receive_ns: int) -> None:
+        """Find out by how much an input's stamps are to be corrected."""
+        clock = self.clocks[name]
         before_ns = clock.correction_ns
-        clock.add(stamp_ns, receive_ns)
-        if not self._settings.correct_clock_offset:
-            if clock.is_off:
-                self._log.warning(name, clock.problem(topic, self._is_simulated))
-        elif clock.correction_ns != before_ns:
+        clock.add(stamp_ns, receive_ns, self._is_simulated)
+        if clock.correction_ns != before_ns:
             outcome = 'corrected from now on' if clock.correction_ns else 'not corrected any more'
+            topic = self._topics[name]
             self._node.get_logger().info(f'stamps on {topic} are {clock}, and {outcome}')
 
     def _drop(self, reason: str, text: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 import re
 from typing import Any, Protocol
 
@@ -58,6 +59,7 @@ class TopicTransforms:
         self.is_own: Callable[[bytes], bool] = _is_of_another
         self._buffer = TransformBuffer()
         self.lookup = self._buffer.lookup
+        self.lookup_child = self._buffer.lookup_child
         self.newest_ns = self._buffer.newest_ns
         self.parent_of = self._buffer.parent_of
         self.clear = self._buffer.clear
@@ -99,7 +101,15 @@ class Tf2Transforms:
         self._insert = self._buffer.set_transform
         self._buffer.set_transform = self._set_transform
         self._listener = tf2_ros.TransformListener(self._buffer, node)
-        self.clear: Callable[[], None] = self._buffer.clear
+        # tf2 takes one transform a frame and stamp: of a fiducial that two cameras see at once,
+        # the first.
+        self._parents: dict[str, str] = {}
+        self._of_several = TransformBuffer()
+
+    def clear(self) -> None:
+        """As :meth:`TransformSource.clear`."""
+        self._buffer.clear()
+        self._of_several.clear()
 
     def _set_transform(self, stamped: Any, authority: str) -> None:
         """Take a transform from the listener, which gives the buffer all of /tf this way."""
@@ -107,6 +117,11 @@ class Tf2Transforms:
         stamp_ns = Time.from_msg(header.stamp).nanoseconds
         self.on_transform(header.frame_id, stamped.child_frame_id, stamp_ns)
         self._insert(stamped, authority)
+        parent, child = header.frame_id, stamped.child_frame_id
+        if self._parents.setdefault(child, parent) != parent:
+            self._parents[child] = ''
+        if not self._parents[child]:
+            self._of_several.insert(parent, child, stamp_ns, _pose_of(stamped))
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> FloatArray:
         """As :meth:`TransformSource.lookup`."""
@@ -114,10 +129,13 @@ class Tf2Transforms:
             stamped = self._buffer.lookup_transform(target, source, Time(nanoseconds=stamp_ns))
         except tf2_ros.TransformException as error:
             raise TransformError(str(error)) from error
-        position, q = stamped.transform.translation, stamped.transform.rotation
-        return pose_matrices(
-            np.array([position.x, position.y, position.z]), np.array([q.x, q.y, q.z, q.w])
-        )
+        return _pose_of(stamped)
+
+    def lookup_child(self, parent: str, child: str, stamp_ns: int) -> FloatArray:
+        """As :meth:`TransformSource.lookup_child`."""
+        with suppress(TransformError):
+            return self._of_several.lookup_child(parent, child, stamp_ns)
+        return self.lookup(parent, child, stamp_ns)
 
     def read_waiting(self) -> None:
         """As :meth:`LiveTransforms.read_waiting`."""
@@ -140,6 +158,14 @@ class Tf2Transforms:
         except tf2_ros.TransformException:
             return None
         return newest_ns or ALWAYS_NS  # tf2 has zero for what is static
+
+
+def _pose_of(stamped: Any) -> FloatArray:
+    """Return the pose (4, 4) of a TransformStamped."""
+    position, q = stamped.transform.translation, stamped.transform.rotation
+    return pose_matrices(
+        np.array([position.x, position.y, position.z]), np.array([q.x, q.y, q.z, q.w])
+    )
 
 
 def _ignore(_parent: str, _child: str, _stamp_ns: int) -> None:

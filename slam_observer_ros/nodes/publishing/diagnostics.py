@@ -8,7 +8,6 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
 
 from slam_observer_ros.estimates import (
     MAX_REJECTED,
@@ -18,6 +17,7 @@ from slam_observer_ros.estimates import (
 )
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import is_automatic
+from slam_observer_ros.nodes.guarded_node import GuardedNode
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher
@@ -48,7 +48,7 @@ class DiagnosticsPublisher:
 
     def __init__(
         self,
-        node: Node,
+        node: GuardedNode,
         estimator: Estimator,
         feed: EstimatorFeed,
         inputs: Sequence[InputTopic[Any]],
@@ -140,6 +140,7 @@ class DiagnosticsPublisher:
     def _warnings(self, dropped: Counter[str], new: Counter[str]) -> list[str]:
         warnings = [self._input_warning(source) for source in self._inputs]
         warnings += self._feed.clock_problems()
+        warnings.append(self._estimate_publisher.early_odometry())
         warnings.append(self._estimate_publisher.rivals())
         if self._feed.is_paused:
             warnings.append('paused')
@@ -153,6 +154,7 @@ class DiagnosticsPublisher:
         warnings += self._rejection_warnings(new)
         warnings += estimator_warnings(self._estimator)
         warnings.append(self._estimate_publisher.problem)
+        warnings.append(self._node.last_failure)
         if not self._estimator.is_localised:
             warnings.append('the pose in the loaded map is not known yet: no pose is published')
             warnings.append(self._ids_warning())

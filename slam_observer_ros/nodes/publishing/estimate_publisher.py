@@ -16,6 +16,7 @@ from slam_observer_ros.common.clock_jumps import is_due
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS
 from slam_observer_ros.messages.cloud_fields import FLOAT32_ID_LIMIT
 from slam_observer_ros.messages.estimate_messages import EstimateMessages, PATH_SPACING_NS
 from slam_observer_ros.messages.outgoing import encode_point_cloud
@@ -39,6 +40,10 @@ TOPICS = (
     'markers',
 )
 """Topics of the estimate, before remapping."""
+
+
+MAX_AHEAD_S = 0.25
+"""Odometry on /tf may be post-dated a little, so that it holds until the next one."""
 
 
 class EstimatePublisher:
@@ -93,10 +98,23 @@ class EstimatePublisher:
     def odometry_age_s(self) -> float | None:
         """Age of the newest odometry on /tf, seconds; None if there is none."""
         newest_ns = None if self._broadcaster is None else self._broadcaster.odometry_ns()
-        if newest_ns is None:
+        if newest_ns in (None, ALWAYS_NS):
             return None
         now_ns: int = self._node.get_clock().now().nanoseconds
         return to_s(now_ns - newest_ns)
+
+    def early_odometry(self) -> str:
+        """Report, and log, that the odometry on /tf is of the future; empty if it is not."""
+        age_s = self.odometry_age_s
+        if age_s is None or age_s > -MAX_AHEAD_S:
+            return ''
+        odom_frame, base_frame = self._settings.odom_frame, self._settings.base_frame
+        text = (
+            f"'{odom_frame}' to '{base_frame}' on /tf is {-age_s:.3f} s ahead of this machine's "
+            'clock: synchronise the clocks of what publishes it'
+        )
+        self._log.warning('early odometry', text)
+        return text
 
     def rivals(self) -> str:
         """Report other publishers of the odometry; empty if there are none. It is logged, too."""

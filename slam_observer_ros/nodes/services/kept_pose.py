@@ -10,7 +10,7 @@ from rclpy.node import Node
 from slam_observer_ros.common.errors import SlamObserverError
 from slam_observer_ros.estimator.estimator import Estimator, GIVEN_POSE_STD
 from slam_observer_ros.known_map.pose_file import read_pose, StoredPose, write_pose
-from slam_observer_ros.nodes.services.map_services import absolute
+from slam_observer_ros.nodes.services.map_services import absolute, is_there
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
@@ -31,7 +31,7 @@ class KeptPose:
 
     def restore(self) -> None:
         """Set the robot to the kept pose, if there is one that may be right."""
-        if self._path is None or not self._path.exists():
+        if self._path is None or not is_there(self._path):
             return
         try:
             stored = read_pose(self._path)

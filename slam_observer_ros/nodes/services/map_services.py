@@ -14,6 +14,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.common.errors import MapError, ParameterError, SlamObserverError
+from slam_observer_ros.common.output_files import checked_name
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import check_writable, read_map, write_map
@@ -76,7 +77,6 @@ class MapServices:
 
         Events that are held back count as far as that is quick: launch waits for five seconds.
         """
-        self._node.remove_on_set_parameters_callback(self._check_changes)
         if self._autosave:
             self._estimator.release(END_S)
         with self._end:
@@ -151,7 +151,7 @@ class MapServices:
             )
 
     def _is_another(self, path: Path) -> bool:
-        return path not in self._own_files and path.exists()
+        return path not in self._own_files and is_there(path)
 
     def _answer_save(
         self, _request: Trigger.Request, response: Trigger.Response
@@ -238,9 +238,19 @@ def _backup(path: Path) -> Path:
     return path.with_name(f'{path.name}~')
 
 
-def absolute(path: str) -> Path:
-    """Return a path with ~ expanded; ParameterError where there is no such user."""
+def is_there(path: Path) -> bool:
+    """Return whether there is such a file, as far as one may look."""
     try:
-        return Path(path).expanduser().absolute()
+        return path.exists()
+    except OSError:  # its name is too long, for example
+        return False
+
+
+def absolute(path: str) -> Path:
+    """Return a path with ~ expanded; ParameterError where there is no such user, or file name."""
+    try:
+        return checked_name(Path(path).expanduser().absolute())
     except RuntimeError as error:  # of a user that there is none of
         raise ParameterError(f"can't find {path}: {error}") from error
+    except OSError as error:
+        raise ParameterError(f"can't find {path!r}: {error.strerror}") from error

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import importlib
+import re
 from typing import Any
-from urllib.parse import unquote, urlparse
+from urllib.parse import unquote
 
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from slam_observer_ros.common.errors import MapError, SlamObserverError
-from slam_observer_ros.nodes.services.map_services import absolute, MapServices
+from slam_observer_ros.nodes.services.map_services import absolute, is_there, MapServices
+
+_FILE_URL = re.compile('file:(?://(?:localhost)?)?(/(?!/).*)', re.IGNORECASE | re.DOTALL)
 
 SAVE, LOAD = '~/save_map_to', '~/load_map_from'
 
@@ -56,15 +59,19 @@ class NamedMapServices:
 
 def _is_there(map_url: str) -> bool:
     try:
-        return absolute(path_of(map_url)).exists()
+        return is_there(absolute(path_of(map_url)))
     except SlamObserverError:
         return False
 
 
 def path_of(map_url: str) -> str:
     """Return the path that a URL of a file, or a plain path, names; MapError for another URL."""
-    parts = urlparse(map_url)
-    path = unquote(parts.path) if parts.scheme == 'file' else map_url
-    if '://' in path:
+    if '://' not in map_url and not map_url.lower().startswith('file:'):
+        return map_url
+    url = _FILE_URL.fullmatch(map_url)
+    if url is None:
         raise MapError(f"map_url takes a path or a file:// URL, not '{map_url}'")
-    return path
+    try:
+        return unquote(url[1], errors='strict')
+    except UnicodeDecodeError as error:
+        raise MapError(f"map_url '{map_url}' is not UTF-8") from error

@@ -1,0 +1,115 @@
+"""A node that nothing ends which comes in: what a callback raises is said, and it goes on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from functools import wraps
+import traceback
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
+
+
+class GuardedNode(Node):  # type: ignore[misc]  # rclpy comes untyped
+    """A node whose callbacks may fail: rclpy would end the process.
+
+    Attributes
+    ----------
+    failures : Counter
+        How often callbacks have failed, by what they were called for.
+    last_failure : str
+        What the last one has raised, and where; empty before the first.
+
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.failures: Counter[str] = Counter()
+        self.last_failure = ''
+        self._failure_log = ThrottledLog(self)
+        super().__init__(*args, **kwargs)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **kwargs: Any
+    ) -> Any:
+        """Create a subscription whose callback may fail: the message is not used then."""
+        guarded = self.guarded(callback, f"a message on '{topic}'")
+        return super().create_subscription(msg_type, topic, guarded, *args, **kwargs)
+
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[..., None], *args: Any, **kwargs: Any
+    ) -> Any:
+        """Create a timer whose callback may fail: it is called again a period later."""
+        what = f'the timer of {callback.__qualname__}'
+        return super().create_timer(
+            timer_period_sec, self.guarded(callback, what), *args, **kwargs
+        )
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Any:
+        """Create a service whose callback may fail: the response says so."""
+
+        @wraps(callback)
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except Exception as error:  # noqa: BLE001
+                text = self.note_failure(error, f"a call of '{srv_name}'")
+                return _refusal(request, srv_type.Response(), text)
+
+        return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
+
+    def guarded(self, callback: Callable[..., None], what: str) -> Callable[..., None]:
+        """Return a callback that notes what the given one raises, when called for ``what``."""
+
+        @wraps(callback)
+        def call(*args: Any) -> None:
+            try:
+                callback(*args)
+            except Exception as error:  # noqa: BLE001
+                self.note_failure(error, what)
+
+        return call
+
+    def note_failure(self, error: Exception, what: str) -> str:
+        """Count and log what was raised by what is called for ``what``; return it as a text.
+
+        While the node is being shut down, which may end anything, it is raised again.
+        """
+        if not self.context.ok():
+            raise error
+        self.failures[what] += 1
+        self.last_failure = f'{what} failed: {described(error)}'
+        self._failure_log.error(
+            f'{what} {type(error)}',
+            f'{self.last_failure} ({self.failures[what]} so far): please report this',
+        )
+        return self.last_failure
+
+
+def described(error: Exception) -> str:
+    """Return what kind of error it is, what it says, and where it was raised, in one line."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    text = ' '.join(str(error).split())
+    return f'{type(error).__name__}: {text} ({frame.name}, {frame.filename}:{frame.lineno})'
+
+
+def _refusal(request: Any, response: Any, text: str) -> Any:
+    """Return a response that says, as far as its type can, that the request was not done."""
+    result = SetParametersResult(successful=False, reason=text)
+    fields = {
+        'success': False,
+        'message': text,
+        'result': getattr(response, 'RESULT_INDEFINITE_FAILURE', None),  # of nav2_msgs
+        'results': [result for _ in getattr(request, 'parameters', ())],
+    }
+    if isinstance(getattr(response, 'result', None), SetParametersResult):
+        fields['result'] = result
+    for name, value in fields.items():
+        if value is not None and hasattr(response, name):
+            setattr(response, name, value)
+    return response
