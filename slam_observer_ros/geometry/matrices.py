@@ -60,13 +60,24 @@ def solve(S: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(solution, dtype=np.float64)
 
 
+def solve_symmetric(S: FloatArray, right: FloatArray) -> FloatArray:
+    """Return S⁻¹ b (…, q, k) or (q,), of S (…, q, q) that is positive but for rounding."""
+    try:
+        return np.asarray(np.linalg.solve(S, right), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.solve(definite(S), right), dtype=np.float64)
+
+
 def solve_definite(S: FloatArray, right: FloatArray) -> FloatArray:
     """Return S⁻¹ b for a symmetric, positive definite S (q, q) and b (q, …)."""
     if right.size and len(S) <= VERY_LARGE:
         _, solution, is_indefinite = dposv(S, right)
         if not is_indefinite:
             return np.asarray(solution, dtype=np.float64)
-    return solve(S, right)  # what rounding has made indefinite, too
+    try:
+        return solve(S, right)  # what rounding has made indefinite, too
+    except np.linalg.LinAlgError:
+        return solve(definite(S), right)
 
 
 def cholesky(S: FloatArray) -> FloatArray:
@@ -97,7 +108,10 @@ def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
     That is (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, with S = C P Cᵀ + R: P stays positive
     but for rounding.
     """
-    K: FloatArray = solve(S, CP).T
+    try:
+        K: FloatArray = solve(S, CP).T
+    except np.linalg.LinAlgError:
+        K = solve(definite(S), CP).T
     half = K @ (0.5 * S @ K.T - CP)
     P += half + half.T
     return K
@@ -105,10 +119,7 @@ def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
 
 def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return √(r_iᵀ Σ_i⁻¹ r_i) (m,) of residuals (m, k) with covariances (m, k, k)."""
-    try:
-        whitened = np.linalg.solve(covariances, r[:, :, None])
-    except np.linalg.LinAlgError:
-        whitened = np.linalg.solve(definite(covariances), r[:, :, None])
+    whitened = solve_symmetric(covariances, r[:, :, None])
     squared = np.einsum('ij,ij->i', r, whitened[:, :, 0])
     return np.asarray(np.sqrt(np.maximum(squared, 0.0)))  # < 0 where rounding has made them so
 
