@@ -29,6 +29,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.known_map.map_file import MAX_NUMBER
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
+from slam_observer_ros.state.landmark_table import LandmarkTable
 
 ROTATION_TOLERANCE = 1e-3
 """How far RᵀR of a pose may be from identity: much further than single precision puts it."""
@@ -312,7 +313,7 @@ def usable_points(
     event: ObservationEvent,
     settings: Settings,
     needs_ids: bool,
-    known_ids: IntArray,
+    landmarks: LandmarkTable,
     counts: Counter[str],
     warnings: EventWarnings,
 ) -> ObservationEvent:
@@ -338,7 +339,7 @@ def usable_points(
         event = event.select(~unknown)
     elif not needs_ids and len(event.ids) > MAX_WEIGHED:
         warnings.many_points(len(event.ids))
-        if unknown.any() or is_automatic(known_ids).any():
+        if unknown.any() or is_automatic(landmarks.ids).any():
             counts['unweighed_point'] += len(event.ids) - MAX_WEIGHED
             warnings.unweighed_points(len(event.ids), MAX_WEIGHED)
             event = event.select(_first_weighed(event, unknown))

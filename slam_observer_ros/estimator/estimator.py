@@ -47,7 +47,7 @@ from slam_observer_ros.state.step import Outcome
 logger = logging.getLogger(__name__)
 
 DIVERGED_M = 1e9
-"""Distance from the start, or standard deviation of a pose, metres, that no estimate has."""
+"""Distance from the start, metres, that no estimate has."""
 
 GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 """Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
@@ -493,15 +493,13 @@ class Estimator:
             self._warnings.late_velocity()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        needs_ids = not self._state.filter.has_joint_covariance
-        known_ids = self._state.landmarks.ids
+        state, warnings = self._state, self._warnings
+        needs_ids = not state.filter.has_joint_covariance
         usable = usable_points(
-            event, self.settings, needs_ids, known_ids, self._counts, self._warnings
+            event, self.settings, needs_ids, state.landmarks, self._counts, warnings
         )
         event = self._timeline.synchronise(usable)
-        self._start_again_if_diverged()
         outcome = self._hypotheses.observe(event)
-        self._start_again_if_diverged()
         self._localise(outcome)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
@@ -521,13 +519,8 @@ class Estimator:
         if self._localiser.search(self._state):
             self._hypotheses.prune_to_best()
 
-    def _start_again_if_diverged(self) -> None:
+    def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""
-        known = self._state.filter.pose_covariance()
-        distance_m = np.abs(self._state.observer.A[:3, 3]).max()
-        variance = 0.0 if known is None else known.trace()
-        if distance_m <= DIVERGED_M and variance <= DIVERGED_M**2:  # what is no number is not
-            return
         logger.error(
             'The estimate has diverged: the pose is %.1e m from its origin. Starting again; the '
             'noise of velocities and landmarks may be set orders of magnitude wrong.',
@@ -596,8 +589,10 @@ class Estimator:
         warnings.unexpected_poses(self._hypotheses.count)
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
-        size = len(joint.P) if joint is not None and is_dense else 0
-        warnings.large_map(len(state.landmarks), limit, size)
+        warnings.large_map(len(state.landmarks), limit, is_dense)
+        distance_m = np.abs(state.observer.A[:3, 3]).max()
+        if not distance_m <= DIVERGED_M:  # nor is what is no number
+            self._start_again(distance_m)
 
     def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
         observer = self._state.observer

@@ -16,8 +16,8 @@ logger = logging.getLogger(__name__)
 MAX_NAMED = 10
 """Ids that a warning lists at most."""
 
-LARGE_COVARIANCE = 1800
-"""Rows of a dense covariance, those of 300 tags, from which on a step takes 20 ms and more."""
+MANY_LANDMARKS = 300
+"""Landmarks of a dense covariance from which on a step takes 20 ms and more."""
 
 MANY_POINTS = 300
 """Points in one observation from which on these gains take a tenth of a second and more."""
@@ -79,7 +79,7 @@ class EventWarnings:
                 'many_points',
                 f'An observation has {count} points: the time that riccati gains take grows with '
                 'the cube of them, to seconds and a gigabyte for 1000. Let the sensor or its '
-                'driver send fewer, those that are told apart best, or use constant gains.',
+                'driver send fewer, or use constant gains.',
             )
 
     def unweighed_points(self, count: int, most: int) -> None:
@@ -90,10 +90,10 @@ class EventWarnings:
         )
         self._warn('unweighed_point', text)
 
-    def large_map(self, count: int, limit: int, dense_size: int) -> None:
+    def large_map(self, count: int, limit: int, is_dense: bool) -> None:
         """Say once that a map is full, with 0 < ``limit``, and once that it takes long.
 
-        That is where a joint covariance has all landmarks in it, ``dense_size`` rows.
+        That is where a joint covariance has all landmarks in it.
         """
         if 0 < limit <= count:
             self._warn_once(
@@ -102,7 +102,7 @@ class EventWarnings:
                 'one replaces the one seen least often. If so many are right, set it higher; if '
                 'not, look for ids that the sensor makes up.',
             )
-        if dense_size >= LARGE_COVARIANCE:
+        if is_dense and count >= MANY_LANDMARKS:
             self._warn_once(
                 'large_map',
                 f'The map has {count} landmarks. Where they move or have orientations, time and '

@@ -724,7 +724,7 @@ def test_landmarks_that_moved_before_a_jump_of_the_clock_did_not_move_lately(cap
 
 @pytest.mark.parametrize('gains', GAINS)
 def test_a_map_too_large_for_a_dense_covariance_is_reported_once(caplog, monkeypatch, gains):
-    monkeypatch.setattr(event_warnings, 'LARGE_COVARIANCE', 21)
+    monkeypatch.setattr(event_warnings, 'MANY_LANDMARKS', 5)
     run([observation(0.1 * step) for step in range(5)], gains=gains)
     reported = [message for message in caplog.messages if 'The map has 5 landmarks' in message]
     assert len(reported) == (gains == 'riccati')
