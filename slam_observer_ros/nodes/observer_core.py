@@ -22,6 +22,7 @@ from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.intake.transform_listener import open_transforms
+from slam_observer_ros.nodes.intake.transformed_odometry import TransformedOdometry
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
@@ -92,12 +93,15 @@ class ObserverCore:
             hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         # What others may do to the estimate
-        self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
+        odometry = TransformedOdometry(settings, self._transforms)
+        controls = ControlServices(node, self._estimator, self._feed, self._publisher, odometry)
+        self._maps = MapServices(node, settings, self._estimator, controls.note_move)
         NamedMapServices(node, self._maps)
         self._kept_pose = KeptPose(node, settings, self._estimator)
         self._kept_pose.restore()
-        InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
-        ControlServices(node, self._estimator, self._feed, self._publisher)
+        InitialPoseListener(
+            node, settings.map_frame, self._estimator, odometry, controls.note_move
+        )
         node.add_post_set_parameters_callback(self._apply_parameters)
         # The times at which all that happens
         self._timers = self._create_timers(settings.publish_rate)
