@@ -286,7 +286,7 @@ class Estimator:
         map has it (``'unexpected_place'``), landmarks (``'rejected_landmark'``,
         ``'moved_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
         ``'unsupported_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
-        ``'reserved_id'``).
+        ``'reserved_id'``, ``'impossible_id'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
