@@ -459,8 +459,7 @@ class Estimator:
 
     def _process_velocities(self, velocities: VelocityBlock) -> None:
         """Use velocities, as far as possible at once."""
-        # By how it is delayed, what is known at a stamp depends on the velocities after it.
-        if self.settings.velocity_delay_stddev or not self._timeline.takes(velocities):
+        if not self._timeline.takes(velocities):
             for event in velocities.events():
                 self._process(event)
             return

@@ -15,6 +15,7 @@ from slam_observer_ros.common.units import to_ns
 from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 NAMES = (
@@ -129,12 +130,33 @@ class Calibration:
         return F
 
     def sensitivity_until(
-        self, Ad: FloatArray, measured_velocities: FloatArray, dt_s: FloatArray
+        self,
+        Ad: FloatArray,
+        held: HeldUntil,
+        Ad_at_ends: FloatArray,
+        at_ends: FloatArray | None,
     ) -> FloatArray:
-        """Return :meth:`sensitivity` until each pose (k + 1, p, c); no delay is estimated."""
-        shares = 0.5 * self._rates(measured_velocities) * dt_s[:, None]
+        """Return :meth:`sensitivity` until each of s instants (s, p, c).
+
+        ``Ad`` (k + 1, p, 6) is along the whole pieces, ``Ad_at_ends`` (s, p, 6) at the instants.
+        """
+        counts, rates = held.counts, len(self._calibrated)
         of_rates = Ad[:, :, self._calibrated]
-        return se3.summed_until((of_rates[:-1] + of_rates[1:]) * shares[:, None, :])
+        shares = self._shares(held.whole)
+        until = se3.summed_until((of_rates[:-1] + of_rates[1:]) * shares)[counts]
+        last = of_rates[counts] + Ad_at_ends[:, :, self._calibrated]
+        F = np.zeros((len(counts), Ad.shape[1], self.count))
+        F[:, :, :rates] = until + last * self._shares(held.last)
+        if rates < self.count and at_ends is not None:
+            starts, ends = self.apply(at_ends)
+            F[:, :, -1] = starts @ Ad[0].T - (Ad_at_ends @ ends[:, :, None])[:, :, 0]
+        return F
+
+    def _shares(self, held: HeldVelocities) -> FloatArray:
+        """Return (k, 1, …) half of how far each scale and bias moves the robot in a piece."""
+        rates = self._rates(held.body_velocities)
+        shares: FloatArray = (0.5 * rates * held.dt_s[:, None])[:, None, :]
+        return shares
 
     def _rates(self, measured_velocities: FloatArray) -> FloatArray:
         """Return (k, …) how fast each scale and bias moves the robot per unit of its error."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -35,10 +35,14 @@ class HeldVelocities:
             usual_s=np.full(2, np.inf),
         )
 
+    @property
+    def piece_counts(self) -> IntArray:
+        """(k,) 2 for pieces that have a gap beside time with a velocity, 1 for others."""
+        return 1 + ((self.gap_s > 0.0) & (self.dt_s > 0.0))
+
     def with_gaps_apart(self) -> HeldVelocities:
         """Return the same with each gap as a piece of its own."""
-        has_gap = (self.gap_s > 0.0) & (self.dt_s > 0.0)
-        rows = np.repeat(np.arange(len(has_gap)), 1 + has_gap)
+        rows = np.repeat(np.arange(len(self.dt_s)), self.piece_counts)
         is_gap = np.append(False, rows[1:] == rows[:-1]) | (self.dt_s[rows] == 0.0)
         return HeldVelocities(
             body_velocities=self.body_velocities[rows],
@@ -50,23 +54,9 @@ class HeldVelocities:
             usual_s=self.usual_s,
         )
 
-    def counts_with_gaps_apart(self, counts: IntArray) -> IntArray:
-        """Return how many pieces the first ``counts`` (s,) are :meth:`with_gaps_apart`."""
-        has_gap = (self.gap_s > 0.0) & (self.dt_s > 0.0)
-        more: IntArray = np.append(0, np.cumsum(has_gap))
-        return counts + more[counts]
-
-    def first(self, count: int, usual_s: FloatArray) -> HeldVelocities:
-        """Return the first pieces, as when velocities were held for ``usual_s`` (2,) as a rule."""
-        return HeldVelocities(
-            body_velocities=self.body_velocities[:count],
-            covariances=self.covariances[:count],
-            is_stated=self.is_stated[:count],
-            dt_s=self.dt_s[:count],
-            gap_s=self.gap_s[:count],
-            before_s=self.before_s[:count],
-            usual_s=usual_s,
-        )
+    def as_usual(self, usual_s: FloatArray) -> HeldVelocities:
+        """Return the same, as when velocities were held for ``usual_s`` (2,) as a rule."""
+        return replace(self, usual_s=usual_s)
 
     def averaged(self, window_s: float) -> FloatArray:
         """Return the mean velocities (k, 6) over windows around the middle of each one.
@@ -84,3 +74,35 @@ class HeldVelocities:
         lengths_s = np.maximum(times_s[ends] - times_s[starts], np.finfo(np.float64).tiny)
         means: FloatArray = (motions[ends] - motions[starts]) / lengths_s[:, None]
         return means
+
+
+@dataclass(frozen=True, slots=True)
+class HeldUntil:
+    """Velocities that are held from one instant to each of s others, as they were known then.
+
+    Until each of these there are the first of k pieces, and a last one that it ends in.
+    """
+
+    whole: HeldVelocities  # (k)
+    last: HeldVelocities  # (s)
+    counts: IntArray  # (s,) how many of the whole pieces there are before the last one
+    usual_s: FloatArray  # (s, 2) how long velocities were held as a rule, as known then
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether there is time in which no velocity is known."""
+        return bool(self.whole.gap_s.any() or self.last.gap_s.any())
+
+    def until(self, row: int) -> HeldVelocities:
+        """Return all pieces until one of the instants."""
+        count = self.counts[row]
+        joined = {
+            field.name: np.append(
+                getattr(self.whole, field.name)[:count],
+                getattr(self.last, field.name)[row : row + 1],
+                axis=0,
+            )
+            for field in fields(HeldVelocities)
+            if field.name != 'usual_s'
+        }
+        return HeldVelocities(**joined, usual_s=self.usual_s[row])

@@ -75,13 +75,34 @@ def integrate_until(
     A: FloatArray,
     start_ns: int,
     stamps_ns: IntArray,
+    at_start: FloatArray | None,
 ) -> Passage:
-    """Return how Â, ``A`` (4, 4) at ``start_ns``, moves on through stamps (s,) of velocities.
+    """Return how Â, ``A`` (4, 4) at ``start_ns``, moves on to each of s stamps of velocities.
 
-    Where no delay is estimated: else what was known at each stamp is not what is known now.
+    As :func:`integrate` would have had it at each stamp.
     """
-    held, counts, usual_s = velocities.held_until(start_ns, stamps_ns)
-    return Passage(_path(A, held, calibration), held, counts, usual_s, calibration, noise)
+    held = velocities.held_until(start_ns, stamps_ns, calibration.delay_ns)
+    if calibration.delay_ns < 0:
+        held = replace(held, usual_s=held.usual_s + to_s(-calibration.delay_ns))
+    path, last = _path(A, held.whole, calibration), held.last
+    at_ends = None
+    if reach_ns := calibration.delay_error_ns:
+        at_ends = np.zeros((2, len(stamps_ns), 6))
+        starts_ns = np.full(len(stamps_ns), start_ns)
+        for of_each, instants_ns in zip(at_ends, (starts_ns, stamps_ns), strict=True):
+            centres_ns = instants_ns - calibration.delay_ns
+            of_each[:] = velocities.means_until(centres_ns, reach_ns, stamps_ns)
+        if at_start is not None:
+            at_ends[0] = at_start
+    return Passage(
+        path=path,
+        poses=path[held.counts]
+        @ se3.exp(calibration.apply(last.body_velocities) * last.dt_s[:, None]),
+        held=held,
+        at_ends=at_ends,
+        calibration=calibration,
+        motion_noise=noise,
+    )
 
 
 def _held(

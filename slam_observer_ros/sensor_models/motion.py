@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import symmetric, transpose
 from slam_observer_ros.sensor_models.calibration import Calibration
-from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+from slam_observer_ros.sensor_models.held_velocities import HeldUntil
 from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 
 
@@ -28,6 +28,7 @@ class Motion:
     # depend on the delay of the velocities.
     at_ends: FloatArray | None
     calibration: Calibration  # which led along the path
+    is_slip: bool = False  # whether odometry has not seen it, so that it may not have been
 
     @cached_property
     def noise(self) -> FloatArray:
@@ -70,22 +71,18 @@ class Motion:
 
 @dataclass(frozen=True)
 class Passage:
-    """Motion from one instant of the state through s others, in k pieces of held velocity.
+    """Motion from one instant of the state to each of s others, in pieces of held velocity.
 
     What is known at each of these is what :class:`.Motion` has of a motion that ends there.
     """
 
-    path: FloatArray  # (k + 1, 4, 4) Â before, between and after the pieces
-    held: HeldVelocities  # the pieces
-    counts: IntArray  # (s,) how many pieces there are until each instant
-    usual_s: FloatArray  # (s, 2) how long velocities were held as a rule, as known then
+    path: FloatArray  # (k + 1, 4, 4) Â before, between and after the whole pieces
+    poses: FloatArray  # (s, 4, 4) Â at each instant
+    held: HeldUntil  # the pieces
+    # (2, s, 6) measured velocities around the start and each instant; None as in Motion
+    at_ends: FloatArray | None
     calibration: Calibration  # which led along the path
     motion_noise: MotionNoise
-
-    @property
-    def poses(self) -> FloatArray:
-        """(s, 4, 4) Â at each instant."""
-        return self.path[self.counts]
 
     def pose_covariance(self, P: FloatArray) -> FloatArray:
         """Return the covariances (s, p, p) of ε then, from P (p + c, p + c) before the motion."""
@@ -94,27 +91,42 @@ class Passage:
     @property
     def _noise(self) -> FloatArray:
         """(s, p, p) Σ Ad_Â Q Ad_Âᵀ until each instant."""
-        held, noise, Ad = self.held, self.motion_noise, self._adjoints
-        if noise.is_summed(held, self.usual_s.min(axis=0)):
-            return se3.summed_noise_until(Ad, noise.covariances(held))[self.counts]
-        return np.array(
-            [
-                se3.summed_noise(Ad[: count + 1], noise.covariances(held.first(count, usual_s)))
-                for count, usual_s in zip(self.counts.tolist(), self.usual_s, strict=True)
-            ]
-        )
+        held, noise, least_s = self.held, self.motion_noise, self.held.usual_s.min(axis=0)
+        whole, last = held.whole.as_usual(least_s), held.last.as_usual(least_s)
+        if noise.is_summed(whole) and noise.is_summed(last) and not held.has_gaps:
+            until = se3.summed_noise_until(self._adjoints, noise.covariances(whole))
+            return until[held.counts] + self._of_last(noise.covariances(last))
+        return np.array([self._noise_until(row) for row in range(len(held.counts))])
+
+    def _of_last(self, covariances: FloatArray) -> FloatArray:
+        """Return the noise (s, p, p) of the last pieces from theirs (s, 6, 6)."""
+        before, after = self._adjoints[self.held.counts], self._adjoints_at_ends
+        of_both = before @ covariances @ transpose(before) + after @ covariances @ transpose(after)
+        noise: FloatArray = 0.5 * of_both
+        return noise
+
+    def _noise_until(self, row: int) -> FloatArray:
+        held, count = self.held.until(row), self.held.counts[row]
+        Ad = np.append(self._adjoints[: count + 1], self._adjoints_at_ends[row : row + 1], axis=0)
+        # A gap is where the velocity before it has led.
+        Ad = np.repeat(Ad, np.append(1, held.piece_counts), axis=0)
+        return se3.summed_noise(Ad, self.motion_noise.covariances(held.with_gaps_apart()))
 
     @property
     def _sensitivity(self) -> FloatArray:
         """(s, p, c) F until each instant."""
-        held, calibration = self.held, self.calibration
-        until_all = calibration.sensitivity_until(self._adjoints, held.body_velocities, held.dt_s)
-        return until_all[self.counts]
+        held, ends = self.held, (self._adjoints_at_ends, self.at_ends)
+        return self.calibration.sensitivity_until(self._adjoints, held, *ends)
 
     @cached_property
     def _adjoints(self) -> FloatArray:
         """(k + 1, p, 6) the estimated rows of Ad_Â along the path."""
         return se3.adjoint(self.path)[:, self.calibration.axes.pose]
+
+    @cached_property
+    def _adjoints_at_ends(self) -> FloatArray:
+        """(s, p, 6) those at the instants."""
+        return se3.adjoint(self.poses)[:, self.calibration.axes.pose]
 
 
 def _pose_covariance(P: FloatArray, F: FloatArray, noise: FloatArray) -> FloatArray:

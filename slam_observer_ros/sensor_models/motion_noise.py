@@ -65,12 +65,9 @@ class MotionNoise(Immutable):
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
 
-    def is_summed(self, held: HeldVelocities, usual_s: FloatArray) -> bool:
-        """Return whether what one motion may be off by does not depend on those that follow.
-
-        Nor on for how long velocities are held as a rule, ``usual_s`` (2,) or longer.
-        """
-        return not (self._has_scale or _some_last_longer(held, usual_s))
+    def is_summed(self, held: HeldVelocities) -> bool:
+        """Return whether what one motion may be off by does not depend on others."""
+        return not (self._has_scale or _some_last_longer(held))
 
     def velocity_covariance(self, held: HeldVelocities) -> FloatArray:
         """Return what a single velocity may be off by: (6, 6), rad²/s² and m²/s²."""
@@ -85,8 +82,8 @@ def _squares(angular: Vector3, linear: Vector3) -> FloatArray:
     return squares
 
 
-def _some_last_longer(held: HeldVelocities, usual_s: FloatArray) -> bool:
-    return bool(np.count_nonzero(held.before_s + held.dt_s[:, None] > usual_s))
+def _some_last_longer(held: HeldVelocities) -> bool:
+    return bool(np.count_nonzero(held.before_s + held.dt_s[:, None] > held.usual_s))
 
 
 def _white_s(held: HeldVelocities) -> FloatArray:
@@ -96,7 +93,7 @@ def _white_s(held: HeldVelocities) -> FloatArray:
     usual T, one of them has moved the robot by t/T times as much: t²/T, not t. Slip is as before.
     """
     dt_s = held.dt_s[:, None]
-    if not _some_last_longer(held, held.usual_s):  # as nearly always
+    if not _some_last_longer(held):  # as nearly always
         return dt_s
     until_s = held.before_s + dt_s
     grown_s = until_s * np.maximum(until_s / held.usual_s, 1.0)

@@ -18,7 +18,7 @@ from slam_observer_ros.events import (
     VelocityBlock,
     VelocityEvent,
 )
-from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
 
 NEVER_NS = -10_000 * NANOSECONDS_PER_SECOND
 """Stamp of a velocity that timed out before time began, nanoseconds."""
@@ -123,21 +123,57 @@ class VelocityHistory:
         held = self._held(self._pieces(start_ns, end_ns))
         return held.with_gaps_apart() if np.count_nonzero(held.gap_s) else held
 
-    def held_until(
-        self, start_ns: int, stamps_ns: IntArray
-    ) -> tuple[HeldVelocities, IntArray, FloatArray]:
-        """Return the velocities in force from ``start_ns`` to the last of s increasing stamps.
+    def held_until(self, start_ns: int, stamps_ns: IntArray, delay_ns: int) -> HeldUntil:
+        """Return what led from ``start_ns`` to increasing stamps (s,), ``delay_ns`` before each.
 
-        Also how many of them (s,) are until each stamp, which is one of a velocity, and for how
-        long they were held as a rule (s, 2) as far as it was known then.
+        As :meth:`held` would have it, had it been asked at each stamp, which is one of a velocity.
         """
-        pieces = self._pieces(start_ns, int(stamps_ns[-1]))
-        held, counts = self._held(pieces), pieces.ends_ns.searchsorted(stamps_ns, 'right')
-        usual_s = self._written().usual_s[pieces.rows.start + counts]
-        if held.gap_s.any():
-            counts = held.counts_with_gaps_apart(counts)
-            held = held.with_gaps_apart()
-        return held, counts, usual_s
+        start_ns, ends_ns = start_ns - delay_ns, stamps_ns - delay_ns
+        stamps, first, known = self._known_at(stamps_ns, start_ns)
+        # Of what was known then, the velocity that each instant is in; others before are whole.
+        counts: IntArray = np.minimum(stamps.searchsorted(ends_ns) - 1, known)
+        begins, k = np.maximum(stamps, start_ns), counts[-1]
+        return HeldUntil(
+            whole=self._held(self._cut(slice(first, first + k), begins[:k], begins[1 : k + 1])),
+            last=self._held(self._cut(first + counts, begins[counts], ends_ns)),
+            counts=counts,
+            usual_s=self._written().usual_s[first + known],
+        )
+
+    def means_until(self, centres_ns: IntArray, reach_ns: int, stamps_ns: IntArray) -> FloatArray:
+        """Return :meth:`mean` around centres (s,), had it been asked at increasing stamps (s,)."""
+        starts_ns, ends_ns = centres_ns - reach_ns, centres_ns + reach_ns
+        stamps, first, known = self._known_at(stamps_ns, int(starts_ns.min()))
+        joined = self._written()
+        velocities = self._counting(joined.body_velocities[first : first + len(stamps)])
+        stops = joined.since_ns[first : first + len(stamps), 1] + self._timeout_ns
+        # How long a velocity was known, and how far it led, until each of their stamps, …
+        known_s = to_s(np.maximum(np.minimum(stops[:-1], stamps[1:]) - stamps[:-1], 0))
+        until = np.zeros((len(stamps), 7))
+        pieces = np.column_stack([known_s[:, None] * velocities[:-1], known_s])
+        np.cumsum(pieces, axis=0, out=until[1:])
+        # … and until any time, each of which is held on as long as it was the latest one.
+        sums = np.zeros((2, len(stamps_ns), 7))
+        for of_each, times in zip(sums, (starts_ns, ends_ns), strict=True):
+            rows = np.minimum(stamps.searchsorted(times, 'right') - 1, known)
+            since_s = to_s(np.maximum(np.minimum(stops[rows], times) - stamps[rows], 0))
+            of_each[:] = until[rows]
+            of_each[:, :6] += since_s[:, None] * velocities[rows]
+            of_each[:, 6] += since_s
+        motions, lengths_s = np.split(sums[1] - sums[0], [6], axis=1)
+        means: FloatArray = motions / np.where(lengths_s > 0.0, lengths_s, np.inf)
+        return means
+
+    def _known_at(self, stamps_ns: IntArray, start_ns: int) -> tuple[IntArray, int, IntArray]:
+        """Return stamps of velocities, the row of the first, and which was the latest at each.
+
+        From the one in force at ``start_ns`` on, or known at the first of ``stamps_ns`` (s,).
+        """
+        earliest_ns, latest_ns = min(start_ns, int(stamps_ns[0])), int(stamps_ns[-1])
+        first = bisect_right(self._stamps_ns, earliest_ns) - 1
+        last = bisect_right(self._stamps_ns, latest_ns)
+        stamps = np.array(self._stamps_ns[first:last], dtype=np.int64)
+        return stamps, first, stamps.searchsorted(stamps_ns, 'right') - 1
 
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
@@ -178,10 +214,11 @@ class VelocityHistory:
         first = bisect_right(self._stamps_ns, start_ns) - 1
         last = bisect_left(self._stamps_ns, end_ns)
         stamps = np.array([*self._stamps_ns[first:last], end_ns], dtype=np.int64)
-        begins, ends = np.maximum(stamps[:-1], start_ns), stamps[1:]
-        timed_out = self._written().since_ns[first:last, 1] + self._timeout_ns
-        stops = np.minimum(np.maximum(timed_out, begins), ends)
-        return _Pieces(slice(first, last), begins, stops, ends)
+        return self._cut(slice(first, last), np.maximum(stamps[:-1], start_ns), stamps[1:])
+
+    def _cut(self, rows: slice | IntArray, begins: IntArray, ends: IntArray) -> _Pieces:
+        timed_out = self._written().since_ns[rows, 1] + self._timeout_ns
+        return _Pieces(rows, begins, np.minimum(np.maximum(timed_out, begins), ends), ends)
 
     def _usual_s(self) -> tuple[float, float]:
         linear_s = self._periods.usual_s
@@ -248,7 +285,7 @@ _InForce: TypeAlias = tuple[VelocityEvent, AngularVelocityEvent | None, tuple[fl
 class _Pieces(NamedTuple):
     """Rows of velocities in force, and when each begins, times out and ends."""
 
-    rows: slice
+    rows: slice | IntArray
     begins_ns: IntArray
     stops_ns: IntArray
     ends_ns: IntArray

@@ -90,10 +90,7 @@ class State:
     def poses_until(
         self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then.
-
-        Where the delay of velocities is not estimated.
-        """
+        """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then."""
         passage = self.passage(velocities, start_ns, stamps_ns)
         covariance, A = self.filter.pose_covariance(passage), passage.poses
         return self.observer.reference_pose @ A, covariances.of_pose(self.observer, covariance, A)
@@ -107,6 +104,7 @@ class State:
             self.observer.A,
             start_ns,
             stamps_ns,
+            self._end_velocity,
         )
 
     def motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
@@ -193,7 +191,7 @@ class State:
                 "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
             )
         # From the reference frame to the world.
-        found, rows = self.relinearisation.smooth(), self.confirmed
+        (found, slips), rows = self.relinearisation.smooth(), self.confirmed
         history, P = self.relinearisation.history, self.observer.reference_pose
         turned = found.orientations
         return Smoothed(
@@ -202,5 +200,6 @@ class State:
             world_points=se3.transform(P, found.points[rows]),
             ids=self.landmarks.ids[rows],
             since=history.since,
+            slips=slips,
             orientations=None if turned is None else P[:3, :3] @ turned[rows],
         )

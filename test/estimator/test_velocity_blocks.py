@@ -148,7 +148,7 @@ def assert_same_samples(one, other):
         optional={
             'reorder_window': st.sampled_from([0.0, 0.5]),
             'two_d_mode': st.just(True),
-            'velocity_delay_stddev': st.just(0.05),
+            'velocity_delay_stddev': st.sampled_from([0.05, 0.3]),
             'linear_scale_noise': st.just((0.1, 0.1, 0.1)),
             'linear_scale_stddev': st.just((0.02, 0.0, 0.0)),
             'on_time_jump': st.just('hold'),
