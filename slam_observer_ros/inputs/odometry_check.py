@@ -13,10 +13,10 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
 
 MAX_PAUSE_S = 1.0  # between two messages: how the robot moved meanwhile no twist says
-WAY_M, TURN_RAD = 0.1, 0.3  # after which both are compared, and begin anew
+WAY_M, TURN_RAD = 0.1, 0.3  # length of a stretch over which both are compared
 COS_TURN = math.cos(TURN_RAD)
 COMPARED = 10  # stretches of this kind that it takes to say something
-TURNED_RAD = 0.5  # heading from which on the axes of both frames can be told apart
+TURNED_RAD = 0.5  # a smaller heading does not show whose axes they are
 MAX_DISAGREEMENT = 0.25  # squared, relative: half of the way; noise and slip are less
 FITS = 0.1  # share of the squared error that is left where another reading is right
 MAX_SPEED = 50.0  # m/s; beyond it the poses were reset

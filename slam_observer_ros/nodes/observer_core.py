@@ -32,6 +32,7 @@ from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
 from slam_observer_ros.nodes.services.kept_pose import KeptPose
 from slam_observer_ros.nodes.services.map_services import MapServices
 from slam_observer_ros.nodes.services.named_map_services import NamedMapServices
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -59,6 +60,7 @@ class ObserverCore:
     def __init__(self, node: GuardedNode) -> None:
         self._node = node
         self._entities = Entities(node)
+        self._log = ThrottledLog(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
         noise = NoiseFit()
@@ -172,16 +174,25 @@ class ObserverCore:
         ]
 
     def _check(self) -> None:
-        if not np.isfinite(self._estimator.pose).all():
-            self._node.get_logger().error(
+        if not self._is_finite():
+            self._log.error(
+                'not finite',
                 'the estimate is not finite any more, as after numbers that are far too large: '
-                'starting again'
+                'starting again',
             )
             self._estimator.reset()
             self._publisher.reset()
         for source in self._inputs:
             source.check_publishers()
         self._localisation.publish()
+
+    def _is_finite(self) -> bool:
+        estimator = self._estimator
+        try:
+            known = (estimator.pose, estimator.pose_covariance, estimator.world_points)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return False
+        return all(each is None or bool(np.isfinite(each).all()) for each in known)
 
     def _publish_overview(self) -> None:
         self._publisher.publish_overview()
