@@ -88,6 +88,11 @@ def blinded(events, which):
 
 
 class TestReport:
+    def test_what_is_not_finite_is_null_in_json(self, slam_observer, simulated):
+        options = ('--set', 'calibration_drift=0.01', '--json')
+        report = slam_observer.succeed('replay', simulated, *options, '--gains', 'riccati').json
+        assert report['calibration']['angular_bias_z']['stated'] is None
+
     def test_simulation_against_its_truth(self, slam_observer, simulated):
         report = slam_observer.succeed('replay', simulated, '--json').json
         assert set(report) == REPORT_KEYS

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
-import math
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_table
+from slam_observer_ros.cli.figures import ACCURACY_ROWS, figure_text
 from slam_observer_ros.cli.replay.dropped import list_dropped
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.common.digits import significant
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.runs.replay import Replay
@@ -21,21 +20,6 @@ NEARLY_ALL = 0.99
 
 LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported')
 """What may happen to landmarks of the map; counted under these names."""
-
-ACCURACY_ROWS = {
-    'ate_rmse_m': ('position error (ATE), RMS', 'm after alignment'),
-    'dead_reckoning_ate_rmse_m': ('of the velocities alone', 'm after alignment'),
-    'unaligned_rmse_m': ('position error, not aligned', "m if the truth is in the map's frame"),
-    'heading_rmse_rad': ('heading error, RMS', '° after alignment'),
-    'landmark_rmse_m': ('landmark error, RMS', 'm after alignment'),
-    'configuration_rmse_m': ('configuration error, RMS', 'm, not aligned'),
-    'anees': ('ANEES of the pose', '(1 is consistent)'),
-    'configuration_anees': ('ANEES of the configuration', '(1 is consistent)'),
-    'unsmoothed_ate_rmse_m': ('of the part that is smoothed, online', 'm after alignment'),
-    'smoothed_ate_rmse_m': ('smoothed: position error, RMS', 'm after alignment'),
-    'smoothed_landmark_rmse_m': ('smoothed: landmark error, RMS', 'm after alignment'),
-}
-"""Figures of ``--json`` that are in the table, their names there and their units."""
 
 
 def as_json(outcome: ReplayOutcome) -> dict[str, object]:
@@ -149,11 +133,6 @@ def _points_text(counts: Counter[str]) -> str:
     return ', '.join(parts)
 
 
-def _figure_text(key: str, figure: float, unit: str) -> str:
-    """Return a figure of ``--json`` as people read it: angles in degrees."""
-    return f'{significant(math.degrees(figure) if key.endswith("_rad") else figure)} {unit}'
-
-
 def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
     """Say of how much of the trajectory the figures are, if not of nearly all."""
     share = outcome.truth_covered
@@ -167,7 +146,7 @@ def _accuracy_rows(outcome: ReplayOutcome) -> dict[str, str]:
     if figures['unsmoothed_ate_rmse_m'] == figures['ate_rmse_m']:  # all of it is smoothed
         figures['unsmoothed_ate_rmse_m'] = None
     rows = _covered_rows(outcome) | {
-        name: _figure_text(key, figure, unit)
+        name: figure_text(key, figure, unit)
         for key, (name, unit) in ACCURACY_ROWS.items()
         if isinstance(figure := figures[key], float)
     }
