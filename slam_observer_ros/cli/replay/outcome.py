@@ -68,6 +68,7 @@ class ReplayOutcome:
             'bytes': self.loss.byte_count,
             'seconds': self.loss.seconds,
             'cut_off': self.loss.is_cut_off,
+            'messages': self.loss.message_count,
             'malformed': self.unused[MALFORMED],
         }
 
