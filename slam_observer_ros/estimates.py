@@ -13,6 +13,7 @@ UNUSED_POINTS = {
     'unknown_id': 'without id',
     'repeated_id': 'of a repeated id',
     'reserved_id': 'of a reserved id',
+    'impossible_id': 'of an impossible id',
     'unmapped_landmark': 'not mapped',
 }
 """Names under which observed points that are not used are counted, and what they are."""
