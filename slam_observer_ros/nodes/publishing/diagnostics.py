@@ -33,7 +33,14 @@ MANY_UNUSED = 20  # messages, none of which was used, that are no transient of t
 USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
 """Inputs, and what their messages are counted as when they are used."""
 
-LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id', 'reserved_id', 'impossible_id')
+LEFT_OUT = (
+    'rejected_landmark',
+    'unknown_id',
+    'repeated_id',
+    'reserved_id',
+    'impossible_id',
+    'unweighed_point',
+)
 """Points not used for something that is wrong; those that are not in a known map may be right."""
 
 
