@@ -99,7 +99,7 @@ class ReplayOutcome:
     def truth_covered(self) -> float | None:
         """Share of the trajectory that the truth covers; None without true poses."""
         errors = self.accuracy.pose_errors
-        return None if errors is None else float(errors.covered.mean())
+        return None if errors is None else errors.covered_share
 
     @property
     def localised_after_s(self) -> float | None:
