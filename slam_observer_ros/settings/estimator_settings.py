@@ -302,6 +302,7 @@ class Settings(Immutable):
         'the body axes x y z, to be estimated for each sensor frame: its standard deviation',
         unit='rad',
         minimum=0.0,
+        maximum=1.0,
     )
     sensor_translation_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -309,6 +310,7 @@ class Settings(Immutable):
         'axes x y z, to be estimated: its standard deviation',
         unit='m',
         minimum=0.0,
+        maximum=10.0,
     )
     range_scale: float = parameter(
         1.0,
@@ -322,6 +324,7 @@ class Settings(Immutable):
         'Riccati gains: how far range_scale may be off, to be estimated: its standard deviation; '
         'without a surveyed map it can hardly be distinguished from the scale of velocities',
         minimum=0.0,
+        maximum=1.0,
     )
     range_is_depth: bool = parameter(
         False,
