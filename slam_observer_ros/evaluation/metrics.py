@@ -58,6 +58,11 @@ class TrajectoryErrors:
         return root_mean_square(self.errors[:, 3:])
 
     @property
+    def distances_m(self) -> FloatArray:
+        """(k,) distances from the truth, metres."""
+        return np.asarray(np.linalg.norm(self.errors[:, 3:], axis=1))
+
+    @property
     def unaligned_rmse_m(self) -> float:
         """The same without the alignment, for an estimate in the truth's frame, metres."""
         return root_mean_square(self.in_estimate(self.estimate.positions) - self.truth.positions)
