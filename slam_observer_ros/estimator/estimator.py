@@ -14,7 +14,7 @@ from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns, to_s
-from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
+from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
 from slam_observer_ros.estimator.checks import (
     check_event,
     check_velocities,
@@ -438,6 +438,11 @@ class Estimator:
         """Scale, bias and delay of the velocity, those that the settings ask for."""
         known = self._state.filter
         return known.calibration.estimates(known.calibration_variances)
+
+    @property
+    def motion_factors(self) -> list[MotionFactor]:
+        """How noisy turning and driving are over what is stated; empty where that is not known."""
+        return self._state.motion_noise.factors.estimates
 
     @property
     def lyapunov(self) -> float:

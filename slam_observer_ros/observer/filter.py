@@ -28,7 +28,12 @@ OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 """Settings without effect on other filters; ``gain_k`` is in the Lyapunov value of all."""
 
 
-OF_SENSORS = ('sensor_rotation_stddev', 'sensor_translation_stddev', 'range_scale_stddev')
+OF_JOINT_COVARIANCES = (
+    'motion_noise_factor',
+    'sensor_rotation_stddev',
+    'sensor_translation_stddev',
+    'range_scale_stddev',
+)
 """Settings of what only a joint covariance can estimate."""
 
 

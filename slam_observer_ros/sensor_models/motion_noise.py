@@ -6,9 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, Immutable
+from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry.matrices import limited
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
+from slam_observer_ros.sensor_models.motion_factors import MotionFactors
 from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
 MAX_SPEED_ERRORS = np.repeat([50.0, 1000.0], 3)
@@ -29,11 +30,15 @@ SPEED_WINDOW_S = 1.0
 _IDENTITY_6 = np.eye(6)
 
 
-class MotionNoise(Immutable):
-    """How far motions may be off: noise densities of the settings, or covariances of messages."""
+class MotionNoise:
+    """How far motions may be off: noise densities of the settings, or covariances of messages.
+
+    Either of them times the ``factors`` that were found for turning and driving.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = s = settings
+        self.factors = MotionFactors(settings)
         self._unknown_squared = (
             np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3) ** 2
         )
@@ -49,6 +54,8 @@ class MotionNoise(Immutable):
         variances = _squares(s.angular_velocity_noise, s.linear_velocity_noise) * _white_s(held)
         if self._has_scale:
             variances += (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2 * dt_s
+        factors = self.factors.applied.repeat(3)
+        variances = variances * factors
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         # In a gap the robot may do anything that is allowed.
@@ -60,7 +67,7 @@ class MotionNoise(Immutable):
         # however many motions that was cut into. Of angular and linear part one may have none.
         if some_are_stated:
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
-            grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
+            grown_s = np.repeat(np.sqrt(squared), 3, axis=1) * np.sqrt(factors)
             stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances

@@ -149,6 +149,12 @@ class Settings(Immutable):
         minimum=0.0,
         maximum=10.0,
     )
+    motion_noise_factor: str = parameter(
+        'at_least_stated',
+        'Riccati gains: whether the noise of the velocity is as stated, as much more as what is '
+        'seen shows (at_least_stated), or also less (auto)',
+        choices=('stated', 'at_least_stated', 'auto'),
+    )
     unknown_angular_motion: float = parameter(
         0.5,
         'How much the robot may turn while no velocity is known, or its wheels slip: standard '

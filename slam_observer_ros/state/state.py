@@ -122,6 +122,8 @@ class State:
     def propagate(self, motion: Motion) -> None:
         """Move on along a motion (27)."""
         self.filter.propagate(motion)
+        if self.filter.has_joint_covariance:
+            self.motion_noise.factors.move(motion.noise_by_kind, motion.stands)
         if self.relinearisation is not None:
             self.relinearisation.move(motion)
         if motion.at_ends is not None:
@@ -140,6 +142,7 @@ class State:
         given = np.zeros((6, 6)) if covariance is None else covariance
         self.filter.set_pose(A, covariances.of_pose_error(observer, given))
         self.was_contradicted = False
+        self.motion_noise.factors.forget_motion()
         self.forget_past('the pose was set')
 
     def clear_time(self) -> None:

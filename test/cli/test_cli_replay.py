@@ -28,7 +28,7 @@ REPORT_KEYS = {
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
     'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
     'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',
-    'unsmoothed_ate_rmse_m', 'smoothed_slips',
+    'unsmoothed_ate_rmse_m', 'smoothed_slips', 'motion_factors',
     'localised_after_s', 'unaligned_rmse_m', 'used', 'velocity_topic', 'landmarks_topic',
     'imu_topic', 'gains', 'truth_covered', 'configuration_anees',
 }  # fmt: skip

@@ -286,8 +286,8 @@ class Publishing:
         self.dropped = Counter()
         self.estimator = SimpleNamespace(
             counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
-            calibration=[], lyapunov=0.0, stamp_ns=None, velocity_is_stale=False,
-            is_localised=True,
+            calibration=[], motion_factors=[], lyapunov=0.0, stamp_ns=None,
+            velocity_is_stale=False, is_localised=True,
         )  # fmt: skip
         vars(self.estimator).update(estimate)
         self.feed = SimpleNamespace(

@@ -198,10 +198,11 @@ def _warn_of_rejections(result: Replay) -> None:
 
 
 def _warn_of_calibration(result: Replay) -> None:
-    """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
-    for part in result.estimator.calibration:
-        if part.problem:
-            logger.warning('%s', part.problem)
+    """Say what may be wrong if a scale, bias, delay or noise is one that nobody can mean."""
+    problems = [part.problem for part in result.estimator.calibration]
+    problems += [part.problem for part in result.estimator.motion_factors]
+    for problem in filter(None, problems):
+        logger.warning('%s', problem)
 
 
 def _warn_of_unmapped(result: Replay) -> None:
