@@ -87,6 +87,11 @@ class Hypotheses:
         """The most likely state."""
         return self._all[0].state
 
+    @property
+    def missed(self) -> float:
+        """Landmarks that should have been among the points without ids seen last, and were not."""
+        return self._all[0].visibility.missed
+
     def prune_to_best(self) -> State:
         """Give up all hypotheses but the most likely one, and return its state."""
         self._all = self._all[:1]
