@@ -28,7 +28,7 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
-from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import cholesky, mahalanobis, transpose, with_blocks
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.state import State
@@ -70,7 +70,7 @@ def find_assignments(
     margin = 0.0 if certain.all() else PRUNING_COST
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
     # Of the pairings that put the robot at one pose, the cheapest, which comes first.
-    scale = np.linalg.inv(np.linalg.cholesky(seen.noise[:, : axes.point, : axes.point]))
+    scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
     J = scale @ axes.output_matrix(seen.points)  # how a pose error moves the points, in σ
     assignments: list[Assignment] = []
     moves: list[FloatArray] = []

@@ -46,6 +46,9 @@ from slam_observer_ros.state.step import Outcome
 
 logger = logging.getLogger(__name__)
 
+DIVERGED_M = 1e9
+"""Distance from the start, metres, that no estimate has."""
+
 GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 """Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
 
@@ -173,16 +176,29 @@ class Estimator:
         else:  # in a map that does not grow there is nothing to carry into another one
             self._start(None)
 
-    def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
-        """Move the robot to ``pose`` (4, 4), body to world, as of ``stamp_ns``; the map stays.
+    def set_pose(
+        self,
+        pose: FloatArray,
+        covariance: FloatArray | None = None,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Move the robot to ``pose`` (4, 4), body to world; the map stays.
 
-        If the pose in a loaded map was unknown, it is known now. ``covariance`` (6, 6) is as in
-        :attr:`pose_covariance`; default exact. Raise :exc:`ParameterError` if one of them can't be
-        right; nothing is changed then.
+        It is where it was at ``stamp_ns``, nanoseconds, by default :attr:`stamp_ns`: the motion
+        since is added if it is known (:meth:`knows_motion_since`). If the pose in a loaded map was
+        unknown, it is known now. ``covariance`` (6, 6) is as in :attr:`pose_covariance`; default
+        exact. Raise :exc:`ParameterError` if one of them can't be right; nothing is changed then.
         """
         pose = rigid(pose, covariance)
         self._timeline.catch_up()
+        if stamp_ns is not None and self.knows_motion_since(stamp_ns):
+            known = np.zeros((6, 6)) if covariance is None else covariance
+            pose, covariance = self._timeline.moved_on(pose, known, stamp_ns)
         self._move_robot(pose, covariance)
+
+    def knows_motion_since(self, stamp_ns: int) -> bool:
+        """Return whether velocities are known from a stamp on, nanoseconds: of seconds at most."""
+        return self._timeline.knows_motion_since(stamp_ns)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.
@@ -269,11 +285,12 @@ class Estimator:
         Events used (``'velocity'``, ``'observation'``), late ones among them
         (``'late_velocity'``, ``'late_observation'``), points (``'observed_point'``), observations
         made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
-        (``'lost'``), the robot not where odometry had it (``'slip'``) or nothing in view where the
-        map has it (``'unexpected_place'``), landmarks (``'rejected_landmark'``,
-        ``'moved_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
-        ``'unsupported_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
-        ``'reserved_id'``).
+        (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
+        had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
+        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``) and points not used
+        (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
+        ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
@@ -505,8 +522,11 @@ class Estimator:
             self._warnings.late_velocity()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        needs_ids = not self._state.filter.has_joint_covariance
-        usable = usable_points(event, self.settings, needs_ids, self._counts, self._warnings)
+        state, warnings = self._state, self._warnings
+        needs_ids = not state.filter.has_joint_covariance
+        usable = usable_points(
+            event, self.settings, needs_ids, state.landmarks, self._counts, warnings
+        )
         event = self._timeline.synchronise(usable)
         self._doubt_rough_pose(event)
         outcome = self._hypotheses.observe(event)
@@ -541,6 +561,16 @@ class Estimator:
         elif (found := self._localiser.pose_by_tag(self._state)) is not None:
             self._start(found.pose, found.covariance)
             self._localiser.try_tag(found.tag_id)
+
+    def _start_again(self, distance_m: float) -> None:
+        """Start again where settings or measurements have led the estimate out of all bounds."""
+        logger.error(
+            'The estimate has diverged: the pose is %.1e m from its origin. Starting again; the '
+            'noise of velocities and landmarks may be set orders of magnitude wrong.',
+            distance_m,
+        )
+        self._counts['diverged'] += 1
+        self._start(None)
 
     def _move_robot(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the pose in a loaded map was not known, it is now."""
@@ -605,6 +635,9 @@ class Estimator:
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
         warnings.large_map(len(state.landmarks), limit, is_dense)
+        distance_m = np.abs(state.observer.A[:3, 3]).max()
+        if not distance_m <= DIVERGED_M:  # nor is what is no number
+            self._start_again(distance_m)
 
     def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
         observer = self._state.observer
