@@ -528,7 +528,8 @@ class Estimator:
             event, self.settings, needs_ids, state.landmarks, self._counts, warnings
         )
         event = self._timeline.synchronise(usable)
-        self._doubt_rough_pose(event)
+        if self._localiser.loaded is not None:
+            self._doubt_rough_pose(event)
         outcome = self._hypotheses.observe(event)
         self._localise(event, outcome)
         self._counts['observation'] += 1
