@@ -35,7 +35,7 @@ LEAST_SHARE = 0.01
 MAX_NAMED = 3
 
 ROUGH_STD = np.repeat([0.5, 1.0], 3)
-"""Standard deviations of a given pose, rad and m, beyond which points without ids can't be told by
+"""Standard deviations of a given pose, rad and m, beyond which points without ids can't be matched by
 where they are: they are then searched for as in a map where the pose is not known at all.
 """
 
@@ -90,7 +90,7 @@ class Localiser:
         self._comparisons, self._unexplained = Comparisons(), Unexplained()
 
     def may_be_rough(self, event: ObservationEvent) -> bool:
-        """Return whether points without ids are to be told by a given pose, for the first time."""
+        """Return whether points without ids are to be matched by a given pose, for the first time."""
         is_untried = self._trial is not None and self._trial.is_untried
         return is_untried and bool((event.ids == UNKNOWN_ID).any())
 
@@ -207,7 +207,7 @@ def is_lost(state: State) -> bool:
 
 
 def is_rough(covariance: FloatArray) -> bool:
-    """Return whether points without ids can't be told by a pose with a covariance (6, 6)."""
+    """Return whether points without ids can't be matched by a pose with a covariance (6, 6)."""
     return bool((np.diagonal(covariance) > ROUGH_STD**2).any())
 
 
