@@ -35,8 +35,8 @@ LEAST_SHARE = 0.01
 MAX_NAMED = 3
 
 ROUGH_STD = np.repeat([0.5, 1.0], 3)
-"""Standard deviations of a given pose, rad and m, beyond which points without ids can't be matched by
-where they are: they are then searched for as in a map where the pose is not known at all.
+"""Standard deviations of a given pose, rad and m, beyond which points can't be matched by where
+they are: the map is then searched as if the pose was not known at all.
 """
 
 
@@ -90,7 +90,7 @@ class Localiser:
         self._comparisons, self._unexplained = Comparisons(), Unexplained()
 
     def may_be_rough(self, event: ObservationEvent) -> bool:
-        """Return whether points without ids are to be matched by a given pose, for the first time."""
+        """Return whether points without ids are to be matched by a pose just given."""
         is_untried = self._trial is not None and self._trial.is_untried
         return is_untried and bool((event.ids == UNKNOWN_ID).any())
 
