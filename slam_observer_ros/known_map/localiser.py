@@ -65,14 +65,14 @@ class Localiser:
                 'taken for exact (use two_d_mode: true for a robot on a floor).'
             )
         self._refused = set()
-        self._search_anew()
+        self._search_again()
 
     def start(self, state: State, pose_is_given: bool, covariance: FloatArray | None) -> None:
         """Take a state at its start, in the loaded map if its pose there is given.
 
         ``covariance`` (6, 6) is that of the given pose; None for an exact one.
         """
-        self._search_anew()
+        self._search_again()
         self.is_localised = self.loaded is None or pose_is_given
         if self.loaded is not None and pose_is_given:
             start_in_map(state, self.loaded, covariance)
@@ -82,7 +82,7 @@ class Localiser:
         """Put a pose that was given on trial."""
         self._trial = None if self.loaded is None else PoseTrial(self.loaded)
 
-    def _search_anew(self) -> None:
+    def _search_again(self) -> None:
         """Take the pose in the map for unknown, and forget what was seen."""
         self.is_localised = False
         self._trial = self._finder = self._rough = self._tag = None
