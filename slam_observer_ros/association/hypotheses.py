@@ -117,7 +117,7 @@ class Hypotheses:
         As :meth:`.State.poses_until` of each hypothesis.
         """
         if not with_covariances:
-            passage = self.best.passage(velocities, start_ns, stamps_ns)
+            passage = self.best.passage(velocities, start_ns, stamps_ns, with_covariances)
             return self.best.observer.reference_pose @ passage.poses, None
         of_each = [one.state.poses_until(velocities, start_ns, stamps_ns) for one in self._all]
         return of_each[0][0], self._mixed(of_each)

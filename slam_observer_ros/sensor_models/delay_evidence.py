@@ -30,16 +30,23 @@ _PER_MEDIAN = 1.4826
 """Standard deviation over the median of the absolute value, of normal distributions."""
 
 
+SAMPLED = 3
+"""One of so many motions is looked at: only ratios of sums count, and time."""
+
+
 class DelayEvidence:
-    """Sums over the motions between observations."""
+    """Sums over motions between observations."""
 
     def __init__(self) -> None:
         self._information = self._noise = self._pull = 0.0
-        # (6,) mean of how velocities usually differ from the one before, and of how many motions.
-        self._steps, self._count = np.zeros(6), 0
+        # (6,) mean of how velocities usually differ from the one before, of how many motions.
+        self._steps, self._used, self._seen = np.zeros(6), 0, 0
 
     def add(self, velocities: VelocityHistory, motion: Motion, start_ns: int, end_ns: int) -> None:
         """Take in a motion between two stamps, of a state that estimates the delay."""
+        self._seen += 1
+        if self._seen % SAMPLED:
+            return
         delay_ns, reach_ns = motion.calibration.delay_ns, motion.calibration.delay_error_ns
         centres_ns = start_ns - delay_ns, end_ns - delay_ns
         stamps, V = velocities.between(centres_ns[0] - reach_ns, end_ns)
@@ -53,8 +60,8 @@ class DelayEvidence:
         period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) / NANOSECONDS_PER_SECOND
         # How much noise there is: as stated, or less where velocities differ less.
         steps = np.sort(np.abs(np.diff(V, axis=0)), axis=0)[(len(V) - 1) // 2]
-        self._count += 1
-        self._steps[axes] += (steps - self._steps[axes]) / self._count
+        self._used += 1
+        self._steps[axes] += (steps - self._steps[axes]) / self._used
         found = 0.5 * (_PER_MEDIAN * self._steps[axes]) ** 2 * period_s
         stated = np.diagonal(motion.covariances.sum(axis=0))[axes] / motion.duration_s
         is_noisy = stated > 0.0

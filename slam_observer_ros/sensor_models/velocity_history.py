@@ -165,7 +165,7 @@ class VelocityHistory:
         return means
 
     def between(self, start_ns: int, end_ns: int) -> tuple[IntArray, FloatArray]:
-        """Return stamps and velocities (m, 6) as measured, in force at times between two stamps."""
+        """Return stamps and measured velocities (m, 6) of those in force between two stamps."""
         rows = slice(
             max(bisect_right(self._stamps_ns, start_ns) - 1, 1),
             bisect_right(self._stamps_ns, end_ns),
