@@ -22,6 +22,9 @@ from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
 
+IMPOSSIBLE_ID = -(2**31)
+"""Landmark id of a point whose message has a number there that can't be one: it is not used."""
+
 MAX_ID = 2**32 - 2
 """Largest landmark id: those that go out are uint32, whose last one says that it is unknown."""
 
@@ -161,7 +164,7 @@ class ObservationEvent:
 
     def repeated_ids(self) -> list[int]:
         """Return the ids that more than one of the points has."""
-        ids = [landmark_id for landmark_id in self.ids.tolist() if landmark_id != UNKNOWN_ID]
+        ids = [landmark_id for landmark_id in self.ids.tolist() if landmark_id >= 0]
         if len(set(ids)) == len(ids):  # as nearly always
             return []
         return [landmark_id for landmark_id, count in Counter(ids).items() if count > 1]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_columns, print_json
+from slam_observer_ros.cli.figures import FIGURES
 from slam_observer_ros.cli.options import add_settings_options
 from slam_observer_ros.cli.outputs import add_force_option, check_outputs
 from slam_observer_ros.cli.replay.asked import (
@@ -18,7 +19,7 @@ from slam_observer_ros.cli.replay.asked import (
     without_outputs,
 )
 from slam_observer_ros.cli.replay.run import replayed, select_inputs
-from slam_observer_ros.cli.replay.summary import ACCURACY_ROWS, as_json
+from slam_observer_ros.cli.replay.summary import as_json
 from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.plots.drawing import SUFFIXES
@@ -29,7 +30,6 @@ from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.settings.input_settings import InputSettings
 
 TUM_SUFFIXES = ('.tum', '.txt')
-FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')
 
 
 @dataclass(frozen=True, slots=True, eq=False)

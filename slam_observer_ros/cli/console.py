@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
-import json
 import logging
 import sys
 import threading
 from typing import TypeVar
 
 from slam_observer_ros.cli.interrupts import leaving_at_once
+from slam_observer_ros.common.digits import json_text
 
 PROGRAM = 'slam-observer'
 
@@ -144,7 +144,7 @@ def shown_steps(description: str) -> Iterator[Callable[[], None]]:
 
 def print_json(result: Mapping[str, object]) -> None:
     """Print one JSON object, on one line, on standard output."""
-    sys.stdout.write(json.dumps(result, allow_nan=False) + '\n')
+    sys.stdout.write(json_text(result) + '\n')
 
 
 def print_table(title: str, rows: Mapping[str, str]) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slam_observer_ros.cli.interrupts import leaving_at_once
+from slam_observer_ros.cli.interrupts import leaving_at_once, SIGNALLED, stopping_once
 
 with leaving_at_once():
     import argparse
@@ -27,8 +27,6 @@ with leaving_at_once():
 EXIT_ERROR = 2
 EXIT_LOSS = 3
 EXIT_INCOMPLETE = 4
-EXIT_SIGNAL = 128
-"""To which the number of the signal that ended the program is added, as shells do."""
 
 EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EXIT_INCOMPLETE}
 
@@ -104,6 +102,7 @@ def make_parser(arguments: Sequence[str]) -> Parser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
+    stop = stopping_once()
     if sys.stdout is None:  # a shell has closed it
         sys.stdout = Path(os.devnull).open('w', encoding='utf-8')  # noqa: SIM115 (till the end)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -114,9 +113,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if (typed := typed_words(os.environ)) is not None:
             complete(make_parser(typed))
         use_one_thread()
-        args = make_parser(words).parse_args(words)
-        # SystemExit, unlike the signal's default, lets unfinished files be cleared away.
-        signal.signal(signal.SIGTERM, lambda number, _stack: sys.exit(EXIT_SIGNAL + number))
+        with leaving_at_once():
+            args = make_parser(words).parse_args(words)
+        # Unlike its default, this lets unfinished files be cleared away.
+        signal.signal(signal.SIGTERM, stop)
         args.run(args)
         sys.stdout.flush()
     except (SlamObserverError, OSError) as error:
@@ -128,7 +128,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _explain_missing(error)
         return EXIT_ERROR
     except KeyboardInterrupt:
-        return EXIT_SIGNAL + signal.SIGINT
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the interpreter would end by another one
+        return SIGNALLED + signal.SIGINT
     return 0
 
 
@@ -146,7 +147,7 @@ def _explain_missing(error: ModuleNotFoundError) -> None:
 def _leave_broken_pipe() -> int:
     """Let the interpreter flush to nowhere at exit: whoever read the output has gone."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return EXIT_SIGNAL + signal.SIGPIPE
+    return SIGNALLED + signal.SIGPIPE
 
 
 if __name__ == '__main__':

@@ -1,7 +1,9 @@
-"""Numbers as people read them."""
+"""Numbers as people read them, and as JSON has them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+import json
 import math
 
 _LEAST = 1e-4
@@ -16,3 +18,19 @@ def significant(value: float, digits: int = 3) -> str:
         return f'{value:.{digits - 1}e}'
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
     return f'{value:.{max(decimals, 0)}f}'
+
+
+def json_text(value: object, *, is_compact: bool = False) -> str:
+    """Return a value as JSON on one line: null for what is not finite, which JSON can't say."""
+    separators = (',', ':') if is_compact else None
+    return json.dumps(_finite(value), allow_nan=False, separators=separators)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(entry) for entry in value]
+    return value

@@ -16,6 +16,7 @@ from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
     flatten,
+    IMPOSSIBLE_ID,
     is_automatic,
     MAX_ID,
     ObservationEvent,
@@ -216,7 +217,7 @@ def _check_observation(event: ObservationEvent) -> None:
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'ids {event.ids.shape} for {m} landmark points')
     for landmark_id in event.ids.tolist():
-        if landmark_id < 0 and landmark_id != UNKNOWN_ID:
+        if landmark_id < 0 and landmark_id not in (UNKNOWN_ID, IMPOSSIBLE_ID):
             raise InvalidEventError('negative_id', f'landmark id {landmark_id} is negative')
         if landmark_id > MAX_ID:
             raise InvalidEventError('too_large', f'landmark id {landmark_id} is beyond {MAX_ID}')
@@ -314,6 +315,10 @@ def usable_points(
     event = flatten(event) if settings.two_d_mode else event
     if event.orientations is not None and settings.use_tag_orientation:
         event = replace(event, orientations=so3.exact(event.orientations))
+    if (impossible := event.ids == IMPOSSIBLE_ID).any():
+        warnings.impossible_ids(int(np.sum(impossible)))
+        counts['impossible_id'] += int(np.sum(impossible))
+        event = event.select(~impossible)
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
         warnings.reserved_ids(event.ids[reserved].tolist())

@@ -173,16 +173,29 @@ class Estimator:
         else:  # in a map that does not grow there is nothing to carry into another one
             self._start(None)
 
-    def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
-        """Move the robot to ``pose`` (4, 4), body to world, as of ``stamp_ns``; the map stays.
+    def set_pose(
+        self,
+        pose: FloatArray,
+        covariance: FloatArray | None = None,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Move the robot to ``pose`` (4, 4), body to world; the map stays.
 
-        If the pose in a loaded map was unknown, it is known now. ``covariance`` (6, 6) is as in
-        :attr:`pose_covariance`; default exact. Raise :exc:`ParameterError` if one of them can't be
-        right; nothing is changed then.
+        It is where it was at ``stamp_ns``, nanoseconds, by default :attr:`stamp_ns`: the motion
+        since is added if it is known (:meth:`knows_motion_since`). If the pose in a loaded map was
+        unknown, it is known now. ``covariance`` (6, 6) is as in :attr:`pose_covariance`; default
+        exact. Raise :exc:`ParameterError` if one of them can't be right; nothing is changed then.
         """
         pose = rigid(pose, covariance)
         self._timeline.catch_up()
+        if stamp_ns is not None and self.knows_motion_since(stamp_ns):
+            known = np.zeros((6, 6)) if covariance is None else covariance
+            pose, covariance = self._timeline.moved_on(pose, known, stamp_ns)
         self._move_robot(pose, covariance)
+
+    def knows_motion_since(self, stamp_ns: int) -> bool:
+        """Return whether velocities are known from a stamp on, nanoseconds: of seconds at most."""
+        return self._timeline.knows_motion_since(stamp_ns)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.
@@ -273,7 +286,7 @@ class Estimator:
         map has it (``'unexpected_place'``), landmarks (``'rejected_landmark'``,
         ``'moved_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
         ``'unsupported_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
-        ``'reserved_id'``).
+        ``'reserved_id'``, ``'impossible_id'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 

@@ -64,6 +64,11 @@ class EventWarnings:
         )
         self._warn('reserved_id', text)
 
+    def impossible_ids(self, count: int) -> None:
+        """Warn that points of an observation have numbers in place of ids that can't be any."""
+        text = f'Not used: {count} points of an observation, whose ids are fractional, below -1, '
+        self._warn('impossible_id', f'{text}or more than their field holds')
+
     def unknown_ids(self, gains: str) -> None:
         """Warn that these gains can't use points without an id."""
         text = f'Points without an id are not used by {gains} gains, only by riccati'

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from importlib import resources
-import json
 from pathlib import Path
 
+from slam_observer_ros.common.digits import json_text
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.output_files import unfinished_file
 from slam_observer_ros.report.data import report_data
@@ -24,7 +24,7 @@ def write_report(path: Path, run: ReportedRun) -> None:
     for mark, name in _PARTS.items():
         page = page.replace(f'@{mark}@', asset(name), 1)
     # In a script element only `<` could end it.
-    numbers = json.dumps(report_data(run), allow_nan=False, separators=(',', ':'))
+    numbers = json_text(report_data(run), is_compact=True)
     page = page.replace('@NUMBERS@', numbers.replace('<', '\\u003c'), 1)
     try:
         with unfinished_file(path) as file:

@@ -46,7 +46,7 @@ def write_index_page(path: Path, title: str, summary: str, tables: Sequence[Inde
         page = page.replace(f'@{mark}@', part)
     try:
         with unfinished_file(path) as file:
-            file.write(page)
+            file.write(page.encode(errors='replace').decode())  # names may be no Unicode
     except OSError as error:
         raise OutputError(f"can't write {path}: {error.strerror}") from error
 

@@ -193,6 +193,11 @@ class VelocityHistory:
             return np.zeros(6)
         return self._counting(held_ns.dot(self._written().body_velocities[pieces.rows]) / known_ns)
 
+    @property
+    def begins_ns(self) -> int | None:
+        """Stamp since which velocities are known, nanoseconds; None while there are none."""
+        return self._stamps_ns[1] if len(self._stamps_ns) > 1 else None
+
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
         first, count = bisect_right(self._stamps_ns, stamp_ns) - 1, len(self._stamps_ns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 import re
@@ -16,6 +17,7 @@ from command_line import CommandLine
 import pytest
 from recordings import write_mcap, write_rosbag1
 
+from slam_observer_ros.cli.batch.index import write_index
 from slam_observer_ros.cli.batch.jobs import grid_points, part_of
 from slam_observer_ros.cli.batch.pool import local_pool
 from slam_observer_ros.cli.batch.run_log import opened_log, read_logs
@@ -23,6 +25,16 @@ from slam_observer_ros.common.errors import OutputError
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 PATIENCE_S = 60.0
+RUN = {
+    'run': 'a',
+    'recording': 'one.mcap',
+    'recording_sha256': '0',
+    'version': '1',
+    'settings': {},
+    'grid': {},
+    'warnings': [],
+}
+"""What a line has at least."""
 GRID = ('--grid', 'point_noise=0.02,0.05', '--grid', 'observation_model=cartesian')
 
 
@@ -223,13 +235,23 @@ def _is_alive(group: int) -> bool:
 
 def test_no_two_batches_write_to_one_file(tmp_path):
     with opened_log(tmp_path / 'runs.jsonl') as log:
-        log.append({'run': 'a'})
+        log.append(RUN)
         with (
             pytest.raises(OutputError, match='another batch'),
             opened_log(tmp_path / 'runs.jsonl'),
         ):
             pass
-    assert read_logs(tmp_path) == {'a': {'run': 'a'}}
+    assert read_logs(tmp_path)['a'].items() >= RUN.items()
+
+
+def is_ctrl_c_held_back(_: int) -> bool:
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_ctrl_c_reaches_no_process_that_begins():
+    (ended,) = local_pool(1).run(is_ctrl_c_held_back, [1])
+    assert ended.result
+    assert not is_ctrl_c_held_back(1)
 
 
 def halve_or_die(number: int) -> float:
@@ -247,6 +269,90 @@ def test_a_run_that_kills_its_process_stops_no_other():
     assert ended[5].failure == 'ZeroDivisionError: five'
     others = [ended[number] for number in range(8) if number not in (3, 5)]
     assert [one.result for one in others] == [one.job / 2 for one in others]
+
+
+def test_files_that_are_asked_for_later_are_written_later(slam_observer, recordings, tmp_path):
+    out = tmp_path / 'results'
+    command = ('batch', *recordings, '--out', out, '--workers', 1, '--json')
+    slam_observer.succeed(*command)
+    assert slam_observer.succeed(*command, '--reports').json['done_before'] == 0
+    assert slam_observer.succeed(*command, '--trajectories').json['done_before'] == 0
+    both = (*command, '--reports', '--trajectories')
+    assert slam_observer.succeed(*both).json['done_before'] == 2
+    lines = read_logs(out).values()
+    assert len(lines) == 2
+    for line in lines:
+        assert (out / line['report']).is_file()
+        assert (out / line['trajectory']).is_file()
+        assert line['report'] in (out / 'index.html').read_text()
+    (out / line['report']).unlink()
+    assert slam_observer.succeed(*both).json['done_before'] == 1
+    assert (out / line['report']).is_file()
+
+
+@pytest.mark.parametrize(
+    'line',
+    [
+        'null',
+        '17',
+        '"run"',
+        '[]',
+        '[{"run": "a"}]',
+        '{}',
+        '{"run": "a"',
+        '{"run": 1}',
+        '[' * 100_000,
+        '9' * 5000,
+        '\0',
+        *(json.dumps({**RUN, name: None}) for name in RUN),
+        *(json.dumps({**RUN, name: 'x'}) for name in ('settings', 'grid', 'warnings')),
+        *(json.dumps({**RUN, 'ate_rmse_m': figure}) for figure in ('x', [], True, math.inf)),
+        json.dumps({**RUN, 'anees': 10**400}),
+        json.dumps({**RUN, 'warnings': [None]}),
+        json.dumps({**RUN, 'report': 5}),
+    ],
+)
+def test_a_line_that_is_no_run_is_left_out_and_named(tmp_path, caplog, line):
+    valid = json.dumps({**RUN, 'recording': 'of another \udc80 place.mcap', 'ate_rmse_m': 0.5})
+    (tmp_path / 'runs-a.jsonl').write_text(f'{valid}\n{line}\n')
+    (tmp_path / 'runs-b.jsonl').write_text(line)
+    os.mkfifo(tmp_path / 'runs-c.jsonl')
+    lines = read_logs(tmp_path)
+    assert list(lines) == ['a']
+    (warning,) = [record.message for record in caplog.records]
+    assert 'runs-a.jsonl: 1 lines are no runs of a batch, and left out (line 2: ' in warning
+    write_index(tmp_path, lines, 'ate_rmse_m')
+    page = (tmp_path / 'index.html').read_text()
+    assert 'of another ? place.mcap' in page
+    assert '1 runs of 1 recordings' in page
+
+
+def test_a_batch_goes_on_where_a_line_is_no_run(slam_observer, recordings, tmp_path):
+    out = tmp_path / 'results'
+    out.mkdir()
+    (out / 'runs.jsonl').write_text('{"run": "0"}\n{"run": "00')
+    ended = slam_observer('batch', recordings[1], '--out', out, '--workers', 1)
+    assert (ended.code, ended.errors.count('\n')) == (0, 1)
+    assert [line['recording'] for line in read_logs(out).values()] == [str(recordings[1])]
+
+
+def test_a_whole_line_without_an_end_is_kept(slam_observer, recordings, tmp_path):
+    out = tmp_path / 'results'
+    command = ('batch', recordings[1], '--out', out, '--workers', 1, '--json')
+    slam_observer.succeed(*command)
+    content = (out / 'runs.jsonl').read_bytes()
+    (out / 'runs.jsonl').write_bytes(content.rstrip())
+    assert slam_observer.succeed(*command).json['done_before'] == 1
+    assert (out / 'runs.jsonl').read_bytes() == content
+
+
+def test_a_figure_that_json_has_not_stops_no_batch(slam_observer, recordings, tmp_path):
+    out = tmp_path / 'results'
+    grid = ('--grid', 'calibration_drift=0.01')
+    slam_observer.succeed('batch', recordings[0], *grid, '--out', out, '--workers', 1)
+    (line,) = lines_of(out)
+    assert line['calibration']['angular_bias_z']['stated'] is None
+    assert '<td>' in (out / 'index.html').read_text()
 
 
 def test_the_index_links_reports_and_sorts(slam_observer, tmp_path):

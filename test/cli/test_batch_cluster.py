@@ -102,6 +102,29 @@ def test_a_cluster_that_loses_a_worker_does_every_run_once(cluster, capsys, tmp_
         assert (remote / file).read_bytes() == (local / file).read_bytes()
 
 
+ADDRESSES = ('tls://127.0.0.1:9', '', 'host', 'tcp:', 'tcp://[x:1', 'inproc://x', 'http://a:1')
+
+
+def test_a_scheduler_that_can_not_be_is_an_error_in_one_line(tmp_path):
+    # In a process of its own, as what a client leaves behind shows when that ends.
+    options = ('batch', str(SAMPLE), '--out', str(tmp_path / 'r'), '--scheduler')
+    program = (
+        'from slam_observer_ros.cli.main import main\n'
+        'print(*(main([*{}, address]) for address in {}))'
+    )
+    ended = subprocess.run(
+        [sys.executable, '-c', program.format(options, ADDRESSES)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert ended.stdout.split() == ['2'] * len(ADDRESSES)
+    lines = ended.stderr.splitlines()
+    assert len(lines) == len(ADDRESSES)
+    assert all('no Dask scheduler answers there' in line for line in lines)
+
+
 def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(capsys, tmp_path):
     options = ('batch', SAMPLE, '--out', tmp_path / 'r', '--scheduler', 'tcp://127.0.0.1:9')
     assert 'no Dask scheduler answers there' in CommandLine(capsys).fail(*options)

@@ -174,6 +174,37 @@ def test_stopped_in_the_middle(tmp_path, stop):
     assert not list(tmp_path.iterdir())
 
 
+STOPPED_TWICE = """
+import atexit, signal, sys
+from slam_observer_ros.cli import doctor, main
+
+def run(args):
+    try:
+        signal.raise_signal(signal.{first})
+    finally:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.{first})
+        print('cleared away')
+
+doctor.run = run
+atexit.register(signal.raise_signal, signal.SIGINT)
+sys.exit(main.main(['doctor']))
+"""
+
+
+@pytest.mark.parametrize('first', [signal.SIGINT, signal.SIGTERM])
+def test_a_second_ctrl_c_disturbs_no_clearing_away(first):
+    ended = subprocess.run(
+        [sys.executable, '-c', STOPPED_TWICE.format(first=first.name)],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (128 + first, 'cleared away\n', '')
+
+
 @pytest.mark.parametrize('module', ['rich', 'numpy', 'scipy'])
 def test_interrupted_while_modules_load(tmp_path, module):
     # Python itself makes such errors of an interrupt, in __set_name__.
@@ -222,11 +253,15 @@ def test_what_is_not_needed_is_not_imported(arguments, unneeded):
     assert not unneeded & set(ended.stderr.split())
 
 
-@pytest.mark.parametrize('absent', ['rosbags', 'rich'])
+@pytest.mark.parametrize('absent', ['rosbags', 'mcap', 'rich'])
 def test_what_only_the_command_line_needs_is_named_when_missing(tmp_path, absent):
     program = program_without([absent], 'slam_observer_ros.cli.main', tmp_path)
+    recording = CHECKOUT / 'samples/sample.mcap'
+    if absent == 'rosbags':  # which MCAP files do without
+        recording = tmp_path / 'other.db3'
+        recording.touch()
     ended = subprocess.run(
-        [sys.executable, program, *('replay', 'samples/sample.mcap')],
+        [sys.executable, program, 'replay', str(recording)],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,

@@ -16,11 +16,13 @@ from slam_observer_ros.events import ObservationEvent, VelocityEvent
 from slam_observer_ros.recording.writer import RecordingWriter
 from slam_observer_ros.runs.likelihood import Likelihood
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.parameter_table import changed_names, table
 from slam_observer_ros.simulation import Scenario, Simulation
 
 START_NS = 1_000_000_000
 TURN_NOISE, DRIVE_NOISE, POINT_NOISE_M = 0.03, 0.02, 0.05
 MODEL = ('--set', 'observation_model=cartesian', '--set', 'angular_bias_stddev=[0,0,0]')
+MODELS = next(row.choices for row in table(Settings) if row.name == 'observation_model')
 TRUE_NOISE = {
     'angular_velocity_noise': TURN_NOISE,
     'linear_velocity_noise': DRIVE_NOISE,
@@ -125,6 +127,15 @@ def test_figures_of_a_kind_keep_their_proportions():
     assert changed.angular_velocity_noise == pytest.approx(settings.angular_velocity_noise)
     assert changed.bearing_noise > 0.0
     assert 'range_scale_noise' not in kinds[2].parameters
+
+
+@pytest.mark.parametrize('model', MODELS)
+def test_every_model_of_observations_has_figures_to_tune(model):
+    kinds = kinds_of(Settings(observation_model=model))
+    figures = [name for kind in kinds for name in kind.parameters]
+    assert len(figures) > 2
+    changed = scaled(Settings(), kinds, [0.5] * len(kinds))
+    assert set(changed_names(changed)) == set(figures)
 
 
 def test_the_search_finds_the_maximum_and_how_sharp_it_is():

@@ -20,9 +20,21 @@ from slam_observer_ros.cli.batch.jobs import (
     shard_of,
 )
 from slam_observer_ros.cli.batch.pool import cluster_pool, local_pool, Pool
-from slam_observer_ros.cli.batch.run_log import log_name, opened_log, read_logs, write_failures
+from slam_observer_ros.cli.batch.run_log import (
+    Line,
+    log_name,
+    opened_log,
+    read_logs,
+    write_failures,
+)
 from slam_observer_ros.cli.batch.worker import REPORTS, TRAJECTORIES, Work
-from slam_observer_ros.cli.console import print_json, print_table, show_message, show_runs
+from slam_observer_ros.cli.console import (
+    muted_warnings,
+    print_json,
+    print_table,
+    show_message,
+    show_runs,
+)
 from slam_observer_ros.cli.options import add_settings_options
 from slam_observer_ros.cli.replay.asked import add_run_options, read_asked
 from slam_observer_ros.cli.replay.identity import sha256_of
@@ -110,7 +122,9 @@ def run(args: argparse.Namespace) -> None:
             if recording in hashes
             for number in part
         ]
-        left = _without_repeats(job for job in jobs if job.run_id not in done_before)
+        left = _without_repeats(
+            job for job in jobs if not _is_done(args, done_before.get(job.run_id))
+        )
         try:
             ended_runs = pool.run(Work(args, args.out.absolute()), left)
             for ended in show_runs(ended_runs, 'running', len(left)):
@@ -123,7 +137,9 @@ def run(args: argparse.Namespace) -> None:
             raise
         finally:
             write_failures(args.out / log_name('failed', args.shard), failures)
-            write_index(args.out, read_logs(args.out), args.score)
+            with muted_warnings():  # which were shown before
+                lines = read_logs(args.out)
+            write_index(args.out, lines, args.score)
     _report(args, [job.run_id for job in jobs], len(left), failures)
 
 
@@ -146,6 +162,15 @@ def _make_folders(args: argparse.Namespace) -> None:
     for name, is_wanted in folders:
         if is_wanted:
             (args.out / name).mkdir(exist_ok=True)
+
+
+def _is_done(args: argparse.Namespace, line: Line | None) -> bool:
+    """Return whether a run is in the log, and the files of it that are asked for are there."""
+    if line is None:
+        return False
+    wanted = {'report': args.reports, 'trajectory': args.trajectories}
+    files = [line[kind] for kind, is_wanted in wanted.items() if is_wanted]
+    return all(file is not None and (args.out / file).is_file() for file in files)
 
 
 def _parts(

@@ -11,8 +11,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from slam_observer_ros.cli.batch.run_log import Line
-from slam_observer_ros.cli.replay.summary import ACCURACY_ROWS
+from slam_observer_ros.cli.batch.run_log import FILES, Line
+from slam_observer_ros.cli.figures import ACCURACY_ROWS, FIGURES
 from slam_observer_ros.report.run_index import Cell, IndexTable, Link, write_index_page
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.parameter_table import table
@@ -22,7 +22,6 @@ INDEX = 'index.html'
 SCORES = tuple(name for name in ACCURACY_ROWS if 'anees' not in name)
 """Figures of which the least is the best."""
 
-_FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')
 _DEFAULTS = {row.name: row.default for row in table(Settings)}
 
 
@@ -30,7 +29,7 @@ def write_index(directory: Path, lines: Mapping[str, Line], score: str) -> None:
     """Write index.html of all runs of a directory."""
     runs = sorted(lines.values(), key=lambda line: (_score(line, score), line['recording']))
     names = _varying(runs)
-    figures = [name for name in _FIGURES if any(run.get(name) is not None for run in runs)]
+    figures = [name for name in FIGURES if any(run.get(name) is not None for run in runs)]
     recordings = {run['recording_sha256'] for run in runs}
     tables = [
         _settings_table(runs, names, figures, score),
@@ -106,13 +105,13 @@ def _runs_table(
                 *(_text(run, name) for name in names),
                 *(run.get(name) for name in figures),
                 '; '.join(run['warnings']),
-                *(_file(run, kind) for kind in ('report', 'trajectory')),
+                *(_file(run, kind) for kind in FILES),
                 run['run'],
             ]
         )
-    headings = ['recording', *names, *figures, 'warnings', 'report', 'trajectory', 'run']
+    headings = ['recording', *names, *figures, 'warnings', *FILES, 'run']
     return IndexTable('Runs', headings, rows, frozenset(best.values()))
 
 
 def _file(run: Line, kind: str) -> Link | str:
-    return Link(kind, quote(run[kind])) if run[kind] else ''
+    return Link(kind, quote(run[kind], errors='replace')) if run[kind] else ''

@@ -5,6 +5,7 @@ Both are executors of ``concurrent.futures``, so there is one way through.
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
@@ -79,7 +80,8 @@ class Pool:
         while running or (waiting and not suspects):
             while waiting and not suspects and len(running) < self.width:
                 try:
-                    running[executor.submit(work, waiting[0])] = waiting[0]
+                    with _ctrl_c_held_back():
+                        running[executor.submit(work, waiting[0])] = waiting[0]
                 except BrokenExecutor:
                     break
                 waiting.popleft()
@@ -132,6 +134,16 @@ def _processes(count: int) -> Iterator[Executor]:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
+@contextmanager
+def _ctrl_c_held_back() -> Iterator[None]:
+    """Hold Ctrl-C back, also from processes that begin here, until they are prepared for it."""
+    held_before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, held_before)
+
+
 def _prepare_process() -> None:
     """Leave Ctrl-C to the batch, and end with it, also when it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -150,14 +162,26 @@ def _cluster(address: str, _: int) -> Iterator[Executor]:
     try:
         from distributed import Client
         from distributed.cfexecutor import ClientExecutor
+        from distributed.comm import connect
+        from distributed.security import Security
     except ImportError as error:
         raise UsageError(
             "--scheduler needs Dask: pip install 'slam_observer_ros[cluster]'"
         ) from error
+
+    async def try_to_connect() -> None:
+        options = Security().get_connection_args('client')
+        await (await connect(address, CONNECT_S, **options)).close()
+
     try:
+        # A client that has failed would try to close its connection when the program ends.
+        asyncio.run(asyncio.wait_for(try_to_connect(), CONNECT_S))
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise UsageError(f'--scheduler {address}: no Dask scheduler answers there') from error
+    except Exception as error:  # of any kind, as what an address is depends on its protocol
+        reason = f': {error}' if str(error) else ''
+        raise UsageError(
+            f'--scheduler {address}: no Dask scheduler answers there{reason}'
+        ) from error
     with client:
         executor: Executor = ClientExecutor(client, pure=False)
         try:

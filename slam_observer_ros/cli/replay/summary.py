@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
-import math
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_table
+from slam_observer_ros.cli.figures import ACCURACY_ROWS, figure_text
 from slam_observer_ros.cli.replay.dropped import list_dropped
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
-from slam_observer_ros.common.digits import significant
 from slam_observer_ros.estimates import point_share, UNUSED_POINTS, used_points
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.runs.replay import Replay
@@ -22,25 +21,11 @@ NEARLY_ALL = 0.99
 LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported')
 """What may happen to landmarks of the map; counted under these names."""
 
-ACCURACY_ROWS = {
-    'ate_rmse_m': ('position error (ATE), RMS', 'm after alignment'),
-    'dead_reckoning_ate_rmse_m': ('of the velocities alone', 'm after alignment'),
-    'unaligned_rmse_m': ('position error, not aligned', "m if the truth is in the map's frame"),
-    'heading_rmse_rad': ('heading error, RMS', '° after alignment'),
-    'landmark_rmse_m': ('landmark error, RMS', 'm after alignment'),
-    'configuration_rmse_m': ('configuration error, RMS', 'm, not aligned'),
-    'anees': ('ANEES of the pose', '(1 is consistent)'),
-    'configuration_anees': ('ANEES of the configuration', '(1 is consistent)'),
-    'smoothed_ate_rmse_m': ('smoothed: position error, RMS', 'm after alignment'),
-    'smoothed_landmark_rmse_m': ('smoothed: landmark error, RMS', 'm after alignment'),
-}
-"""Figures of ``--json`` that are in the table, their names there and their units."""
-
 
 def as_json(outcome: ReplayOutcome) -> dict[str, object]:
     """Return the figures as ``--json`` prints them; null is what was not measured."""
     estimator, accuracy = outcome.result.estimator, outcome.accuracy
-    errors = accuracy.pose_errors
+    errors, after = accuracy.pose_errors, outcome.smoothed_accuracy
     selected = outcome.selected
     return {
         'velocity_topic': selected.velocity.name,
@@ -67,8 +52,10 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'configuration_anees': accuracy.configuration_anees,
         'nis': None if outcome.recorder is None else outcome.recorder.mean_nis,
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
-        'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
-        'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,
+        'unsmoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.online_errors),
+        'smoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.pose_errors),
+        'smoothed_landmark_rmse_m': None if after is None else after.landmark_rmse_m,
+        'smoothed_slips': None if outcome.smoothed is None else outcome.smoothed.slips,
     }
 
 
@@ -102,6 +89,8 @@ def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
         rows['lost'] = _loss_text(outcome)
     if slips := estimator.counts['slip']:
         rows['slips'] = f'{slips} × the robot was not where odometry had it'
+        if outcome.smoothed is not None:
+            rows['slips'] += f'; all that was seen confirms {outcome.smoothed.slips}'
     if unexpected := estimator.counts['unexpected_place']:
         rows['unexpected places'] = f'{unexpected} × nothing seen was where the map has it'
     if outcome.localised_after_s is not None:
@@ -144,11 +133,6 @@ def _points_text(counts: Counter[str]) -> str:
     return ', '.join(parts)
 
 
-def _figure_text(key: str, figure: float, unit: str) -> str:
-    """Return a figure of ``--json`` as people read it: angles in degrees."""
-    return f'{significant(math.degrees(figure) if key.endswith("_rad") else figure)} {unit}'
-
-
 def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
     """Say of how much of the trajectory the figures are, if not of nearly all."""
     share = outcome.truth_covered
@@ -159,8 +143,10 @@ def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
 
 def _accuracy_rows(outcome: ReplayOutcome) -> dict[str, str]:
     figures = as_json(outcome)
+    if figures['unsmoothed_ate_rmse_m'] == figures['ate_rmse_m']:  # all of it is smoothed
+        figures['unsmoothed_ate_rmse_m'] = None
     rows = _covered_rows(outcome) | {
-        name: _figure_text(key, figure, unit)
+        name: figure_text(key, figure, unit)
         for key, (name, unit) in ACCURACY_ROWS.items()
         if isinstance(figure := figures[key], float)
     }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
-import math
 from pathlib import Path
 
 from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
@@ -144,8 +143,7 @@ def _print(
                 zip([kind.name for kind in kinds], found.log_factors.tolist(), strict=True)
             ),
             'log_factor_deviations': {
-                kind.name: deviation if math.isfinite(deviation) else None
-                for kind, deviation in zip(kinds, deviations, strict=True)
+                kind.name: deviation for kind, deviation in zip(kinds, deviations, strict=True)
             },
             'held_out': asdict(verdict),
         }

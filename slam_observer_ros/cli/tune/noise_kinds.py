@@ -36,6 +36,7 @@ _OF_POINTS = {
         NoiseKind('range', ('range_noise', 'range_scale_noise')),
         NoiseKind('bearing', ('bearing_noise',)),
     ),
+    'fiducial': (NoiseKind('pixels', ('pixel_noise',)),),
     'cartesian': (NoiseKind('points', ('point_noise',)),),
     'stereo': (
         NoiseKind('pixels', ('pixel_noise',)),
@@ -59,7 +60,7 @@ def scaled(
 ) -> Settings:
     """Return settings whose figures of each kind have grown by a factor, given as its logarithm.
 
-    None gets smaller than its parameter may be.
+    None gets smaller or larger than its parameter may be.
     """
     values: dict[str, Any] = {}
     for kind, log_factor in zip(kinds, log_factors, strict=True):
@@ -69,6 +70,7 @@ def scaled(
 
 
 def _scaled(name: str, value: Value, factor: float) -> Value:
-    if isinstance(value, tuple):
-        return tuple(factor * entry for entry in value)
-    return min(max(factor * float(value), _ROWS[name].minimum), _ROWS[name].maximum)
+    row = _ROWS[name]
+    entries = value if isinstance(value, tuple) else (float(value),)
+    within = tuple(min(max(factor * entry, row.minimum), row.maximum) for entry in entries)
+    return within if isinstance(value, tuple) else within[0]

@@ -33,7 +33,7 @@ MANY_UNUSED = 20  # messages, none of which was used, that are no transient of t
 USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
 """Inputs, and what their messages are counted as when they are used."""
 
-LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id', 'reserved_id')
+LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id', 'reserved_id', 'impossible_id')
 """Points not used for something that is wrong; those that are not in a known map may be right."""
 
 
@@ -207,7 +207,7 @@ class DiagnosticsPublisher:
     def _points_warning(new: Counter[str]) -> str:
         """Report points left out since the last time: most of them, or for their ids."""
         left_out = {name: new[name] for name in LEFT_OUT if new[name]}
-        of_wrong_ids = new['repeated_id'] + new['reserved_id']
+        of_wrong_ids = new['repeated_id'] + new['reserved_id'] + new['impossible_id']
         if not (of_wrong_ids or 2 * sum(left_out.values()) > new['observed_point']):
             return ''
         reasons = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())

@@ -1,0 +1,30 @@
+"""The figures of a run that people compare, by their names in JSON."""
+
+from __future__ import annotations
+
+import math
+
+from slam_observer_ros.common.digits import significant
+
+ACCURACY_ROWS = {
+    'ate_rmse_m': ('position error (ATE), RMS', 'm after alignment'),
+    'dead_reckoning_ate_rmse_m': ('of the velocities alone', 'm after alignment'),
+    'unaligned_rmse_m': ('position error, not aligned', "m if the truth is in the map's frame"),
+    'heading_rmse_rad': ('heading error, RMS', '° after alignment'),
+    'landmark_rmse_m': ('landmark error, RMS', 'm after alignment'),
+    'configuration_rmse_m': ('configuration error, RMS', 'm, not aligned'),
+    'anees': ('ANEES of the pose', '(1 is consistent)'),
+    'configuration_anees': ('ANEES of the configuration', '(1 is consistent)'),
+    'unsmoothed_ate_rmse_m': ('of the part that is smoothed, online', 'm after alignment'),
+    'smoothed_ate_rmse_m': ('smoothed: position error, RMS', 'm after alignment'),
+    'smoothed_landmark_rmse_m': ('smoothed: landmark error, RMS', 'm after alignment'),
+}
+"""Figures of ``--json`` that are in the table, their names there and their units."""
+
+FIGURES = (*ACCURACY_ROWS, 'nis', 'seconds')
+"""What runs are compared by."""
+
+
+def figure_text(key: str, figure: float, unit: str) -> str:
+    """Return a figure as people read it: angles in degrees."""
+    return f'{significant(math.degrees(figure) if key.endswith("_rad") else figure)} {unit}'
