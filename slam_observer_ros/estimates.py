@@ -14,6 +14,7 @@ UNUSED_POINTS = {
     'unknown_id': 'without id',
     'repeated_id': 'of a repeated id',
     'reserved_id': 'of a reserved id',
+    'unweighed_point': 'more than can be weighed',
     'impossible_id': 'of an impossible id',
     'unmapped_landmark': 'not mapped',
 }

@@ -18,13 +18,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
     convert = actions.add_parser(
         'convert',
-        help='make one of a CSV table, of TagSLAM or of a bundle of AprilTags',
+        help='make one of a table, of TagSLAM, a bundle of AprilTags or a field of FRC',
         description='CSV: id, x, y and, if known, z and sigma, with or without these names in '
         'the first line, and by name qx, qy, qz, qw, or the yaw in which an upright tag looks, '
         'and orientation_sigma; TagSLAM: the YAML file of bodies, or its output; the tag_bundles '
         'of apriltag_ros for ROS 1: poses in the frame of the bundle.',
     )
-    convert.add_argument('file', type=Path, metavar='FILE', help='.csv, .txt or .yaml')
+    convert.add_argument(
+        'file', type=Path, metavar='FILE', help='.csv, .tsv, .txt, .yaml or .json'
+    )
     convert.add_argument('output', type=Path, metavar='OUT.yaml', help='map file to make')
     convert.add_argument('--frame', default='map', help='frame of the positions (default map)')
     convert.add_argument(

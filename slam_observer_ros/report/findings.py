@@ -36,7 +36,8 @@ class Finding:
 def findings(run: ReportedRun) -> list[Finding]:
     """Return what is worth knowing of a run, the most important first."""
     advice = [Finding(text) for text in noise_advice(run)]
-    return [*_growths(run), *_consistency(run), *advice, *_calibration(run)]
+    unused = [Finding(run.nothing_used)] if run.nothing_used else []
+    return [*unused, *_growths(run), *_consistency(run), *advice, *_calibration(run)]
 
 
 def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int, int]]:

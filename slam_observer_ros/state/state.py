@@ -161,9 +161,21 @@ class State:
         if self.relinearisation is not None:
             self.relinearisation.reset(since)
 
-    def relocate(self, rows: IntArray, points: FloatArray, noise: FloatArray) -> None:
+    def add_sensor(self, frame: str) -> None:
+        """Begin to calibrate the sensor of another frame."""
+        self.filter.add_sensor(frame)
+        if self.relinearisation is not None:
+            self.relinearisation.add_calibration()
+
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        noise: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks (m,) for new ones seen at ``points`` (m, 3), body frame."""
-        self.filter.relocate(rows, points, noise)
+        self.filter.relocate(rows, points, noise, D)
         if self.relinearisation is not None:
             self.relinearisation.relocate(rows)
 
