@@ -209,14 +209,17 @@ class VelocityHistory:
     def _held(self, pieces: _Pieces) -> HeldVelocities:
         rows, begins_ns, stops_ns, ends_ns = pieces
         joined = self._written()
-        dt_s, gap_s = to_s(np.array([stops_ns - begins_ns, ends_ns - stops_ns]))
+        before_ns = begins_ns[:, None] - joined.since_ns[rows]
+        dt_s, gap_s, *before_s = to_s(
+            np.array([stops_ns - begins_ns, ends_ns - stops_ns, *before_ns.T])
+        )
         return HeldVelocities(
             body_velocities=self._counting(joined.body_velocities[rows]),
             covariances=joined.covariances[rows],
             is_stated=joined.is_stated[rows],
             dt_s=dt_s,
             gap_s=gap_s,
-            before_s=to_s(begins_ns[:, None] - joined.since_ns[rows]),
+            before_s=np.array(before_s).T,
             usual_s=np.array(self._usual_s()),
         )
 
