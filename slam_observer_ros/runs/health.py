@@ -7,7 +7,12 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Update
+from slam_observer_ros.estimates import (
+    calibration_problems,
+    CalibrationEstimate,
+    MotionFactor,
+    Update,
+)
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 OK, WARN = 0, 1
@@ -54,9 +59,8 @@ def estimator_warnings(estimator: Diagnosed) -> list[str]:
     """Return what is wrong with the velocity or its noise, by the estimate alone."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
     warnings = ['no velocity in force: the pose is held'] if stale else []
-    problems = [part.problem for part in estimator.calibration]
-    problems += [part.problem for part in estimator.motion_factors]
-    return warnings + [problem for problem in problems if problem]
+    warnings += calibration_problems(estimator.calibration)
+    return warnings + [part.problem for part in estimator.motion_factors if part.problem]
 
 
 def diagnostics(

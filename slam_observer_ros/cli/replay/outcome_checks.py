@@ -12,6 +12,7 @@ import numpy as np
 from slam_observer_ros.cli.replay.dropped import list_dropped, unused_messages
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import (
+    calibration_problems,
     MAX_REJECTED,
     MAX_REJECTED_ORIENTATIONS,
     point_share,
@@ -131,6 +132,11 @@ def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap
 def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
     named = known.ids[~is_automatic(known.ids)]
     least = 'two' if result.estimator.settings.two_d_mode else 'three'
+    if is_automatic(result.estimator.landmark_ids).any():
+        return (
+            f'the pose in the map {path} was not found: '
+            f'{result.estimator.localisation_problem}{_advice(result)}'
+        )
     return (
         f'the pose in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
@@ -199,9 +205,9 @@ def _warn_of_rejections(result: Replay) -> None:
 
 def _warn_of_calibration(result: Replay) -> None:
     """Say what may be wrong if a scale, bias, delay or noise is one that nobody can mean."""
-    problems = [part.problem for part in result.estimator.calibration]
-    problems += [part.problem for part in result.estimator.motion_factors]
-    for problem in filter(None, problems):
+    estimator = result.estimator
+    noisier = [part.problem for part in estimator.motion_factors if part.problem]
+    for problem in calibration_problems(estimator.calibration) + noisier:
         logger.warning('%s', problem)
 
 
