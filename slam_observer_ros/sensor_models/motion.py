@@ -37,21 +37,16 @@ class Motion:
 
     @property
     def noise_by_kind(self) -> FloatArray | None:
-        """(2, p, p) what turning and driving add to it; None if not all of it was measured.
+        """(2, p, p) what turning and driving add to it; None if it stands or was not all measured.
 
         By how fast it grows with the factor of either: what errors of both share is half theirs.
         """
-        if self.is_slip or not self.dt_s.all():
+        stands = not np.count_nonzero(self.measured_velocities)
+        if self.is_slip or stands or np.count_nonzero(self.dt_s) < len(self.dt_s):
             return None
-        of_turning = symmetric(
-            se3.summed_noise(self._adjoints, _of_angular_part(self.covariances))
-        )
+        half = 0.5 * se3.summed_noise(self._adjoints, _of_angular_part(self.covariances))
+        of_turning = half + half.T
         return np.array([of_turning, self.noise - of_turning])
-
-    @property
-    def stands(self) -> bool:
-        """Whether all measured velocities are exactly zero."""
-        return not np.count_nonzero(self.measured_velocities)
 
     @cached_property
     def sensitivity(self) -> FloatArray:

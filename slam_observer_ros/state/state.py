@@ -13,7 +13,6 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.sensor_models.integration import integrate, integrate_until
 from slam_observer_ros.sensor_models.motion import Motion, Passage
-from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -38,7 +37,7 @@ class State:
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
         self.was_contradicted = False  # most known landmarks seen last were rejected
-        self.motion_noise = MotionNoise(settings)
+        self.motion_noise = filter_.motion_noise
         self.observation_noise = ObservationNoise(settings)
         # Around the state's stamp, as the last motion had it; the next one begins with the same.
         self._end_velocity: FloatArray | None = None
@@ -129,8 +128,6 @@ class State:
     def propagate(self, motion: Motion) -> None:
         """Move on along a motion (27)."""
         self.filter.propagate(motion)
-        if self.filter.has_joint_covariance:
-            self.motion_noise.factors.move(motion.noise_by_kind, motion.stands)
         if self.relinearisation is not None:
             self.relinearisation.move(motion)
         if motion.at_ends is not None:
@@ -149,7 +146,6 @@ class State:
         given = np.zeros((6, 6)) if covariance is None else covariance
         self.filter.set_pose(A, covariances.of_pose_error(observer, given))
         self.was_contradicted = False
-        self.motion_noise.factors.forget_motion()
         self.forget_past('the pose was set')
 
     def clear_time(self) -> None:

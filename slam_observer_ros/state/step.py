@@ -42,8 +42,8 @@ class Outcome:
 
 def step(state: State, matched: MatchedObservation) -> Outcome:
     """One step of the observer (28), from where the velocity has led it (27): the innovation."""
-    _learn_motion_noise(state, matched)
     if matched.known.orientations is not None:
+        state.filter.learn_motion_noise(matched.residuals)
         matched = correct_by_orientations(state, matched)  # φ_i = log(R_Â Z_i B̂_iᵀ)
     residuals = matched.residuals  # (29)  e_i = Â y_i − â_i,  r_i = e_i − y_i°
     _drop_history_if_full(state, matched)
@@ -60,22 +60,6 @@ def step(state: State, matched: MatchedObservation) -> Outcome:
     _set_velocities(state, event, rows)  # (19)
     innovation = None if expected is None else expected.judge(weights)
     return Outcome(matched.known.ids, residuals.r, rejected, moved_ids, innovation)
-
-
-def _learn_motion_noise(state: State, matched: MatchedObservation) -> None:
-    """Let residuals say how noisy the motion since the last observation was."""
-    residuals, factors = matched.residuals, state.motion_noise.factors
-    if not len(residuals.rows):
-        if len(matched.rows):  # new landmarks, which will tell of the motion from now on
-            factors.forget_motion()
-        return
-    S = state.filter.innovation_covariance(residuals)
-    if S is None:
-        return
-    r, _ = residuals.on(state.axes)
-    # As the filter's prediction: at the middle between where landmarks are expected and seen.
-    C = state.axes.output_matrix(residuals.landmarks + 0.5 * residuals.r)
-    factors.learn(r, S, C)
 
 
 def _correct(state: State, residuals: Residuals) -> FloatArray:

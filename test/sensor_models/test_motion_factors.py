@@ -11,10 +11,12 @@ import pytest
 
 from slam_observer_ros.estimates import MotionFactor
 from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.runs.recorder import NisTally
+from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.motion_factors import MotionFactors
-from slam_observer_ros.sensor_models.motion_noise import MotionNoise
+from slam_observer_ros.sensor_models.motion import Motion
+from slam_observer_ros.sensor_models.motion_noise import MotionFactors, MotionNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
 RIGHT = Settings(
@@ -109,18 +111,36 @@ def test_swapped_landmarks_and_a_carried_robot_are_no_noise_of_the_odometry():
     assert max(found(estimator)) < 1.6
 
 
-def test_a_robot_that_stands_tells_nothing():
-    factors, told = MotionFactors(Settings()), (np.ones((1, 2)), np.eye(2), np.eye(3)[None, :2])
-    factors.move(np.array([np.eye(3)] * 2), stands=True)
-    factors.learn(*told)
+def test_gaps_and_a_robot_that_stands_say_nothing():
+    factors, seen = MotionFactors(Settings()), (np.ones((1, 2)), np.eye(2), np.eye(3)[None, :2])
+    shares = np.array([np.eye(3)] * 2)
+    factors.learn(*seen)  # no motion at all
+    factors.move(shares)
+    factors.move(None)
+    factors.learn(*seen)
     assert factors.estimates == []
-    factors.move(np.array([np.eye(3)] * 2), stands=False)
-    factors.move(None, stands=True)  # a gap
-    factors.learn(*told)
-    assert factors.estimates == []
-    factors.move(np.array([np.eye(3)] * 2), stands=False)
-    factors.learn(*told)
-    assert factors.estimates[0].name == 'turning'
+    factors.move(shares)
+    factors.learn(*seen)
+    assert [part.name for part in factors.estimates] == ['turning', 'driving']
+
+
+@pytest.mark.parametrize(
+    ('velocity', 'dt_s', 'is_slip'), [(0.0, 0.1, False), (1.0, 0.0, False), (1.0, 0.1, True)]
+)
+def test_of_what_motion_nothing_can_be_learnt(velocity, dt_s, is_slip):
+    calibration = Calibration(RIGHT, axes_of(True))
+    path, noise = np.array([np.eye(4)] * 2), np.eye(6)[None]
+    motion = Motion(path, np.full((1, 6), 1.0), np.array([0.1]), noise, 0.1, None, calibration)
+    of_turning, of_driving = motion.noise_by_kind
+    np.testing.assert_allclose(of_turning + of_driving, motion.noise)
+    np.testing.assert_array_equal(np.diagonal(of_turning), [1.0, 0.0, 0.0])
+    useless = replace(
+        motion,
+        measured_velocities=np.full((1, 6), velocity),
+        dt_s=np.array([dt_s]),
+        is_slip=is_slip,
+    )
+    assert useless.noise_by_kind is None
 
 
 def test_every_hypothesis_has_its_own_and_a_reset_forgets_them():
@@ -128,7 +148,7 @@ def test_every_hypothesis_has_its_own_and_a_reset_forgets_them():
     factors = estimator._state.motion_noise.factors
     copied = deepcopy(estimator._state).motion_noise.factors
     assert copied.estimates == factors.estimates
-    copied.move(np.array([np.eye(3)] * 2), stands=False)
+    copied.move(np.array([np.eye(3)] * 2))
     copied.learn(np.ones((1, 2)), np.eye(2), np.eye(3)[None, :2])
     assert copied.estimates != factors.estimates
     estimator.reset()
