@@ -129,6 +129,7 @@ class Smoothed:
     """Trajectory and map, each pose estimated from all that was seen before and after.
 
     ``since`` says in words what happened before the first of them, so that no more is smoothed.
+    Of the slips since then that the estimator has counted, ``slips`` are confirmed by all of that.
     """
 
     stamps_ns: IntArray  # (s,) of the observations
@@ -136,5 +137,6 @@ class Smoothed:
     world_points: FloatArray  # (n, 3) landmarks, metres, world
     ids: IntArray  # (n,)
     since: str
+    slips: int
     # (n, 3, 3) of the landmarks, world, zero where unknown; None if it is not estimated
     orientations: FloatArray | None = None

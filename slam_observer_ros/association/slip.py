@@ -51,6 +51,7 @@ def slip(state: State, matched: MatchedObservation) -> float:
         duration_s=0.0,
         at_ends=None,
         calibration=state.filter.calibration,
+        is_slip=True,
     )
     state.propagate(motion)
     state.counts['slip'] += 1

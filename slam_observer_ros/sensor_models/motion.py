@@ -28,6 +28,7 @@ class Motion:
     # depend on the delay of the velocities.
     at_ends: FloatArray | None
     calibration: Calibration  # which led along the path
+    is_slip: bool = False  # whether odometry has not seen it, so that it may not have been
 
     @cached_property
     def noise(self) -> FloatArray:

@@ -63,22 +63,29 @@ class Smoother:
         drifts, c = settings.calibration_drift > 0.0, len(prior.calibration)
         self._chained, self._shared = (c, 0) if drifts else (0, c)
         self._link_information = _link_information(keyframes, drifts)
-        self._prior_information = _inverse(prior.covariance)
+        self._prior_information = inverse(prior.covariance)
 
-    def smooth(self, start: Solution, iterations: int, tolerance: float) -> Step:
+    def smooth(
+        self, start: Solution, iterations: int, tolerance: float, gated: bool = True
+    ) -> Step:
         """Iterate from ``start``; return the last step.
 
         That is the first which moves neither the last pose nor the border by ``tolerance`` (m,
-        rad), or the last of ``iterations``.
+        rad), or the last of ``iterations``. What a filter would reject has less weight, if
+        ``gated``.
         """
         for _ in range(iterations):
-            factors = Factors(self._linearise(start))
+            factors = Factors(self._linearise(start, gated))
             change, border_change = factors.solve()
             step = Step(start, self._moved(start, change, border_change), factors)
             if max(np.abs(change[-1]).max(), np.abs(border_change).max(initial=0.0)) < tolerance:
                 break
             start = step.end
         return step
+
+    def motion_errors(self, solution: Solution) -> FloatArray:
+        """Return by how much the motions are off (S, d), as right perturbations, rad and m."""
+        return self._links(solution)[1][:, : self._axes.p]
 
     def ungated(self, start: Solution) -> Solution:
         """Return ``start``, if something is gated there after an iteration without the gate."""
@@ -176,16 +183,16 @@ class Smoother:
         """
         keyframes, pose = self._keyframes, self._axes.pose
         # The motions, had they been computed with this calibration, and their errors.
-        eta = np.zeros((len(keyframes.motions), 6))
+        links, eta = keyframes.links, np.zeros((len(keyframes.calibrations), 6))
         off = solution.calibrations[:-1] - keyframes.calibrations
-        eta[:, pose] = (keyframes.sensitivities @ off[:, :, None])[:, :, 0]
+        eta[:, pose] = (links.sensitivities @ off[:, :, None])[:, :, 0]
         back = se3.inverse(solution.poses[1:]) @ solution.poses[:-1]
-        motions = keyframes.motions @ se3.exp(eta)
+        motions = links.motions @ se3.exp(eta)
         error = se3.log(se3.inverse(back @ motions))
         # Derivatives by the pose after a motion, by that before, and by the calibration.
         J_to = self._estimated(se3.left_jacobian_inverse(-error))
         J_from = -J_to @ self._estimated(se3.adjoint(back))
-        F = keyframes.sensitivities
+        F = links.sensitivities
         if F.shape[2]:
             J_off = -J_to @ self._estimated(se3.adjoint(back @ motions) @ se3.left_jacobian(-eta))
             F = J_off @ F
@@ -210,17 +217,17 @@ class Smoother:
 
 def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:
     """Return the information (S, d, d) of motions, or (S, d + c, d + c) with that of a drift."""
-    of_motions = _inverse(keyframes.motion_covariances)
+    of_motions = inverse(keyframes.links.covariances)
     if not drifts:
         return of_motions
-    d, c = keyframes.sensitivities.shape[1:]
+    d, c = keyframes.links.sensitivities.shape[1:]
     information = np.zeros((len(of_motions), d + c, d + c))
     information[:, :d, :d] = of_motions
-    information[:, d:, d:] = _inverse(keyframes.drift_covariances)
+    information[:, d:, d:] = inverse(keyframes.drift_covariances)
     return information
 
 
-def _inverse(covariances: FloatArray) -> FloatArray:
+def inverse(covariances: FloatArray) -> FloatArray:
     """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
     jitter = EXACT_M**2 * np.eye(covariances.shape[-1])
     return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)

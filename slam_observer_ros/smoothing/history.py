@@ -19,6 +19,7 @@ from slam_observer_ros.smoothing.keyframes import (
     joined,
     joined_turns,
     Keyframes,
+    Links,
     no_keyframes,
     SeenTurns,
 )
@@ -61,6 +62,15 @@ class _Step:
     drift: FloatArray
     calibration: FloatArray
     keyframe: Keyframe
+    slip: Motion | None  # after it, if the robot was taken for slipped
+
+    @property
+    def with_slip(self) -> list[_Step]:
+        """The same with the slip as a part of the motion; none if there was none."""
+        slip = self.slip
+        if slip is None:
+            return []
+        return [replace(self, end=slip.path[-1], noise=self.noise + slip.noise)]
 
 
 class History:
@@ -83,6 +93,7 @@ class History:
         self._calibration = prior.calibration
         self._start: FloatArray | None = None
         self._end = prior.pose
+        self._slip: Motion | None = None
         self._motion_noise, self._sensitivity, self._drift = self._at_rest()
         # Keyframes as arrays: those that are summarised, in pieces, and those that are not.
         q = 0 if prior.orientations is None else axes.turn
@@ -100,9 +111,12 @@ class History:
         return other
 
     def move(self, motion: Motion) -> None:
-        """Append a motion to the one that leads to the next keyframe."""
+        """Append a motion to the one that leads to the next keyframe; a slip comes last."""
         if self._start is None:
-            self._start = motion.path[0].copy()
+            self._start = self._end = motion.path[0].copy()
+        if motion.is_slip:
+            self._slip = motion
+            return
         self._end = motion.path[-1].copy()  # not a view, which would keep all of the path
         self._motion_noise = self._motion_noise + motion.noise
         self._sensitivity = self._sensitivity + motion.sensitivity
@@ -116,8 +130,8 @@ class History:
         self.calibrations.append(calibration)
         start = self._end if self._start is None else self._start
         motion = (self._motion_noise, self._sensitivity, self._drift, self._calibration)
-        self._new.append(_Step(start, self._end, *motion, keyframe))
-        self._start = None
+        self._new.append(_Step(start, self._end, *motion, keyframe, self._slip))
+        self._start = self._slip = None
         self._motion_noise, self._sensitivity, self._drift = self._at_rest()
 
     def summarise(self, known: Prior) -> None:
@@ -172,14 +186,18 @@ class History:
         return joined([*self._summarised, self._gathered()])
 
     def latest_keyframes(self) -> Keyframes:
-        """Return the keyframes that are not summarised, numbered from zero."""
+        """Return the keyframes that are not summarised, numbered from zero, with all slips."""
         latest = self._gathered()
-        return replace(latest, keyframes=latest.keyframes - self.summarised)
+        return replace(
+            latest,
+            keyframes=latest.keyframes - self.summarised,
+            slips=latest.slips - self.summarised,
+        ).with_slips()
 
     def _gathered(self) -> Keyframes:
         """Return the keyframes that are not summarised."""
         if self._new:
-            first = self.summarised + len(self._latest.motions)
+            first = self.summarised + len(self._latest.calibrations)
             self._latest = joined([self._latest, self._as_arrays(self._new, first)])
             self._new = []
         return self._latest
@@ -191,18 +209,14 @@ class History:
 
     def _as_arrays(self, steps: list[_Step], first: int) -> Keyframes:
         """Return keyframes as arrays; ``first`` is the number of the first one."""
-        pose, k, seen = self._axes.pose, self._axes.point, [step.keyframe for step in steps]
-        # Motions in the frame of the pose that they led to.
-        back = se3.inverse(np.array([step.end for step in steps]))
-        starts = np.array([step.start for step in steps])
-        to_body = se3.adjoint(back)[:, pose, pose]
-        noises = np.array([step.noise for step in steps])
+        k, seen = self._axes.point, [step.keyframe for step in steps]
+        slips = [number for number, step in enumerate(steps, first) if step.slip is not None]
         numbers = np.arange(first, first + len(steps))
         dt_s = np.concatenate([part.dt_s for part in seen])
         return Keyframes(
-            motions=se3.inverse(back @ starts),
-            motion_covariances=to_body @ noises @ transpose(to_body),
-            sensitivities=to_body @ np.array([step.sensitivity for step in steps]),
+            links=self._links(steps),
+            slips=np.array(slips, dtype=np.int64),
+            slipped=self._links([slipped for step in steps for slipped in step.with_slip]),
             calibrations=np.array([step.calibration for step in steps]),
             drift_covariances=np.array([step.drift for step in steps]),
             keyframes=np.repeat(numbers, [len(part.rows) for part in seen]),
@@ -211,6 +225,19 @@ class History:
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
             shares=1.0 / repetition_factors(dt_s, self._observation_noise.error_time_s),
             turns=self._turns(seen),
+        )
+
+    def _links(self, steps: list[_Step]) -> Links:
+        """Return motions in the frame of the pose that they led to."""
+        if not steps:
+            return self._none.links
+        pose, back = self._axes.pose, se3.inverse(np.array([step.end for step in steps]))
+        starts, noises = [step.start for step in steps], [step.noise for step in steps]
+        to_body = se3.adjoint(back)[:, pose, pose]
+        return Links(
+            motions=se3.inverse(back @ np.array(starts)),
+            covariances=to_body @ np.array(noises) @ transpose(to_body),
+            sensitivities=to_body @ np.array([step.sensitivity for step in steps]),
         )
 
     def _turns(self, seen: list[Keyframe]) -> SeenTurns | None:

@@ -27,12 +27,34 @@ class SeenTurns:
 
 
 @dataclass(frozen=True, slots=True)
+class Links:
+    """S motions, each from one keyframe to the next, or from the prior's pose to the first."""
+
+    motions: FloatArray  # (S, 4, 4) pose in the one before
+    covariances: FloatArray  # (S, d, d) of each motion as a right perturbation
+    sensitivities: FloatArray  # (S, d, c) derivative of each motion by the calibration, so too
+
+    def replaced(self, rows: IntArray, others: Links) -> Links:
+        """Return the links with others (r,) in place of those at ``rows`` (r,)."""
+        if not len(rows):
+            return self
+        changed = Links(*(getattr(self, field.name).copy() for field in fields(Links)))
+        for field in fields(Links):
+            getattr(changed, field.name)[rows] = getattr(others, field.name)
+        return changed
+
+    def only(self, kept: BoolArray) -> Links:
+        """Return some of the links (S,)."""
+        return Links(self.motions[kept], self.covariances[kept], self.sensitivities[kept])
+
+
+@dataclass(frozen=True, slots=True)
 class Keyframes:
     """S keyframes with M observed points since a prior."""
 
-    motions: FloatArray  # (S, 4, 4) pose in the one before; the first in the prior's pose
-    motion_covariances: FloatArray  # (S, d, d) of each motion as a right perturbation
-    sensitivities: FloatArray  # (S, d, c) derivative of each motion by the calibration, so too
+    links: Links  # as odometry has it
+    slips: IntArray  # (s,) those links in which a filter took the robot for slipped …
+    slipped: Links  # … and what it had in their place
     calibrations: FloatArray  # (S, c) with which each motion was computed
     drift_covariances: FloatArray  # (S, c, c) of what the calibration drifted by meanwhile
     keyframes: IntArray  # (M,) in which keyframe each point was observed
@@ -42,6 +64,13 @@ class Keyframes:
     # (M,) how much of it counts: less than 1 where its error is partly that of a point before
     shares: FloatArray
     turns: SeenTurns | None = None  # where orientations of landmarks are estimated
+
+    def with_slips(self, are_slips: BoolArray | None = None) -> Keyframes:
+        """Return the keyframes with some of the slips (s,) in place of the links, or with all."""
+        if are_slips is None:
+            are_slips = np.ones(len(self.slips), dtype=np.bool_)
+        slipped = self.slipped.only(are_slips)
+        return replace(self, links=self.links.replaced(self.slips[are_slips], slipped))
 
     def only(self, kept: BoolArray) -> Keyframes:
         """Return the keyframes with only some of the points (M,)."""
@@ -69,20 +98,35 @@ class Solution:
 
 def joined(parts: list[Keyframes]) -> Keyframes:
     """Return the keyframes of one or more parts, one after the other."""
-    names = [field.name for field in fields(Keyframes) if field.name != 'turns']
-    together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    own = [field.name for field in fields(Keyframes) if field.name not in _OF_PARTS]
+    together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in own}
     turns = [part.turns for part in parts if part.turns is not None]
-    return replace(parts[0], **together, turns=joined_turns(turns) if turns else None)
+    return replace(
+        parts[0],
+        **together,
+        links=_joined_links([part.links for part in parts]),
+        slipped=_joined_links([part.slipped for part in parts]),
+        turns=joined_turns(turns) if turns else None,
+    )
+
+
+_OF_PARTS = 'links', 'slipped', 'turns'
+
+
+def _joined_links(parts: list[Links]) -> Links:
+    names = [field.name for field in fields(Links)]
+    return Links(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def no_keyframes(d: int, c: int, k: int, q: int = 0) -> Keyframes:
     """Return no keyframes; d, c and k as in :class:`.Smoother`, q if turns are estimated."""
     none = np.empty(0, dtype=np.int64)
     no_rotations = np.empty((0, 3, 3))
+    no_links = Links(np.empty((0, 4, 4)), np.empty((0, d, d)), np.empty((0, d, c)))
     return Keyframes(
-        motions=np.empty((0, 4, 4)),
-        motion_covariances=np.empty((0, d, d)),
-        sensitivities=np.empty((0, d, c)),
+        links=no_links,
+        slips=none,
+        slipped=no_links,
         calibrations=np.empty((0, c)),
         drift_covariances=np.empty((0, c, c)),
         keyframes=none,

@@ -38,6 +38,7 @@ from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
 from slam_observer_ros.smoothing.keyframes import Solution
 from slam_observer_ros.smoothing.prior import Prior
+from slam_observer_ros.smoothing.slips import confirmed_slips
 
 logger = logging.getLogger(__name__)
 
@@ -164,23 +165,32 @@ class Relinearisation:
         """Forget landmarks; those behind move up."""
         self.history.remove(rows)
 
-    def smooth(self) -> Solution:
-        """Return all smoothed estimates, iterated from the present ones, which stay as they are.
+    def smooth(self) -> tuple[Solution, int]:
+        """Return all smoothed estimates, and how many slips they confirm (:mod:`.slips`).
 
-        Raise :exc:`ParameterError` if what the smoother takes for constant is not, or no history
-        is kept, :exc:`SmoothingError` if the observations don't determine everything.
+        They are iterated from the present ones, which stay as they are. Raise
+        :exc:`ParameterError` if what the smoother takes for constant is not, or no history is
+        kept, :exc:`SmoothingError` if the observations don't determine everything.
         """
         self._check_smoothable()
-        history = self.history
         try:
-            smoother = Smoother(self._axes, history.prior, history.keyframes(), self._settings)
-            start = self._start_for(smoother, 0)
-            return smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE).end
+            return self._smoothed()
         except np.linalg.LinAlgError as error:
             raise SmoothingError(
                 'can not smooth: the observations leave some pose or landmark open, or contradict '
                 'covariances that say they are exact'
             ) from error
+
+    def _smoothed(self) -> tuple[Solution, int]:
+        known, keyframes = (self._axes, self.history.prior), self.history.keyframes()
+        start, slips = self._solution_from(0), 0
+        if len(keyframes.slips):
+            are_slips, start = confirmed_slips(*known, keyframes, self._settings, start)
+            keyframes, slips = keyframes.with_slips(are_slips), int(np.sum(are_slips))
+        smoother = Smoother(*known, keyframes, self._settings)
+        start = self._without_outliers_of_then(smoother, start)
+        smoothed = smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE)
+        return smoothed.end, slips
 
     def _check_smoothable(self) -> None:
         if self._settings.relinearization_interval == 0:
@@ -253,7 +263,8 @@ class Relinearisation:
             smoother = Smoother(
                 self._axes, history.summary, history.latest_keyframes(), self._settings
             )
-            step = smoother.smooth(self._start_for(smoother, first), ITERATIONS, TOLERANCE)
+            start = self._without_outliers_of_then(smoother, self._solution_from(first))
+            step = smoother.smooth(start, ITERATIONS, TOLERANCE)
             covariance = step.marginal()
         except np.linalg.LinAlgError:
             self._warning.give()
@@ -284,9 +295,8 @@ class Relinearisation:
         if tags is not None and end.orientations is not None:
             tags.B = end.orientations
 
-    def _start_for(self, smoother: Smoother, first: int) -> Solution:
-        """Return where iterations begin, with the poses from before keyframe ``first`` on."""
-        start = self._solution_from(first)
+    def _without_outliers_of_then(self, smoother: Smoother, start: Solution) -> Solution:
+        """Return where iterations begin among tags, given the present estimates."""
         if start.orientations is None:
             return start
         # The poses are those of their time, the map is that of now: after a loop was closed much

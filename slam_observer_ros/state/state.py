@@ -191,7 +191,7 @@ class State:
                 "smoothing needs 'gains: riccati' and a 'relinearization_interval'"
             )
         # From the reference frame to the world.
-        found, rows = self.relinearisation.smooth(), self.confirmed
+        (found, slips), rows = self.relinearisation.smooth(), self.confirmed
         history, P = self.relinearisation.history, self.observer.reference_pose
         turned = found.orientations
         return Smoothed(
@@ -200,5 +200,6 @@ class State:
             world_points=se3.transform(P, found.points[rows]),
             ids=self.landmarks.ids[rows],
             since=history.since,
+            slips=slips,
             orientations=None if turned is None else P[:3, :3] @ turned[rows],
         )

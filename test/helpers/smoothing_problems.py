@@ -8,7 +8,13 @@ import numpy as np
 
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.keyframes import Keyframes, SeenTurns, Solution
+from slam_observer_ros.smoothing.keyframes import (
+    Keyframes,
+    Links,
+    no_keyframes,
+    SeenTurns,
+    Solution,
+)
 from slam_observer_ros.smoothing.prior import Prior
 
 LEAST_SQUARES = Settings(huber_threshold=0.0, rejection_threshold=1e9)
@@ -61,10 +67,15 @@ class Problem:
         seen = se3.transform(se3.inverse(poses[keyframes + 1]), points[landmarks][:, None])[
             :, 0
         ] + 0.1 * axes.full_points(rng.normal(size=len(keyframes) * k))
+        none = no_keyframes(d, c, k)
         self.keyframes = Keyframes(
-            motions,
-            random_covariances(rng, POSES, d, 0.1),
-            0.2 * rng.normal(size=(POSES, d, c)),
+            Links(
+                motions,
+                random_covariances(rng, POSES, d, 0.1),
+                0.2 * rng.normal(size=(POSES, d, c)),
+            ),
+            none.slips,
+            none.slipped,
             0.1 * rng.normal(size=(POSES, c)),
             random_covariances(rng, POSES, c, 0.1) if c else np.empty((POSES, 0, 0)),
             keyframes,
@@ -130,13 +141,13 @@ class Problem:
         ]
         whitened = [whiten(np.linalg.inv(self.prior.covariance), np.concatenate(off))]
         for s in range(POSES):
-            by_calibration = keyframes.sensitivities[s] @ (
+            by_calibration = keyframes.links.sensitivities[s] @ (
                 solution.calibrations[s] - keyframes.calibrations[s]
             )
-            motion = keyframes.motions[s] @ se3.exp(self._tangents(by_calibration[None])[0])
+            motion = keyframes.links.motions[s] @ se3.exp(self._tangents(by_calibration[None])[0])
             step = se3.inverse(solution.poses[s]) @ solution.poses[s + 1]
             error = se3.log(se3.inverse(motion) @ step)[pose]
-            whitened.append(whiten(np.linalg.inv(keyframes.motion_covariances[s]), error))
+            whitened.append(whiten(np.linalg.inv(keyframes.links.covariances[s]), error))
             if self.drifts:
                 drift = solution.calibrations[s + 1] - solution.calibrations[s]
                 whitened.append(whiten(np.linalg.inv(keyframes.drift_covariances[s]), drift))

@@ -147,10 +147,10 @@ def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
         return history.keyframes()
 
     whole, parts = keyframes(), keyframes(1, 3)
-    np.testing.assert_allclose(parts.motions, whole.motions, atol=1e-12)
-    np.testing.assert_allclose(parts.motion_covariances, whole.motion_covariances, atol=1e-12)
-    np.testing.assert_allclose(parts.sensitivities, whole.sensitivities, atol=1e-12)
-    assert (np.abs(whole.sensitivities).max(axis=(0, 1)) > 0.01).all()
+    np.testing.assert_allclose(parts.links.motions, whole.links.motions, atol=1e-12)
+    np.testing.assert_allclose(parts.links.covariances, whole.links.covariances, atol=1e-12)
+    np.testing.assert_allclose(parts.links.sensitivities, whole.links.sensitivities, atol=1e-12)
+    assert (np.abs(whole.links.sensitivities).max(axis=(0, 1)) > 0.01).all()
 
 
 @pytest.mark.parametrize('axes', [PLANAR, SPATIAL])
@@ -175,6 +175,7 @@ def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
             sensitivity=sensitivities[part],
             drift=np.diag(np.full(c, 0.1)),
             calibration=calibration,
+            is_slip=False,
         )
         history.move(motion)
     history.add(Keyframe(0, *NOTHING), path[-1], calibration.values)
@@ -182,11 +183,13 @@ def test_a_keyframe_has_all_that_the_calibration_does_to_its_motions(axes, rng):
     keyframes = history.keyframes()
     to_body = se3.adjoint(se3.inverse(path[-1]))[axes.pose, axes.pose]
     np.testing.assert_allclose(
-        keyframes.sensitivities, [to_body @ sensitivities.sum(axis=0), np.zeros((d, c))], atol=1e-9
+        keyframes.links.sensitivities,
+        [to_body @ sensitivities.sum(axis=0), np.zeros((d, c))],
+        atol=1e-9,
     )
     expected = to_body @ noises.sum(axis=0) @ to_body.T
-    np.testing.assert_allclose(keyframes.motion_covariances[0], expected, atol=1e-9)
-    np.testing.assert_array_equal(keyframes.motion_covariances[1], 0.0)
+    np.testing.assert_allclose(keyframes.links.covariances[0], expected, atol=1e-9)
+    np.testing.assert_array_equal(keyframes.links.covariances[1], 0.0)
     np.testing.assert_allclose(keyframes.drift_covariances, [0.3 * np.eye(c), np.zeros((c, c))])
 
 

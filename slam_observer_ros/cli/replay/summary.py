@@ -88,6 +88,8 @@ def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
         rows['lost'] = _loss_text(outcome)
     if slips := estimator.counts['slip']:
         rows['slips'] = f'{slips} × the robot was not where odometry had it'
+        if outcome.smoothed is not None:
+            rows['slips'] += f'; all that was seen confirms {outcome.smoothed.slips}'
     if unexpected := estimator.counts['unexpected_place']:
         rows['unexpected places'] = f'{unexpected} × nothing seen was where the map has it'
     if outcome.localised_after_s is not None:

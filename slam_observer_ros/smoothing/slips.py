@@ -1,0 +1,58 @@
+"""Which slips the whole history confirms, of those that a filter has believed in.
+
+A filter takes the robot for slipped by what it has seen until then, which what follows may
+explain otherwise. A link that may be a slip has a thousand times the variance of one that is not,
+so a false one lets a part of the map drift off. All links are therefore taken as odometry has
+them at first, and nothing is gated: what speaks against a false slip would be. A link becomes a
+slip where that pays: where it makes the error e of the motion likelier,
+
+    eᵀ S⁻¹ e − eᵀ S_s⁻¹ e > ln (|S_s| / |S|)
+
+with S the covariance that odometry states and S_s that with the slip.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_observer_ros.common.types import BoolArray, FloatArray
+from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.smoothing.gauss_newton import inverse, Smoother
+from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
+from slam_observer_ros.smoothing.prior import Prior
+
+ROUNDS = 10
+"""Times, at most, that it is asked which slips pay; the answer hardly changes after the third."""
+
+ITERATIONS, TOLERANCE = 50, 1e-4
+"""Gauss–Newton steps before each time; change of pose and map, rad and m, that ends them."""
+
+
+def confirmed_slips(
+    axes: EstimatedAxes, prior: Prior, keyframes: Keyframes, settings: Settings, start: Solution
+) -> tuple[BoolArray, Solution]:
+    """Return which of the keyframes' slips (s,) pay, and a solution with these, not gated.
+
+    Iterations begin at ``start``. Raise LinAlgError as :meth:`.Smoother.smooth` does.
+    """
+    are_slips = np.zeros(len(keyframes.slips), dtype=np.bool_)
+    solution = start
+    for _ in range(ROUNDS):
+        smoother = Smoother(axes, prior, keyframes.with_slips(are_slips), settings)
+        solution = smoother.smooth(solution, ITERATIONS, TOLERANCE, gated=False).end
+        as_stated = Smoother(axes, prior, keyframes, settings).motion_errors(solution)
+        pay = _pay(keyframes, as_stated[keyframes.slips])
+        if np.array_equal(pay, are_slips):
+            break
+        are_slips = pay
+    return are_slips, solution
+
+
+def _pay(keyframes: Keyframes, errors: FloatArray) -> BoolArray:
+    """Return which slips (s,) make the errors (s, d) of their motions likelier."""
+    stated = inverse(keyframes.links.covariances[keyframes.slips])
+    slipped = inverse(keyframes.slipped.covariances)
+    paid = np.einsum('si,sij,sj->s', errors, stated - slipped, errors)
+    price = np.linalg.slogdet(stated)[1] - np.linalg.slogdet(slipped)[1]
+    return np.asarray(paid > price)
