@@ -15,6 +15,7 @@ ACCURACY_ROWS = {
     'configuration_rmse_m': ('configuration error, RMS', 'm, not aligned'),
     'anees': ('ANEES of the pose', '(1 is consistent)'),
     'configuration_anees': ('ANEES of the configuration', '(1 is consistent)'),
+    'unsmoothed_ate_rmse_m': ('of the part that is smoothed, online', 'm after alignment'),
     'smoothed_ate_rmse_m': ('smoothed: position error, RMS', 'm after alignment'),
     'smoothed_landmark_rmse_m': ('smoothed: landmark error, RMS', 'm after alignment'),
 }

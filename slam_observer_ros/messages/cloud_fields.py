@@ -62,6 +62,20 @@ def read_fields(raw: Buffer, message_type: str) -> CloudFields:
     return CloudFields(tuple(names), points)
 
 
+def skip_cloud(reader: CdrReader) -> None:
+    """Pass over a sensor_msgs/PointCloud2 inside another message."""
+    reader.header()
+    reader.uint32()  # height
+    reader.uint32()  # width
+    for _ in range(reader.uint32()):
+        read_field(reader)
+    reader.uint8()  # is_bigendian
+    reader.uint32()  # point_step
+    reader.uint32()  # row_step
+    reader.data(reader.uint32())
+    reader.uint8()  # is_dense
+
+
 def missing_ids(names: Sequence[str], message_type: str) -> str:
     """Describe what a cloud has instead of ids; empty if there are ids among its ``names``."""
     if ID_NAME in names:

@@ -16,6 +16,7 @@ from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
+from slam_observer_ros.messages.cloud_fields import skip_cloud
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.observed_poses import observed_poses, orientations_of
 from slam_observer_ros.messages.poses_and_velocities import PoseMessage
@@ -54,16 +55,37 @@ def decode_pose_array(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[Ob
 
 
 def decode_detections(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
-    """Decode a vision_msgs/Detection3DArray.
+    """Decode a vision_msgs/Detection3DArray, since ROS 2 Galactic.
 
     The id of a landmark is the number that ends its detection's ``id``, or else its first
     result's ``class_id``: both are strings. No id are UUIDs, hashes, and numbers beyond
     ``MAX_ID``, as trackers give them. Its pose, with covariance if it is known of all, is that
     result's, or else, if that is missing or zero, that of the centre of the box.
     """
+    return _decode_detections(raw, ('id',))
+
+
+def decode_foxy_detections(
+    raw: Buffer, _receive_stamp_ns: int = 0
+) -> Measurement[ObservationEvent]:
+    """Decode a vision_msgs/Detection3DArray of ROS 2 Dashing to Foxy, with ``tracking_id``."""
+    return _decode_detections(raw, ('source_cloud', 'is_tracking', 'tracking_id'))
+
+
+def decode_ros1_detections(
+    raw: Buffer, _receive_stamp_ns: int = 0
+) -> Measurement[ObservationEvent]:
+    """Decode a vision_msgs/Detection3DArray of ROS 1, whose classes are numbers, made CDR."""
+    return _decode_detections(raw, ('source_cloud',), has_numbers=True)
+
+
+def _decode_detections(
+    raw: Buffer, rest: Sequence[str], has_numbers: bool = False
+) -> Measurement[ObservationEvent]:
+    """Decode detections with these fields behind their box."""
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
-    detections = [_read_detection(reader) for _ in range(reader.uint32())]
+    detections = [_read_detection(reader, rest, has_numbers) for _ in range(reader.uint32())]
     reader.finish()
     ids = np.array([landmark_id for landmark_id, _, _ in detections], dtype=np.int64)
     poses = np.array([pose for _, pose, _ in detections]).reshape(-1, _POSE)
@@ -145,12 +167,21 @@ def _observation(
     return Measurement(frame_id, ObservationEvent(stamp_ns, ids, points, orientations=R))
 
 
-def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
+def _read_detection(
+    reader: CdrReader, rest: Sequence[str], has_numbers: bool
+) -> tuple[int, FloatArray, FloatArray]:
     """Read a vision_msgs/Detection3D: id, position and quaternion (7,), covariance (6, 6)."""
     reader.header()
-    results = [_read_result(reader) for _ in range(reader.uint32())]
-    centre = reader.float64(_POSE + _SIZE)[:_POSE]
-    names = [reader.string(), *(name for name, _, _ in results[:1])]
+    results = [_read_result(reader, has_numbers) for _ in range(reader.uint32())]
+    centre, name = reader.float64(_POSE + _SIZE)[:_POSE], ''
+    for field in rest:
+        if field == 'source_cloud':
+            skip_cloud(reader)
+        elif field == 'is_tracking':
+            reader.uint8()
+        else:
+            name = reader.string()
+    names = [name, *(class_id for class_id, _, _ in results[:1])]
     ids = (_id_in_name(name) for name in names)
     landmark_id = next((number for number in ids if number != UNKNOWN_ID), UNKNOWN_ID)
     if results and results[0][1][:3].any():
@@ -160,9 +191,9 @@ def _read_detection(reader: CdrReader) -> tuple[int, FloatArray, FloatArray]:
     return landmark_id, centre, np.zeros((6, 6))
 
 
-def _read_result(reader: CdrReader) -> tuple[str, FloatArray, FloatArray]:
+def _read_result(reader: CdrReader, has_numbers: bool) -> tuple[str, FloatArray, FloatArray]:
     """Read a vision_msgs/ObjectHypothesisWithPose: class, pose (7,), covariance (6, 6)."""
-    name = reader.string()
+    name = str(reader.int64(1)[0]) if has_numbers else reader.string()
     values = reader.float64(1 + _POSE + _COVARIANCE)  # the score comes first
     covariance = values[1 + _POSE :].reshape(6, 6)
     if covariance[0, 0] < 0.0:  # unknown

@@ -32,6 +32,7 @@ from slam_observer_ros.messages.poses_and_velocities import (
     PoseMessage,
 )
 from slam_observer_ros.messages.velocity_blocks import BLOCK_DECODERS, BlockDecoder
+from slam_observer_ros.recording.definitions import decoder_of_other_fields
 from slam_observer_ros.recording.sources import RawBlock, RawMessage, Topic
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
@@ -57,6 +58,7 @@ def input_decoders(selected: SelectedTopics, inputs: InputSettings) -> dict[Topi
     if selected.landmarks.message_type == TRANSFORMS:
         decoders[selected.landmarks] = partial(_tags_on_tf, inputs.tag_frame_prefix)
     elif selected.landmarks.message_type == APRILTAGS:
+        decoder_of_other_fields(APRILTAGS, selected.landmarks.definition)
         decoders[selected.landmarks] = _one(decode_apriltags)
     if selected.imu is not None:
         decoders[selected.imu] = _one(decode_imu)
@@ -72,7 +74,10 @@ def block_decoder(selected: SelectedTopics, inputs: InputSettings) -> BlockDecod
 
 def decode_landmarks(raw: RawMessage) -> Measurement[ObservationEvent]:
     """Decode landmarks, measured or true."""
-    return _OBSERVATION_DECODERS[raw.topic.message_type](raw.data, raw.receive_stamp_ns)
+    topic = raw.topic
+    decode = decoder_of_other_fields(topic.message_type, topic.definition)
+    decode = decode or _OBSERVATION_DECODERS[topic.message_type]
+    return decode(raw.data, raw.receive_stamp_ns)
 
 
 def decode_pose(raw: RawMessage) -> PoseMessage:

@@ -38,16 +38,19 @@ from slam_observer_ros.recording.decoding import (
 )
 from slam_observer_ros.recording.opening import open_source
 from slam_observer_ros.recording.recorded_truth import base_in_frames, other_frames, Truth
-from slam_observer_ros.recording.sources import Loss, RawBlock, RawMessage, Topic
+from slam_observer_ros.recording.sources import (
+    FEWEST_IN_BLOCK,
+    Loss,
+    RawBlock,
+    RawMessage,
+    Topic,
+)
 from slam_observer_ros.recording.topics import select_topics, SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 
 if TYPE_CHECKING:
     from slam_observer_ros.recording.writer import RecordingWriter
-
-FEWEST_IN_BLOCK = 4
-"""Messages that cost less one by one."""
 
 logger = logging.getLogger(__name__)
 _Decoded = TypeVar('_Decoded')

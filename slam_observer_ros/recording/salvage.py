@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
 import heapq
 import mmap
 from pathlib import Path
@@ -14,6 +15,7 @@ from slam_observer_ros.common.units import to_s
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.recording.ros1 import Ros1Messages
 from slam_observer_ros.recording.sources import (
+    by_key,
     in_blocks,
     Loss,
     MessageSource,
@@ -24,12 +26,10 @@ from slam_observer_ros.recording.sources import (
 
 
 class FoundChannel(NamedTuple):
-    """Under which number a file has a topic, and how its messages are encoded."""
+    """Under which number a file has a topic, not counted yet."""
 
     number: int
-    topic: str
-    message_type: str
-    encoding: str
+    topic: Topic
 
 
 class FoundMessage(NamedTuple):
@@ -53,23 +53,19 @@ Scan: TypeAlias = Callable[[mmap.mmap], Iterator[Found]]
 
 
 class SalvagedSource:
-    """The whole messages of a damaged file, or of one that rosbags does not know.
-
-    ``other_encodings`` are those of the channels that are left out, as they are neither CDR nor of
-    a ROS 1 bag.
-    """
+    """The whole messages of a damaged .db3 or .bag file."""
 
     def __init__(self, path: Path, scan: Scan) -> None:
         self._path, self._scan = path, scan
-        self._ros1 = Ros1Messages()
-        self._channels: dict[int, FoundChannel] = {}
+        self._ros1 = Ros1Messages() if path.suffix == '.bag' else None
+        channels: dict[int, Topic] = {}
         self._disorder_ns = 0
         self.start_ns = self.end_ns = 0
         counts: Counter[int] = Counter()
         byte_count, gap_ns, is_cut_off, is_behind_damage = 0, 0, False, False
         for found in self._found():
             if isinstance(found, FoundChannel):
-                self._channels[found.number] = found
+                channels[found.number] = found.topic
             elif isinstance(found, Damaged):
                 byte_count += found.byte_count
                 is_cut_off |= found.is_cut_off
@@ -85,26 +81,11 @@ class SalvagedSource:
                 self.end_ns = max(self.end_ns, found.stamp_ns)
                 self._disorder_ns = max(self._disorder_ns, self.end_ns - found.stamp_ns)
         self.loss = Loss(byte_count, to_s(gap_ns), is_cut_off)
-        self.other_encodings = {
-            number: channel.encoding
-            for number, channel in self._channels.items()
-            if channel.encoding not in ('cdr', 'ros1 bag')
-        }
-        self._set_topics(counts)
-
-    def _set_topics(self, counts: Counter[int]) -> None:
         # Several channels may be of one topic.
-        keys = {
-            number: (channel.topic, channel.message_type)
-            for number, channel in self._channels.items()
-            if counts[number] and number not in self.other_encodings
-        }
-        of_topic: Counter[tuple[str, str]] = Counter()
-        for number, key in keys.items():
-            of_topic[key] += counts[number]
-        topics = {key: Topic(*key, count) for key, count in of_topic.items()}
+        parts = {number: replace(channels[number], count=counts[number]) for number in channels}
+        topics = by_key(part for part in parts.values() if part.count)
         self.topics = tuple(topics.values())
-        self._topic_of = {number: topics[key] for number, key in keys.items()}
+        self._topic_of = {number: topics[part.key] for number, part in parts.items() if part.count}
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
@@ -114,7 +95,7 @@ class SalvagedSource:
                 continue
             topic, stamp_ns = self._topic_of[found.channel], found.stamp_ns
             if topic in topics:
-                raw = RawMessage(topic, stamp_ns, self._cdr(found))
+                raw = RawMessage(topic, stamp_ns, self._cdr(topic, found.data))
                 heapq.heappush(held, (stamp_ns, number, raw))
             while held and held[0][0] <= stamp_ns - self._disorder_ns:
                 yield heapq.heappop(held)[-1]
@@ -137,12 +118,11 @@ class SalvagedSource:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 yield from self._scan(data)
 
-    def _cdr(self, found: FoundMessage) -> Buffer:
-        channel = self._channels[found.channel]
-        if channel.encoding == 'cdr':
-            return found.data
+    def _cdr(self, topic: Topic, data: Buffer) -> Buffer:
+        if self._ros1 is None:
+            return data
         try:
-            return self._ros1.to_cdr(bytes(found.data), channel.message_type)
+            return self._ros1.to_cdr(bytes(data), topic.message_type, topic.definition)
         except RecordingError:
             raise
         except Exception:  # noqa: BLE001 (no list of what rosbags raises is complete)
@@ -200,8 +180,8 @@ class MendedSource:
         salvaged = self._salvaged
         if not salvaged.topics:
             raise RecordingError(f'{error}; no whole message is left') from error
-        known = {(topic.name, topic.message_type): topic for topic in topics}
-        wanted = [topic for topic in salvaged.topics if (topic.name, topic.message_type) in known]
+        known = {topic.key: topic for topic in topics}
+        wanted = [topic for topic in salvaged.topics if topic.key in known]
         for raw in salvaged.messages(wanted):
             if last_ns is None or raw.receive_stamp_ns > last_ns:
-                yield raw._replace(topic=known[raw.topic.name, raw.topic.message_type])
+                yield raw._replace(topic=known[raw.topic.key])

@@ -1,21 +1,14 @@
-"""Scans of damaged MCAP files, ROS 1 bags and SQLite databases, for what is whole in them."""
+"""Scans of damaged ROS 1 bags and SQLite databases, for what is whole in them."""
 
 from __future__ import annotations
 
 import bz2
 from collections.abc import Iterator
-from io import BytesIO
 import mmap
-import re
 import struct
 from typing import Final
 
 import lz4.frame  # type: ignore[import-untyped]
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
-from rosbags.typesys.msg import normalize_msgtype
 
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.recording.salvage import (
@@ -25,91 +18,7 @@ from slam_observer_ros.recording.salvage import (
     FoundMessage,
     Scan,
 )
-
-_MCAP_MAGIC: Final = b'\x89MCAP0\r\n'
-_MCAP_CHUNK: Final = re.compile(
-    rb'\x06.{6}\x00\x00.{28}(?:\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)',
-    re.DOTALL,
-)
-"""How a chunk begins: opcode, length, times, size and sum, compression."""
-
-
-def scan_mcap(data: mmap.mmap) -> Iterator[Found]:
-    """Read records one after the other; behind damage, from the next whole chunk on."""
-    types: dict[int, str] = {}
-    size = len(data)
-    if data[: len(_MCAP_MAGIC)] != _MCAP_MAGIC:
-        yield Damaged(min(size, len(_MCAP_MAGIC)))
-    place = len(_MCAP_MAGIC)
-    while place + 9 <= size:
-        opcode, length = struct.unpack_from('<BQ', data, place)
-        end = place + 9 + length
-        if not 1 <= opcode <= max(Opcode) or end > size:
-            after = _next_chunk(data, place + 1)
-            yield Damaged(after - place, is_cut_off=after == size)
-            place = after
-            continue
-        try:
-            for record in _mcap_records(opcode, data[place + 9 : end]):
-                if isinstance(record, Schema):
-                    types[record.id] = record.name
-                elif isinstance(record, Channel):
-                    message_type = types.get(record.schema_id, '')
-                    yield FoundChannel(
-                        record.id, record.topic, message_type, record.message_encoding
-                    )
-                elif isinstance(record, Message):
-                    yield FoundMessage(record.channel_id, record.log_time, record.data)
-        except Exception:  # noqa: BLE001 (decompressors and struct raise whatever they like)
-            yield Damaged(end - place)
-        if opcode == Opcode.FOOTER:
-            return
-        place = end
-    yield Damaged(size - place, is_cut_off=True)
-
-
-def is_intact_mcap(data: mmap.mmap) -> bool:
-    """Return whether all chunks have their checksums, which rosbags does not ask for."""
-    place, size = len(_MCAP_MAGIC), len(data)
-    while place + 9 <= size:
-        opcode, length = struct.unpack_from('<BQ', data, place)
-        end = place + 9 + length
-        if end > size:
-            return False
-        if opcode == Opcode.CHUNK:
-            try:
-                chunk = Chunk.read(ReadDataStream(BytesIO(data[place + 9 : end])))
-                get_chunk_data_stream(chunk, validate_crc=True)
-            except Exception:  # noqa: BLE001 (decompressors raise whatever they like)
-                return False
-        elif opcode == Opcode.FOOTER:
-            return True
-        place = end
-    return False
-
-
-def _mcap_records(opcode: int, content: bytes) -> list[object]:
-    stream = ReadDataStream(BytesIO(content))
-    if opcode == Opcode.CHUNK:
-        return list(breakup_chunk(Chunk.read(stream), validate_crc=True))
-    if opcode == Opcode.SCHEMA:
-        return [Schema.read(stream)]
-    if opcode == Opcode.CHANNEL:
-        return [Channel.read(stream)]
-    return [Message.read(stream, len(content))] if opcode == Opcode.MESSAGE else []
-
-
-def _next_chunk(data: mmap.mmap, place: int) -> int:
-    """Return where the next chunk begins that is whole; the end of the file if there is none."""
-    while (match := _MCAP_CHUNK.search(data, place)) is not None:
-        place = match.start()
-        (length,) = struct.unpack_from('<Q', data, place + 1)
-        end = place + 9 + length
-        if end <= len(data) and (end == len(data) or 1 <= data[end] <= max(Opcode)):
-            return place
-        place += 1
-    return len(data)
-
+from slam_observer_ros.recording.sources import ros2_type, Topic
 
 _BAG_MAGIC: Final = b'#ROSBAG V2.0\n'
 _BAG_MESSAGE, _BAG_CHUNK, _BAG_CONNECTION, _BAG_INDEX = 2, 5, 7, 4
@@ -160,9 +69,10 @@ def _of_bag_chunk(chunk: bytes) -> Iterator[Found]:
 
 def _bag_connection(header: dict[bytes, bytes], content: bytes) -> FoundChannel:
     (number,) = struct.unpack('<I', header[b'conn'])
-    message_type = _bag_fields(content)[b'type'].decode()
-    topic = header[b'topic'].decode()
-    return FoundChannel(number, topic, normalize_msgtype(message_type), 'ros1 bag')
+    fields, name = _bag_fields(content), header[b'topic'].decode()
+    message_type = ros2_type(fields[b'type'].decode())
+    definition = fields.get(b'message_definition', b'').decode(errors='replace')
+    return FoundChannel(number, Topic(name, message_type, 0, definition))
 
 
 def _bag_record(data: Buffer | mmap.mmap, place: int) -> tuple[dict[bytes, bytes], bytes, int]:
@@ -245,7 +155,7 @@ def _of_row(values: list[object]) -> Found | None:
     """Return what of a recording a row is: a topic, a message or nothing of it."""
     number = values[0]
     if len(values) >= 4 and isinstance(values[1], str) and values[3] == 'cdr':
-        return FoundChannel(int(str(number)), values[1], str(values[2]), 'cdr')
+        return FoundChannel(int(str(number)), Topic(values[1], ros2_type(str(values[2])), 0))
     if len(values) == 4 and isinstance(values[1], int) and isinstance(values[2], int):
         content = values[3]
         if isinstance(content, bytes):
@@ -313,5 +223,5 @@ def _varint(data: bytes | mmap.mmap, place: int) -> tuple[int, int]:
     return value << 8 | data[place + 8], place + 9
 
 
-SCANS: Final[dict[str, Scan]] = {'.mcap': scan_mcap, '.bag': scan_bag, '.db3': scan_db3}
+SCANS: Final[dict[str, Scan]] = {'.bag': scan_bag, '.db3': scan_db3}
 """By the suffix of the file."""

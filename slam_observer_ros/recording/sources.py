@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 import heapq
 from itertools import groupby, islice
 from pathlib import Path
+import re
 from typing import NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags import rosbag2
-from rosbags.interfaces import Connection
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.common.types import IntArray
@@ -22,23 +20,60 @@ from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.recording.ros1 import Ros1Messages
 
 if TYPE_CHECKING:
-    from rosbags import rosbag1
+    from rosbags import rosbag1, rosbag2
+    from rosbags.interfaces import Connection
 
 
 MOST_IN_BLOCK = 4096
 """Messages of a block at most."""
 
 
+FEWEST_IN_BLOCK = 4
+"""Messages that cost less one by one."""
+
+SAME_TYPES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+"""Former names of types, whose bytes are the same."""
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic, its type as ROS 2 names it (ROS 1 types, too), and its number of messages."""
+    """One topic, its type as ROS 2 names it (ROS 1 types, too), and its number of messages.
+
+    ``definition`` is how the file defines the type; empty if it does not.
+    """
 
     name: str
     message_type: str
     count: int
+    definition: str = field(default='', compare=False, repr=False)
 
     def __str__(self) -> str:
         return f'{self.name} ({self.message_type}, {self.count} messages)'
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and type: what is recorded in parts, with both in common, is one topic."""
+        return self.name, self.message_type
+
+
+def by_key(parts: Iterable[Topic]) -> dict[tuple[str, str], Topic]:
+    """Return topics, with the messages of all their parts."""
+    topics: dict[tuple[str, str], Topic] = {}
+    for part in parts:
+        known = topics.get(part.key, replace(part, count=0))
+        topics[part.key] = replace(known, count=known.count + part.count)
+    return topics
+
+
+def ros2_type(name: str) -> str:
+    """Return a type's name as ROS 2 has it: ROS 1, DDS and some recorders write it otherwise."""
+    parts = [part for part in re.split('/|::', name) if part not in ('', 'dds_')]
+    if '::' in name and 'dds_' in name:
+        parts[-1] = parts[-1].removesuffix('_')
+    if len(parts) == 2:
+        parts.insert(1, 'msg')
+    full = '/'.join(parts)
+    return SAME_TYPES.get(full, full)
 
 
 def last_part(name: str) -> str:
@@ -92,20 +127,26 @@ class Loss:
         to the first one behind.
     is_cut_off : bool
         Whether a file has no proper end: more is missing than can be said.
+    message_count : int
+        Messages that were recorded, by what the files themselves count, and are not there.
 
     """
 
     byte_count: int = 0
     seconds: float = 0.0
     is_cut_off: bool = False
+    message_count: int = 0
 
     def __bool__(self) -> bool:
         """Return whether anything is lost."""
-        return self.byte_count > 0 or self.is_cut_off
+        return self.byte_count > 0 or self.is_cut_off or self.message_count > 0
 
     def __str__(self) -> str:
         """Return the amount as text."""
         text = f'{self.byte_count} bytes and {self.seconds:.1f} s in between are lost'
+        if self.message_count:
+            counted = f'{self.message_count} messages'
+            text = f'{counted}, {text}' if self.byte_count else f'{counted} are lost'
         return f'{text}, and what was cut off' if self.is_cut_off else text
 
     def __add__(self, other: Loss) -> Loss:
@@ -114,6 +155,7 @@ class Loss:
             self.byte_count + other.byte_count,
             self.seconds + other.seconds,
             self.is_cut_off or other.is_cut_off,
+            self.message_count + other.message_count,
         )
 
 
@@ -144,7 +186,7 @@ class MessageSource(Protocol):
 
 
 class BagSource:
-    """A whole MCAP file, rosbag2 (directory or bare .db3) or ROS 1 .bag.
+    """A whole .db3 file of rosbag2, or a ROS 1 .bag.
 
     Raises a RecordingError if rosbags can't read it.
     """
@@ -157,10 +199,7 @@ class BagSource:
         with damage_reported(path, mends=False):
             self._reader = _reader_of(path)
             self._reader.open()
-        counts: Counter[tuple[str, str]] = Counter()
-        for connection in self._reader.connections:
-            counts[connection.topic, connection.msgtype] += connection.msgcount
-        self._topics = {key: Topic(*key, count) for key, count in counts.items()}
+        self._topics = by_key(_part(connection) for connection in self._reader.connections)
         self.topics = tuple(self._topics.values())
         self.start_ns = self._reader.start_time
         self.end_ns = self._reader.end_time - 1  # rosbags gives the time just after the end.
@@ -171,8 +210,10 @@ class BagSource:
         if not wanted:  # rosbags would take this for all connections.
             return
         with damage_reported(self._path):
+            of_connection = {c.id: self._topic(c) for c in wanted}
             for connection, stamp_ns, data in self._reader.messages(wanted):
-                yield RawMessage(self._topic(connection), stamp_ns, self._cdr(connection, data))
+                topic = of_connection[connection.id]
+                yield RawMessage(topic, stamp_ns, self._cdr(topic, data))
 
     def blocks(
         self, topics: Collection[Topic], together: Topic
@@ -180,42 +221,47 @@ class BagSource:
         """Yield the same, those of one of the topics in blocks."""
         return in_blocks(self.messages(topics), together)
 
-    @property
-    def compresses_messages(self) -> bool:
-        """Whether each message is compressed for itself."""
-        reader = self._reader
-        return isinstance(reader, rosbag2.Reader) and reader.compression_mode == 'message'
-
     def close(self) -> None:
         """Close the file."""
         self._reader.close()
 
     def _topic(self, connection: Connection) -> Topic:
-        return self._topics[connection.topic, connection.msgtype]
+        return self._topics[_part(connection).key]
 
-    def _cdr(self, connection: Connection, data: bytes) -> Buffer:
-        return data if self._ros1 is None else self._ros1.to_cdr(data, connection.msgtype)
+    def _cdr(self, topic: Topic, data: bytes) -> Buffer:
+        return (
+            data
+            if self._ros1 is None
+            else self._ros1.to_cdr(data, topic.message_type, topic.definition)
+        )
+
+
+def _part(connection: Connection) -> Topic:
+    name = ros2_type(connection.msgtype)
+    return Topic(connection.topic, name, connection.msgcount, connection.msgdef.data)
 
 
 def _reader_of(path: Path) -> rosbag1.Reader | rosbag2.Reader:
+    from rosbags import rosbag1, rosbag2  # which few recordings need
+
     if path.suffix != '.bag':
         return rosbag2.Reader(path)
-    from rosbags import rosbag1  # which few recordings need
 
     return rosbag1.Reader(path)
 
 
 class SplitSource:
-    """The files that one recording was split into, and what is lost with those not open."""
+    """The files that one recording was split into, and what is lost with the others.
 
-    def __init__(self, parts: Sequence[MessageSource], loss: Loss = NOTHING_LOST) -> None:
-        self._loss = loss
+    ``stated_count`` is how many messages the recording should have.
+    """
+
+    def __init__(
+        self, parts: Sequence[MessageSource], loss: Loss = NOTHING_LOST, stated_count: int = 0
+    ) -> None:
+        self._loss, self._stated_count = loss, stated_count
         self._parts = sorted(parts, key=lambda part: part.start_ns)
-        counts: Counter[tuple[str, str]] = Counter()
-        for part in parts:
-            for topic in part.topics:
-                counts[topic.name, topic.message_type] += topic.count
-        self._topics = {key: Topic(*key, count) for key, count in counts.items()}
+        self._topics = by_key(topic for part in parts for topic in part.topics)
         self.topics = tuple(self._topics.values())
         self.start_ns = min(part.start_ns for part in parts)
         self.end_ns = max(part.end_ns for part in parts)
@@ -223,7 +269,9 @@ class SplitSource:
     @property
     def loss(self) -> Loss:
         """What has been found damaged so far."""
-        return sum((part.loss for part in self._parts), self._loss)
+        loss = sum((part.loss for part in self._parts), self._loss)
+        missing = self._stated_count - sum(topic.count for topic in self.topics)
+        return replace(loss, message_count=max(loss.message_count, missing))
 
     def messages(self, topics: Collection[Topic]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order in which they were received."""
@@ -242,7 +290,7 @@ class SplitSource:
             part.close()
 
     def _messages_of(self, part: MessageSource, topics: Collection[Topic]) -> Iterator[RawMessage]:
-        whole = {topic: self._topics[topic.name, topic.message_type] for topic in part.topics}
+        whole = {topic: self._topics[topic.key] for topic in part.topics}
         wanted = [topic for topic in part.topics if whole[topic] in topics]
         for raw in part.messages(wanted):
             yield raw._replace(topic=whole[raw.topic])
@@ -275,6 +323,8 @@ def damage_reported(path: Path, mends: bool = True) -> Iterator[None]:
     """
     try:
         yield
+    except ImportError:  # of a package that is not installed, and named as such
+        raise
     except Exception as error:
         reason = str(error).strip().split('\n')[0].rstrip('.') or type(error).__name__
         if isinstance(error, UnicodeError):  # bytes where text should be

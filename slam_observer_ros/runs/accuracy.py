@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 import logging
 
+import numpy as np
+
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import Smoothed
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
+from slam_observer_ros.evaluation.gaps import filled
 from slam_observer_ros.evaluation.metrics import (
     landmark_errors,
     trajectory_errors,
@@ -65,20 +68,39 @@ def measure(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedAccuracy:
+    """Errors of what was smoothed, as :class:`Accuracy` has them, and of what it was before."""
+
+    pose_errors: TrajectoryErrors | None
+    online_errors: TrajectoryErrors | None  # at the same stamps
+    landmark_rmse_m: float | None
+
+
 def measure_smoothed(
-    smoothed: Smoothed, truth: Truth
-) -> tuple[TrajectoryErrors | None, float | None]:
-    """Return errors of the smoothed poses and of the map, as :class:`Accuracy` has them."""
+    smoothed: Smoothed, trajectory: Trajectory, online: Trajectory, truth: Truth
+) -> SmoothedAccuracy:
+    """Compare what was smoothed, with its trajectory at some of the online one's stamps."""
     pose_truth = Trajectory(truth.stamps_ns, truth.poses)
-    return (
-        _pose_errors('smoothed trajectory', trajectory_of(smoothed), pose_truth),
+    same = np.isin(online.stamps_ns, trajectory.stamps_ns)
+    before = Trajectory(online.stamps_ns[same], online.poses[same])
+    return SmoothedAccuracy(
+        _pose_errors('smoothed trajectory', trajectory, pose_truth),
+        _pose_errors('trajectory before smoothing', before, pose_truth),
         _landmark_rmse_m(smoothed.ids, smoothed.world_points, truth),
     )
 
 
-def trajectory_of(smoothed: Smoothed) -> Trajectory:
-    """Return the smoothed poses as a trajectory."""
-    return Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
+def smoothed_trajectory(
+    smoothed: Smoothed, stamps_ns: IntArray, dead_reckoning: Trajectory
+) -> Trajectory:
+    """Return the smoothed poses at any stamps (m,), such as those of the online trajectory.
+
+    Between observations, and beyond the first and last one, the robot moved as the velocities
+    have it.
+    """
+    estimate = Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
+    return filled(estimate, dead_reckoning, stamps_ns)
 
 
 def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:

@@ -253,11 +253,15 @@ def test_what_is_not_needed_is_not_imported(arguments, unneeded):
     assert not unneeded & set(ended.stderr.split())
 
 
-@pytest.mark.parametrize('absent', ['rosbags', 'rich'])
+@pytest.mark.parametrize('absent', ['rosbags', 'mcap', 'rich'])
 def test_what_only_the_command_line_needs_is_named_when_missing(tmp_path, absent):
     program = program_without([absent], 'slam_observer_ros.cli.main', tmp_path)
+    recording = CHECKOUT / 'samples/sample.mcap'
+    if absent == 'rosbags':  # which MCAP files do without
+        recording = tmp_path / 'other.db3'
+        recording.touch()
     ended = subprocess.run(
-        [sys.executable, program, *('replay', 'samples/sample.mcap')],
+        [sys.executable, program, 'replay', str(recording)],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,

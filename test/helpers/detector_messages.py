@@ -8,44 +8,9 @@ import numpy as np
 import ros_messages as ros
 from rosbags.typesys import get_types_from_msg
 
-NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
-DEFINITIONS = {
-    'vision_msgs/msg/ObjectHypothesis': 'string class_id\nfloat64 score\n',
-    'vision_msgs/msg/ObjectHypothesisWithPose': (
-        'ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n'
-    ),
-    'vision_msgs/msg/BoundingBox3D': 'geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n',
-    'vision_msgs/msg/Detection3D': (
-        'std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n'
-        'string id\n'
-    ),
-    'vision_msgs/msg/Detection3DArray': 'std_msgs/Header header\nDetection3D[] detections\n',
-    'apriltag_msgs/msg/Point': 'float64 x\nfloat64 y\n',
-    'apriltag_msgs/msg/AprilTagDetection': (
-        'string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n'
-        'Point centre\nPoint[4] corners\nfloat64[9] homography\n'
-    ),
-    'apriltag_msgs/msg/AprilTagDetectionArray': (
-        'std_msgs/Header header\nAprilTagDetection[] detections\n'
-    ),
-    'isaac_ros_apriltag_interfaces/msg/AprilTagDetection': (
-        'string family\nint32 id\ngeometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n'
-        'geometry_msgs/PoseWithCovarianceStamped pose\n'
-    ),
-    'isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray': (
-        'std_msgs/Header header\nAprilTagDetection[] detections\n'
-    ),
-    'aruco_opencv_msgs/msg/MarkerPose': 'uint16 marker_id\ngeometry_msgs/Pose pose\n',
-    'aruco_opencv_msgs/msg/BoardPose': 'string board_name\ngeometry_msgs/Pose pose\n',
-    'aruco_opencv_msgs/msg/ArucoDetection': (
-        'std_msgs/Header header\nMarkerPose[] markers\nBoardPose[] boards\n'
-    ),
-    **dict.fromkeys(
-        ('aruco_interfaces/msg/ArucoMarkers', 'ros2_aruco_interfaces/msg/ArucoMarkers'),
-        'std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses\n',
-    ),
-}
+from slam_observer_ros.recording.definitions import DEFINITIONS
 
+NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 for type_name, text in DEFINITIONS.items():
     ros.TYPESTORE.register(get_types_from_msg(text, type_name))
 

@@ -70,19 +70,27 @@ def messages() -> Iterator[tuple[str, int, object]]:
 
 
 def write_rosbag2(
-    directory: Path, storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE
+    directory: Path,
+    storage: StoragePlugin,
+    compression: CompressionMode = CompressionMode.NONE,
+    repeats: int = 1,
 ) -> Path:
-    """Write the run as a rosbag2 directory."""
+    """Write the run as a rosbag2 directory, again and again."""
+    serialised = [
+        (topic, stamp_ns, message.__msgtype__, ros.serialise(message))
+        for topic, stamp_ns, message in messages()
+    ]
     bag = rosbag2.Writer(directory, version=9, storage_plugin=storage)
     bag.set_compression(compression, CompressionFormat.ZSTD)
     with bag:
         connections = {}
-        for topic, stamp_ns, message in messages():
-            if topic not in connections:
-                connections[topic] = bag.add_connection(
-                    topic, message.__msgtype__, typestore=ros.TYPESTORE
-                )
-            bag.write(connections[topic], stamp_ns, ros.serialise(message))
+        for number in range(repeats):
+            for topic, stamp_ns, message_type, data in serialised:
+                if topic not in connections:
+                    connections[topic] = bag.add_connection(
+                        topic, message_type, typestore=ros.TYPESTORE
+                    )
+                bag.write(connections[topic], stamp_ns + number * 3 * 10**9, data)
     return directory
 
 

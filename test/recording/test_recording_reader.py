@@ -233,10 +233,29 @@ class TestDamage:
         assert len(stamps_ns) == 102
         assert stamps_ns == sorted(stamps_ns)
 
+    def test_a_file_that_metadata_does_not_list_is_named(self, split):
+        directory, count = split
+        (directory / 'metadata.yaml').write_text(
+            'rosbag2_bagfile_information: {relative_file_paths: [0.mcap]}'
+        )
+        with Recording(directory) as recording:
+            expected = f'{directory}: metadata.yaml does not list 1.mcap, left out'
+            assert (recording.warning, recording.message_count) == (expected, count)
+
     def test_of_a_split_recording_a_file_that_is_missing_is_named(self, split):
-        directory, _ = split
+        directory, count = split
         (directory / '1.mcap').unlink()
-        with pytest.raises(RecordingError, match=r'incomplete; metadata\.yaml lists 1\.mcap'):
+        with (directory / 'metadata.yaml').open('w') as file:
+            file.write(
+                'rosbag2_bagfile_information:\n  relative_file_paths: [0.mcap, 1.mcap]\n'
+                f'  message_count: {2 * count}\n'
+            )
+        with Recording(directory) as recording:
+            assert recording.warning == f'{directory}: 1.mcap is missing: {count} messages'
+            assert recording.loss.message_count == count
+            assert len(list(recording.events(recording.find_topics()))) == count
+        (directory / '0.mcap').unlink()
+        with pytest.raises(RecordingError, match='no rosbag2 directory'):
             Recording(directory)
 
     @pytest.mark.parametrize('name', ['mcap file', 'sqlite3 file', 'ROS 1 bag', 'own mcap'])
@@ -410,23 +429,39 @@ class TestCompression:
         with Recording(recordings.write_rosbag2(tmp_path / 'run', storage, mode)) as run:
             assert len(list(run.events(run.find_topics()))) == 150
 
-    def test_without_metadata_a_compressed_file_is_refused_with_what_to_do(
-        self, tmp_path, storage
-    ):
-        directory = recordings.write_rosbag2(tmp_path / 'run', storage, CompressionMode.FILE)
+    @pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
+    def test_without_metadata_it_is_read_too(self, tmp_path, storage, mode):
+        directory = recordings.write_rosbag2(tmp_path / 'run', storage, mode)
         (directory / 'metadata.yaml').unlink()
         (file,) = directory.iterdir()
         for path in (directory, file):
-            with pytest.raises(RecordingError, match=f"{file}: compressed; run 'zstd -d'"):
-                Recording(path)
+            with Recording(path) as run:
+                assert_same_events(list(run.events(run.find_topics())), recordings.events())
+                assert not run.loss
 
-    def test_without_metadata_compressed_messages_are_refused_with_what_to_do(
-        self, tmp_path, storage
-    ):
+    @pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
+    def test_of_one_that_is_cut_off_what_is_there_is_read(self, tmp_path, storage, mode):
+        directory = recordings.write_rosbag2(tmp_path / 'run', storage, mode, repeats=200)
+        (file,) = (path for path in directory.iterdir() if path.suffix != '.yaml')
+        os.truncate(file, file.stat().st_size * 2 // 3)
+        with Recording(directory) as run:
+            assert 0 < len(list(run.events(run.find_topics()))) < 200 * 150
+            assert run.loss
+            assert run.loss.message_count > 0
+            assert str(file) in run.warning
+            assert 'slam_observer_' not in run.warning
+
+    def test_a_message_that_is_damaged_is_malformed(self, tmp_path, storage):
         directory = recordings.write_rosbag2(tmp_path / 'run', storage, CompressionMode.MESSAGE)
-        (directory / 'metadata.yaml').unlink()
-        with pytest.raises(RecordingError, match='its messages are compressed, which'):
-            Recording(directory)
+        (file,) = (path for path in directory.iterdir() if path.suffix != '.yaml')
+        data = file.read_bytes()
+        middle = data.index(bytes.fromhex('28b52ffd'), len(data) // 2)  # how zstd begins
+        file.write_bytes(data[: middle + 5] + bytes(8) + data[middle + 13 :])
+        with Recording(directory) as run:
+            events = list(run.events(run.find_topics()))
+            lost = run.malformed.total() + bool(run.loss)
+        assert len(events) < 150
+        assert lost
 
 
 def cloud2_with(count: int, *fields: str) -> object:

@@ -116,9 +116,13 @@ def read(path: Path):
 
 
 @pytest.mark.parametrize('name', FORMATS)
-def test_of_a_whole_recording_nothing_is_lost_and_a_scan_finds_the_same(whole, name):
+def test_of_a_whole_recording_nothing_is_lost(whole, name):
     velocities, loss, warning = read(whole[name])
     assert (len(velocities), bool(loss), warning) == (COUNT, False, None)
+
+
+@pytest.mark.parametrize('name', ['db3', 'bag'])
+def test_of_a_whole_recording_a_scan_finds_the_same(whole, name):
     scanned = SalvagedSource(whole[name], SCANS[f'.{name}'])
     with Recording(whole[name]) as recording:
         assert set(scanned.topics) == set(recording.topics)

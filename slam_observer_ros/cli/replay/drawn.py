@@ -11,7 +11,6 @@ from slam_observer_ros.cli.replay.outcome import ReplayOutcome
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import nees_over_time
-from slam_observer_ros.evaluation.gaps import fill_gaps
 from slam_observer_ros.evaluation.map_shape import shape_covariances
 from slam_observer_ros.evaluation.plots.map_plot import plot_map
 from slam_observer_ros.evaluation.plots.replay_plots import plot_errors, plot_residuals
@@ -80,13 +79,10 @@ def draw_figures(outcome: ReplayOutcome, directory: Path, suffix: str) -> None:
 
 def _draw_map(outcome: ReplayOutcome, path: Path) -> None:
     result, truth, smoothed = outcome.result, outcome.truth, outcome.smoothed
-    trajectory = outcome.trajectory
-    if smoothed is not None:
-        trajectory = fill_gaps(trajectory, result.dead_reckoning)
     has_errors = outcome.trajectory_errors is not None
     plot_map(
         path,
-        trajectory,
+        outcome.trajectory,
         result.estimator.landmark_ids if smoothed is None else smoothed.ids,
         result.estimator.world_points if smoothed is None else smoothed.world_points,
         Trajectory(truth.stamps_ns, truth.poses) if has_errors else None,

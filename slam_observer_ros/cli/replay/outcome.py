@@ -16,7 +16,13 @@ from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
 from slam_observer_ros.recording.sources import Loss, NOTHING_LOST
 from slam_observer_ros.recording.topics import SelectedTopics
-from slam_observer_ros.runs.accuracy import Accuracy, measure, measure_smoothed, trajectory_of
+from slam_observer_ros.runs.accuracy import (
+    Accuracy,
+    measure,
+    measure_smoothed,
+    smoothed_trajectory,
+    SmoothedAccuracy,
+)
 from slam_observer_ros.runs.recorder import NisTally, RunRecorder
 from slam_observer_ros.runs.replay import Replay
 
@@ -40,8 +46,8 @@ class ReplayOutcome:
     missing_ids: str
     loss: Loss = NOTHING_LOST
     smoothed: Smoothed | None = None
-    smoothed_errors: TrajectoryErrors | None = None
-    smoothed_landmark_rmse_m: float | None = None
+    smoothed_trajectory: Trajectory | None = None
+    smoothed_accuracy: SmoothedAccuracy | None = None
     recorder: RunRecorder | NisTally | None = None
     warnings: Sequence[str] = ()
 
@@ -73,24 +79,27 @@ class ReplayOutcome:
             'bytes': self.loss.byte_count,
             'seconds': self.loss.seconds,
             'cut_off': self.loss.is_cut_off,
+            'messages': self.loss.message_count,
             'malformed': self.unused[MALFORMED],
         }
 
     @property
     def trajectory(self) -> Trajectory:
         """The smoothed trajectory, if that was asked for; else the online one."""
-        return self.result.trajectory if self.smoothed is None else trajectory_of(self.smoothed)
+        smoothed = self.smoothed_trajectory
+        return self.result.trajectory if smoothed is None else smoothed
 
     @property
     def trajectory_errors(self) -> TrajectoryErrors | None:
         """Errors of :attr:`trajectory`; None without truth."""
-        return self.accuracy.pose_errors if self.smoothed is None else self.smoothed_errors
+        accuracy = self.accuracy if self.smoothed_accuracy is None else self.smoothed_accuracy
+        return accuracy.pose_errors
 
     @property
     def truth_covered(self) -> float | None:
         """Share of the trajectory that the truth covers; None without true poses."""
         errors = self.accuracy.pose_errors
-        return None if errors is None else float(errors.covered.mean())
+        return None if errors is None else errors.covered_share
 
     @property
     def localised_after_s(self) -> float | None:
@@ -137,16 +146,19 @@ def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
     smoothed = outcome.result.estimator.smooth()
     if not len(smoothed.stamps_ns):
         raise UsageError(f'nothing to smooth: no observation since {smoothed.since}')
+    online = outcome.result.trajectory
+    stamps_ns = online.stamps_ns
     if len(smoothed.stamps_ns) < outcome.result.observations:
+        stamps_ns = stamps_ns[stamps_ns >= smoothed.stamps_ns[0]]
         logger.warning(
             'Only the last %d observations are smoothed: those since %s.',
             len(smoothed.stamps_ns),
             smoothed.since,
         )
-    errors, landmark_rmse_m = measure_smoothed(smoothed, outcome.truth)
+    trajectory = smoothed_trajectory(smoothed, stamps_ns, outcome.result.dead_reckoning)
     return replace(
         outcome,
         smoothed=smoothed,
-        smoothed_errors=errors,
-        smoothed_landmark_rmse_m=landmark_rmse_m,
+        smoothed_trajectory=trajectory,
+        smoothed_accuracy=measure_smoothed(smoothed, trajectory, online, outcome.truth),
     )

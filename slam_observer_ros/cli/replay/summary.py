@@ -25,7 +25,7 @@ LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported')
 def as_json(outcome: ReplayOutcome) -> dict[str, object]:
     """Return the figures as ``--json`` prints them; null is what was not measured."""
     estimator, accuracy = outcome.result.estimator, outcome.accuracy
-    errors = accuracy.pose_errors
+    errors, after = accuracy.pose_errors, outcome.smoothed_accuracy
     selected = outcome.selected
     return {
         'velocity_topic': selected.velocity.name,
@@ -52,8 +52,10 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'configuration_anees': accuracy.configuration_anees,
         'nis': None if outcome.recorder is None else outcome.recorder.mean_nis,
         'dead_reckoning_ate_rmse_m': _ate_rmse_m(accuracy.dead_reckoning_errors),
-        'smoothed_ate_rmse_m': _ate_rmse_m(outcome.smoothed_errors),
-        'smoothed_landmark_rmse_m': outcome.smoothed_landmark_rmse_m,
+        'unsmoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.online_errors),
+        'smoothed_ate_rmse_m': None if after is None else _ate_rmse_m(after.pose_errors),
+        'smoothed_landmark_rmse_m': None if after is None else after.landmark_rmse_m,
+        'smoothed_slips': None if outcome.smoothed is None else outcome.smoothed.slips,
     }
 
 
@@ -142,6 +144,8 @@ def _covered_rows(outcome: ReplayOutcome) -> dict[str, str]:
 
 def _accuracy_rows(outcome: ReplayOutcome) -> dict[str, str]:
     figures = as_json(outcome)
+    if figures['unsmoothed_ate_rmse_m'] == figures['ate_rmse_m']:  # all of it is smoothed
+        figures['unsmoothed_ate_rmse_m'] = None
     rows = _covered_rows(outcome) | {
         name: figure_text(key, figure, unit)
         for key, (name, unit) in ACCURACY_ROWS.items()
