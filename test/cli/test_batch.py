@@ -153,6 +153,7 @@ def test_the_same_recording_under_two_names_is_run_once(slam_observer, recording
         (['--grid', 'gains=constant', '--smooth'], '--smooth needs riccati gains'),
         (['--shard', '3/2'], 'i from 1 to N'),
         (['nothing/*.mcap'], "no file is named 'nothing/*.mcap'"),
+        (['--grid', 'range_noise=0.1,0.10'], '--grid range_noise: 0.1 is given twice'),
         (['--workers', '0'], 'a number of processes from 1 is needed'),
         (['--workers', 'many'], 'a number of processes from 1 is needed'),
     ],

@@ -38,6 +38,7 @@ READ = [
     ('convert', 'graph', '{}.txt', 'out.mcap'),
     ('config', './{}.yaml'),
     ('config', './{}.yaml', '--dump'),
+    ('doctor', '{}.mcap'),
 ]
 """What reads a file, by its name without a suffix; a folder has it as its only file."""
 
@@ -94,6 +95,7 @@ def test_an_output_that_links_to_itself_is_refused(slam_observer, recording, opt
         ('map', 'check', ''),
         ('convert', 'mrclam', '', 'out.mcap', '--robot', '1'),
         ('config', ''),
+        ('doctor', ''),
     ],
     ids=' '.join,
 )
@@ -151,5 +153,6 @@ def test_no_output_replaces_what_is_read_even_by_force(slam_observer, recording,
 
 def test_what_is_held_out_is_read_before_the_search(slam_observer, recording, monkeypatch):
     monkeypatch.setattr('slam_observer_ros.cli.tune.command.most_likely', None)
-    words = ('tune', recording, '--hold-out', 'nothing.mcap')
-    assert 'nothing.mcap: no such file' in slam_observer.fail(*words)
+    words = ('tune', recording, '--hold-out')
+    assert 'nothing.mcap: no such file' in slam_observer.fail(*words, 'nothing.mcap')
+    assert 'a recording is given twice' in slam_observer.fail(*words, SAMPLE)

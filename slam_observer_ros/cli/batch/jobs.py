@@ -17,7 +17,7 @@ from typing import Any
 from slam_observer_ros.cli.options import parse_value
 from slam_observer_ros.cli.replay.asked import Asked, check_smooth
 from slam_observer_ros.cli.replay.input_options import topic_names
-from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.errors import shown, UsageError
 from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -80,6 +80,9 @@ def grid_points(texts: Iterable[str]) -> list[Point]:
         axes[name] = [
             _KNOWN[name].check(parse_value(value)) for value in re.split(r',(?![^\[]*\])', values)
         ]
+        for number, value in enumerate(axes[name]):
+            if value in axes[name][:number]:
+                raise UsageError(f'--grid {name}: {shown(value)} is given twice')
     return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
 
 

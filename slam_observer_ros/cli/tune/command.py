@@ -71,11 +71,13 @@ def run(args: argparse.Namespace) -> None:
     read = {f'the recording {path}': files_of(path) for path in recordings}
     check_inputs_are_kept({'--out': args.out}, read)
     check_outputs([args.out], args.force)
-    with muted_warnings():  # which are shown when it is judged; the search takes long
-        for path in args.hold_out:
-            read_material(args, path, asked, 1.0)
+    with muted_warnings():  # they are shown when it is judged; here, before the long search
+        hashes = [read_material(args, path, asked, 1.0).sha256 for path in args.hold_out]
     share = 0.0 if args.hold_out else HELD_OUT_SHARE
     trained_on = [read_material(args, path, asked, share) for path in args.recordings]
+    hashes += [material.sha256 for material in trained_on]
+    if len(set(hashes)) < len(hashes):
+        raise UsageError('a recording is given twice; what is trained on can not be held out, too')
     kinds, found = _search(trained_on, asked.settings)
     tuned = _rounded(scaled(asked.settings, kinds, found.log_factors.tolist()), kinds)
     verdict = _verdict(args, asked, trained_on, tuned)
