@@ -184,6 +184,15 @@ def test_the_range_scale_is_not_biased_by_noise(monkeypatch):
 
 
 @both
+def test_in_the_plane_a_bracket_is_taken_to_be_askew_unless_stated_otherwise(settings):
+    usual = calibrated(Settings(two_d_mode=settings.two_d_mode))
+    assert usual.corrects_points == settings.two_d_mode
+    np.testing.assert_array_equal(usual.initial_variances, [0.035**2] * settings.two_d_mode)
+    exact = calibrated(Settings(two_d_mode=settings.two_d_mode, sensor_rotation_stddev=NONE))
+    assert not exact.corrects_points
+
+
+@both
 def test_each_sensor_frame_has_a_calibration_of_its_own(settings):
     world = drive(settings, 40.0, landmarks=20)
     left = erring(world, settings, sensor_frame='left').observations()
