@@ -143,4 +143,5 @@ def _consistency(run: ReportedRun) -> list[Finding]:
 
 
 def _calibration(run: ReportedRun) -> list[Finding]:
-    return [Finding(part.problem) for part in run.calibration if part.problem]
+    found = [text for part in run.calibration for text in (part.problem, part.advice)]
+    return [Finding(text) for text in found if text]

@@ -40,13 +40,6 @@ How the robot moves so much later is not known yet when it is needed: without a 
 estimate, which can't make up for it, would stray ever further.
 """
 
-PLANAR_MOUNT_RAD = 0.035
-"""How far a sensor's bracket is turned about z, if nobody states it: two degrees.
-
-In space all three angles would have to be estimated, which costs more than it gives where sensors
-are mounted well.
-"""
-
 UNITS = ('',) * 6 + ('rad/s',) * 3 + ('m/s',) * 3 + ('s',)
 
 
@@ -244,10 +237,8 @@ class Calibration:
 
 def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
     """Return ψ, d and s (7,) of a sensor as stated, and their standard deviations (7,)."""
-    usual = np.array([0.0, 0.0, PLANAR_MOUNT_RAD if settings.two_d_mode else 0.0])
-    rotation = np.array(settings.sensor_rotation_stddev)
     deviations = [
-        *np.where(rotation < 0.0, usual, rotation),
+        *settings.sensor_rotation_stddev,
         *settings.sensor_translation_stddev,
         settings.range_scale_stddev / settings.range_scale,
     ]

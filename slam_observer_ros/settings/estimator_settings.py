@@ -297,12 +297,12 @@ class Settings(Immutable):
         maximum=MAX_DELAY_S,
     )
     sensor_rotation_stddev: Vector3 = parameter(
-        (-1.0, -1.0, -1.0),
+        (0.0, 0.0, 0.0),
         'Riccati gains: how far a sensor of landmarks may be turned against what /tf says, about '
         'the body axes x y z, to be estimated for each sensor frame: its standard deviation; '
-        'negative for the usual one, which is 0.035 (2°) about z with two_d_mode, else 0',
+        'brackets are turned by some 0.035 (2°)',
         unit='rad',
-        minimum=-1.0,
+        minimum=0.0,
         maximum=1.0,
     )
     sensor_translation_stddev: Vector3 = parameter(

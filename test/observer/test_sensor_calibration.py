@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from strategies import generators
 
+from slam_observer_ros.estimates import CalibrationEstimate
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
@@ -188,15 +189,6 @@ def test_the_range_scale_is_not_biased_by_noise(monkeypatch):
 
 
 @both
-def test_in_the_plane_a_bracket_is_taken_to_be_askew_unless_stated_otherwise(settings):
-    usual = calibrated(Settings(two_d_mode=settings.two_d_mode))
-    assert usual.corrects_points == settings.two_d_mode
-    np.testing.assert_array_equal(usual.initial_variances, [0.035**2] * settings.two_d_mode)
-    exact = calibrated(Settings(two_d_mode=settings.two_d_mode, sensor_rotation_stddev=NONE))
-    assert not exact.corrects_points
-
-
-@both
 def test_each_sensor_frame_has_a_calibration_of_its_own(settings):
     world = drive(settings, 40.0, landmarks=20)
     left = erring(world, settings, sensor_frame='left').observations()
@@ -309,3 +301,30 @@ def test_points_without_ids_are_matched_where_a_calibrated_sensor_has_them():
 
     estimator = estimate(world.with_observations(shown), settings)
     assert len(estimator.landmark_ids) <= 8
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'text'),
+    [
+        ('sensor_rotation_z/camera', 0.0349, 'camera is mounted 2 ± 0.57 ° further to the left'),
+        ('sensor_rotation_y', -0.0349, 'the sensor is mounted 2 ± 0.57 ° further up than'),
+        (
+            'sensor_translation_x',
+            -0.05,
+            'is mounted 0.05 ± 0.01 m further back than /tf',
+        ),
+        ('range_scale', 0.95, 'multiplied by 0.950 ± 0.010: set range_scale: 0.9500'),
+        ('sensor_rotation_z', 0.02, ''),
+        ('linear_scale_x', 1.5, ''),
+    ],
+)
+def test_what_was_found_is_said_as_what_to_set(name, value, text):
+    part = CalibrationEstimate(
+        name, value, 0.01, UNITS[name.split('/')[0]], float('scale' in name), 0.035
+    )
+    assert part.advice == text or text in part.advice != ''
+
+
+UNITS = dict(zip(sensor_calibration.NAMES, sensor_calibration.UNITS, strict=True)) | {
+    'linear_scale_x': ''
+}

@@ -198,10 +198,10 @@ def _warn_of_rejections(result: Replay) -> None:
 
 
 def _warn_of_calibration(result: Replay) -> None:
-    """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
+    """Say what may be wrong if nobody can mean an estimate, and how sensors are really mounted."""
     for part in result.estimator.calibration:
-        if part.problem:
-            logger.warning('%s', part.problem)
+        for text in filter(None, (part.problem, part.advice)):
+            logger.warning('%s', text)
 
 
 def _warn_of_unmapped(result: Replay) -> None:
