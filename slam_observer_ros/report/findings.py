@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimates import MAX_REJECTED
+from slam_observer_ros.estimates import calibration_problems, MAX_REJECTED
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.report.noise_advice import noise_advice
@@ -143,5 +143,5 @@ def _consistency(run: ReportedRun) -> list[Finding]:
 
 
 def _calibration(run: ReportedRun) -> list[Finding]:
-    found = [text for part in run.calibration for text in (part.problem, part.advice)]
-    return [Finding(text) for text in found if text]
+    advice = [part.advice for part in run.calibration if part.advice]
+    return [Finding(text) for text in [*calibration_problems(run.calibration), *advice]]

@@ -289,9 +289,9 @@ class Settings(Immutable):
         maximum=100.0,
     )
     velocity_delay_stddev: float = parameter(
-        0.0,
+        0.2,
         'Scheduled and Riccati gains: delay from the stamp of a velocity to its effect in '
-        'observations, to be estimated: its standard deviation',
+        'observations, to be estimated: its standard deviation; 0 for none',
         unit='s',
         minimum=0.0,
         maximum=MAX_DELAY_S,
@@ -428,10 +428,18 @@ class Settings(Immutable):
         choices=('off', 'uncertain', 'fixed'),
         basic=True,
     )
+    localization_error_probability: float = parameter(
+        1e-3,
+        'Riccati gains, points without id in a loaded map: how likely the place where they fit '
+        'may be wrong',
+        minimum=1e-9,
+        maximum=0.1,
+    )
     set_initial_pose: bool = parameter(
         False,
         'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded '
-        'map within 0.5 m and 0.26 rad, instead of localising there by landmarks',
+        'map within initial_position_stddev and initial_angle_stddev, instead of localising there '
+        'by landmarks',
     )
     initial_position: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -446,6 +454,34 @@ class Settings(Immutable):
         unit='rad',
         minimum=-6.3,
         maximum=6.3,
+    )
+    initial_roll: float = parameter(
+        0.0,
+        'Its roll then, where it does not stand upright',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
+    )
+    initial_pitch: float = parameter(
+        0.0,
+        'Its pitch then',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
+    )
+    initial_position_stddev: float = parameter(
+        0.5,
+        'In a loaded map: standard deviation of each coordinate of initial_position',
+        unit='m',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    initial_angle_stddev: float = parameter(
+        0.26,
+        'In a loaded map: standard deviation of how the robot is turned, about each axis',
+        unit='rad',
+        minimum=0.0,
+        maximum=3.2,
     )
     map_noise: float = parameter(
         0.05,

@@ -36,6 +36,7 @@ EVERYTHING = Settings(
     range_scale=1.01,
     range_scale_stddev=0.02,
     angular_bias_stddev=NONE,
+    velocity_delay_stddev=0.0,
     angular_velocity_noise=(0.003,) * 3,
     linear_velocity_noise=(0.003,) * 3,
     range_noise=0.02,
@@ -59,7 +60,8 @@ def erring(world, settings, turned=TURNED, shifted=SHIFTED, longer=LONGER, **whe
 
 def calibrated(settings):
     calibration = Calibration(
-        replace(settings, angular_bias_stddev=NONE), axes_of(settings.two_d_mode)
+        replace(settings, angular_bias_stddev=NONE, velocity_delay_stddev=0.0),
+        axes_of(settings.two_d_mode),
     )
     calibration.add_sensor('')
     return calibration
@@ -167,6 +169,7 @@ def range_scales(seeds):
         range_scale_stddev=0.05,
         range_noise=0.1,
         angular_bias_stddev=NONE,
+        velocity_delay_stddev=0.0,
         relinearization_interval=0,
     )
     off = []

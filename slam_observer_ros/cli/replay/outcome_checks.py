@@ -12,6 +12,7 @@ import numpy as np
 from slam_observer_ros.cli.replay.dropped import list_dropped, unused_messages
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import (
+    calibration_problems,
     MAX_REJECTED,
     MAX_REJECTED_ORIENTATIONS,
     point_share,
@@ -131,6 +132,11 @@ def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap
 def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
     named = known.ids[~is_automatic(known.ids)]
     least = 'two' if result.estimator.settings.two_d_mode else 'three'
+    if is_automatic(result.estimator.landmark_ids).any():
+        return (
+            f'the pose in the map {path} was not found: '
+            f'{result.estimator.localisation_problem}{_advice(result)}'
+        )
     return (
         f'the pose in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
@@ -199,9 +205,10 @@ def _warn_of_rejections(result: Replay) -> None:
 
 def _warn_of_calibration(result: Replay) -> None:
     """Say what may be wrong if nobody can mean an estimate, and how sensors are really mounted."""
-    for part in result.estimator.calibration:
-        for text in filter(None, (part.problem, part.advice)):
-            logger.warning('%s', text)
+    calibration = result.estimator.calibration
+    advice = [part.advice for part in calibration if part.advice]
+    for text in [*calibration_problems(calibration), *advice]:
+        logger.warning('%s', text)
 
 
 def _warn_of_unmapped(result: Replay) -> None:
