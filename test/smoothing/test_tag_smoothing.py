@@ -34,6 +34,7 @@ SETTINGS = Settings(
     huber_threshold=0.0,
     rejection_threshold=100.0,
     angular_bias_stddev=(0.0, 0.0, 0.0),
+    velocity_delay_stddev=0.0,
     max_hypotheses=1,
     confirmations=1,
     reorder_window=0.0,
