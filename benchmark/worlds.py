@@ -159,7 +159,7 @@ def shipped_settings(config: str) -> Settings:
 
 
 def simulated_settings(config: str) -> Settings:
-    """Return the same for a simulated sensor: as /tf has it, with errors new in each observation."""
+    """Return the same for a simulated sensor: as /tf has it, with errors new each time."""
     return replace(
         shipped_settings(config),
         observation_correlation_time=0.0,
