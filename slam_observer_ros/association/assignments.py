@@ -19,7 +19,7 @@ from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     JointSearch,
     Pairs,
-    PRUNING_COST,
+    pruning_cost,
     RESOLUTION,
     unpaired_cost,
 )
@@ -46,12 +46,13 @@ class Assignment:
 
 
 def find_assignments(
-    state: State, index: LandmarkIndex, event: ObservationEvent, budget: float
+    state: State, index: LandmarkIndex, event: ObservationEvent, new_cost: float, budget: float
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different poses, the most likely first.
 
     ``state`` is that at the instant of ``event``, an observation of m points, ``index`` that of
-    its landmarks. None costs more than ``budget``.
+    its landmarks. A point without an id costs ``new_cost`` if it is of a new landmark. None costs
+    more than ``budget``.
     """
     # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
     axes, m = state.axes, len(event.ids)
@@ -64,10 +65,11 @@ def find_assignments(
     # What it costs that a point is of no landmark, and which are of one in any case.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
-    unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), gate_cost)
+    none_costs = np.where(event.ids == UNKNOWN_ID, new_cost, gate_cost)
+    unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
     # Points outside the search; one of no landmark costs the same whatever it might have been.
-    fixed_cost = m * gate_cost - float(unpaired_costs[np.unique(at)].sum())
-    margin = 0.0 if certain.all() else PRUNING_COST
+    fixed_cost = float(none_costs.sum() - unpaired_costs[np.unique(at)].sum())
+    margin = 0.0 if certain.all() else pruning_cost(event.ids)
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
     # Of the pairings that put the robot at one pose, the cheapest, which comes first.
     scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
