@@ -41,7 +41,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
-from slam_observer_ros.state.matching import match, MatchedObservation
+from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, Outcome, step
 
@@ -92,6 +92,11 @@ class Hypotheses:
     def best(self) -> State:
         """The most likely state."""
         return self._all[0].state
+
+    @property
+    def missed(self) -> float:
+        """Landmarks that should have been among the points without ids seen last, and were not."""
+        return self._all[0].visibility.missed
 
     def prune_to_best(self) -> State:
         """Give up all hypotheses but the most likely one, and return its state."""
@@ -243,9 +248,14 @@ class Hypotheses:
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
+<<<<<<< HEAD
             for taken in interpretations(
                 state, index, event, matched, new_ids, new_cost, worst - cost
             ):
+=======
+            seen = corrected(state, event)
+            for taken in interpretations(state, index, seen, matched, new_ids, worst - cost):
+>>>>>>> main
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
@@ -278,7 +288,7 @@ def are_one(
     They have if the points, and each landmark that either takes one of them for, have the same
     positions: which was which in this observation does not matter then.
     """
-    if not np.array_equal(event.points, other_event.points):  # one takes some for outliers
+    if not np.array_equal(_shown(event), _shown(other_event)):  # one takes some for outliers
         return False
     # How far the points seen are from each other, and the landmarks they are taken for.
     here, there = state.observer.pose, other.observer.pose
@@ -292,3 +302,8 @@ def are_one(
             shifts.append(state.world_points[rows] - other.world_points[other_rows])
     distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
     return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)
+
+
+def _shown(event: ObservationEvent) -> FloatArray:
+    """Return the points (m, 3) as the sensor showed them, whatever a hypothesis makes of that."""
+    return event.points if event.sensed is None else event.sensed.arms

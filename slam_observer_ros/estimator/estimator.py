@@ -35,7 +35,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import Localiser
+from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -300,6 +300,21 @@ class Estimator:
         return self._localiser.is_localised
 
     @property
+    def localisation_problem(self) -> str:
+        """Why the pose in a loaded map is not known; empty if it is."""
+        return self._localiser.problem(self._state.observer.A)
+
+    @property
+    def possible_poses(self) -> FloatArray:
+        """(q, 4, 4) where in a loaded map the robot may be, by points without ids, likely first.
+
+        As of the last search; empty where none fits, and where the pose is known.
+        """
+        places = [] if self.is_localised else self._localiser.places
+        poses = [place.transform @ self._state.observer.A for place in places]
+        return np.array(poses).reshape(-1, 4, 4)
+
+    @property
     def landmark_map(self) -> LandmarkMap:
         """The present map, as it can be saved and loaded: without landmarks that move.
 
@@ -513,8 +528,10 @@ class Estimator:
             event, self.settings, needs_ids, state.landmarks, self._counts, warnings
         )
         event = self._timeline.synchronise(usable)
+        if self._localiser.loaded is not None:
+            self._doubt_rough_pose(event)
         outcome = self._hypotheses.observe(event)
-        self._localise(outcome)
+        self._localise(event, outcome)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
         self._warn_of(event, outcome)
@@ -522,16 +539,29 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self.last_update)
 
-    def _localise(self, outcome: Outcome) -> None:
+    def _doubt_rough_pose(self, event: ObservationEvent) -> None:
+        """Search about a given pose that is too rough for the points of an observation."""
+        if not self._localiser.may_be_rough(event):
+            return
+        pose, covariance = self.pose, self.pose_covariance
+        if covariance is not None and is_rough(covariance):
+            self._start(None)
+            self._localiser.search_near(pose, covariance)
+
+    def _localise(self, event: ObservationEvent, outcome: Outcome) -> None:
         """Look for the pose in a loaded map if it is not known, or not any more."""
         if self._localiser.loaded is None:
             return
-        reason = self._localiser.reason_to_reset(self._state, outcome)
+        missed = self._hypotheses.missed
+        reason = self._localiser.reason_to_reset(self._state, event, outcome, missed)
         if reason is not None:
             logger.warning('%s; localising again.', reason)
             self._start(None)
         if self._localiser.search(self._state):
             self._hypotheses.prune_to_best()
+        elif (found := self._localiser.pose_by_tag(self._state)) is not None:
+            self._start(found.pose, found.covariance)
+            self._localiser.try_tag(found.tag_id)
 
     def _start_again(self, distance_m: float) -> None:
         """Start again where settings or measurements have led the estimate out of all bounds."""
@@ -554,8 +584,10 @@ class Estimator:
 
     def _start_where_settings_say(self) -> None:
         settings = self.settings
-        pose = se3.from_rpy((*settings.initial_position, 0.0, 0.0, settings.initial_yaw))
-        self._start(pose, np.diag(GIVEN_POSE_STD**2))
+        turn = settings.initial_roll, settings.initial_pitch, settings.initial_yaw
+        deviations = settings.initial_angle_stddev, settings.initial_position_stddev
+        pose = se3.from_rpy((*settings.initial_position, *turn))
+        self._start(pose, np.diag(np.repeat(deviations, 3) ** 2))
 
     def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
         """Start again with an empty map, or the loaded one, at ``pose`` (4, 4) if it is known."""

@@ -32,7 +32,7 @@ UNEXPECTED_POSES = {
     'slip': 'Odometry does not explain what is seen: the robot slipped or was carried, or the '
     'stated noise of its velocity is too small',
     'unexpected_place': 'Nothing that is seen is where the map has it: if the robot slipped or '
-    'was carried, it is not found again, as the points have no ids',
+    'was carried, without ids it is found again in a loaded map only',
 }
 """What is wrong with the robot's pose when these counts grow."""
 

@@ -296,10 +296,46 @@ class Settings(Immutable):
         minimum=0.0,
         maximum=MAX_DELAY_S,
     )
+    sensor_rotation_stddev: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Riccati gains: how far a sensor of landmarks may be turned against what /tf says, about '
+        'the body axes x y z, to be estimated for each sensor frame: its standard deviation',
+        unit='rad',
+        minimum=0.0,
+        maximum=1.0,
+    )
+    sensor_translation_stddev: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Riccati gains: how far a sensor of landmarks may be from where /tf says, along the body '
+        'axes x y z, to be estimated: its standard deviation',
+        unit='m',
+        minimum=0.0,
+        maximum=10.0,
+    )
+    range_scale: float = parameter(
+        1.0,
+        "What a sensor's ranges are multiplied by, as for tags printed larger than the detector "
+        'knows, or a focal length that is off',
+        minimum=0.1,
+        maximum=10.0,
+    )
+    range_scale_stddev: float = parameter(
+        0.0,
+        'Riccati gains: how far range_scale may be off, to be estimated: its standard deviation; '
+        'without a surveyed map it can hardly be distinguished from the scale of velocities',
+        minimum=0.0,
+        maximum=1.0,
+    )
+    range_is_depth: bool = parameter(
+        False,
+        'Whether the sensor takes for range what is depth along its axis, as cameras do that '
+        "judge distance by apparent size; the axis is x of the sensor's frame, z of an optical "
+        'one',
+    )
     calibration_drift: float = parameter(
         0.0,
-        'Scheduled and Riccati gains: how fast scale, bias and delay of the velocity drift, as a '
-        'share of the standard deviation of each',
+        'Scheduled and Riccati gains: how fast the calibration of velocity and sensors drifts, as '
+        'a share of the standard deviation of each part',
         unit='1/√s',
         minimum=0.0,
         maximum=10.0,
@@ -391,10 +427,18 @@ class Settings(Immutable):
         choices=('off', 'uncertain', 'fixed'),
         basic=True,
     )
+    localization_error_probability: float = parameter(
+        1e-3,
+        'Riccati gains, points without id in a loaded map: how likely the place where they fit '
+        'may be wrong',
+        minimum=1e-9,
+        maximum=0.1,
+    )
     set_initial_pose: bool = parameter(
         False,
         'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded '
-        'map within 0.5 m and 0.26 rad, instead of localising there by landmarks',
+        'map within initial_position_stddev and initial_angle_stddev, instead of localising there '
+        'by landmarks',
     )
     initial_position: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -409,6 +453,34 @@ class Settings(Immutable):
         unit='rad',
         minimum=-6.3,
         maximum=6.3,
+    )
+    initial_roll: float = parameter(
+        0.0,
+        'Its roll then, where it does not stand upright',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
+    )
+    initial_pitch: float = parameter(
+        0.0,
+        'Its pitch then',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
+    )
+    initial_position_stddev: float = parameter(
+        0.5,
+        'In a loaded map: standard deviation of each coordinate of initial_position',
+        unit='m',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    initial_angle_stddev: float = parameter(
+        0.26,
+        'In a loaded map: standard deviation of how the robot is turned, about each axis',
+        unit='rad',
+        minimum=0.0,
+        maximum=3.2,
     )
     map_noise: float = parameter(
         0.05,

@@ -221,6 +221,18 @@ class LandmarkTable:
         self.tentative[rows] = is_automatic(self.ids[rows])
         self.in_view[rows] = self.passed[rows] = self.missed[rows] = 0
 
+    def merge(self, rows: IntArray, copies: IntArray) -> None:
+        """Count what was seen of ``copies`` (m,) for ``rows`` (m,), and delete the copies."""
+        for counted in (self.counts, self.in_view, self.passed):
+            counted[rows] += counted[copies]
+        is_later = self.last_seen_ns[copies] > self.last_seen_ns[rows]
+        later, latest = rows[is_later], copies[is_later]
+        for column in (self.last_seen_ns, self.seen_before_ns, self.missed):
+            column[later] = column[latest]
+        self.rejections[rows] = 0
+        self.tentative[rows] &= self.tentative[copies]
+        self.remove(copies)
+
     def remove(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""
         for name in _COLUMNS:

@@ -154,9 +154,21 @@ class State:
         if self.relinearisation is not None:
             self.relinearisation.reset(since)
 
-    def relocate(self, rows: IntArray, points: FloatArray, noise: FloatArray) -> None:
+    def add_sensor(self, frame: str) -> None:
+        """Begin to calibrate the sensor of another frame."""
+        self.filter.add_sensor(frame)
+        if self.relinearisation is not None:
+            self.relinearisation.add_calibration()
+
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        noise: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks (m,) for new ones seen at ``points`` (m, 3), body frame."""
-        self.filter.relocate(rows, points, noise)
+        self.filter.relocate(rows, points, noise, D)
         if self.relinearisation is not None:
             self.relinearisation.relocate(rows)
 
@@ -166,6 +178,16 @@ class State:
             self.relinearisation.remove(rows)
         self.filter.remove(rows)
         self.landmarks.remove(rows)
+
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit; see the filter's merge."""
+        square = self.filter.merge(rows, copies, most)
+        if square <= most:
+            self.landmarks.merge(rows, copies)
+            if self.relinearisation is not None:
+                self.relinearisation.merge(rows, copies)
+            self.counts['merged_landmark'] += len(rows)
+        return square
 
     def forget(self, rows: IntArray, why: str) -> None:
         """Remove landmarks, if there are any at ``rows``; ``why`` is the count they go to."""

@@ -514,21 +514,21 @@ def test_with_wrong_parameters_the_node_says_why_and_does_not_start(tmp_path, pa
     assert 'Traceback' not in node.output
 
 
-def test_without_ids_the_pose_in_a_map_is_asked_for(ros, robot, tmp_path):
+def test_points_without_ids_that_fit_nowhere_in_a_map_are_reported(ros, robot, tmp_path):
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
     surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(5))
-    message = 'points have no ids: give the pose on initialpose'
+    message = 'fits no place in the map yet: drive on, or give the pose on initialpose'
 
     def is_reported():
         return diagnostics and message in diagnostics[-1].status[0].message
 
     def see_without_ids():
-        ids, points = np.full(3, UNKNOWN_ID), robot.points[2:5]
+        ids, points = np.full(3, UNKNOWN_ID), 1.5 * robot.points[2:5]  # not in the map
         robot.landmarks.publish(MESSAGES.point_cloud2(time.time_ns(), 'base_link', ids, points))
         ros.spin_for(0.1)
 
     with running('observer_node', tmp_path / 'log', map_file=surveyed, **PARAMETERS) as node:
-        node.wait_for_output('until three of them are recognised by their ids, or it is given on')
+        node.wait_for_output('until three of them are recognised by their ids, more without ids')
         robot.connect()
         robot.see(np.eye(4), [0, 1])
         diagnostics.clear()

@@ -131,6 +131,11 @@ def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap
 def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
     named = known.ids[~is_automatic(known.ids)]
     least = 'two' if result.estimator.settings.two_d_mode else 'three'
+    if is_automatic(result.estimator.landmark_ids).any():
+        return (
+            f'the pose in the map {path} was not found: '
+            f'{result.estimator.localisation_problem}{_advice(result)}'
+        )
     return (
         f'the pose in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '

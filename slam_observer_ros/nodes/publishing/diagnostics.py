@@ -158,7 +158,7 @@ class DiagnosticsPublisher:
         warnings.append(self._node.last_failure)
         if not self._estimator.is_localised:
             warnings.append('the pose in the loaded map is not known yet: no pose is published')
-            warnings.append(self._ids_warning())
+            warnings.append(self._places_warning())
         return [warning for warning in warnings if warning]
 
     def _unused_warning(self, source: InputTopic[Any]) -> str:
@@ -183,13 +183,12 @@ class DiagnosticsPublisher:
             )
         return f'no landmark in {observations} messages so far'
 
-    def _ids_warning(self) -> str:
-        """Report that the pose in a map can't be found: nothing that is seen has an id."""
+    def _places_warning(self) -> str:
+        """Report where in a map points without ids fit."""
         # Landmarks that came without an id have one that was given here.
-        ids = self._estimator.landmark_ids
-        if not len(ids) or not is_automatic(ids).all():
+        if not is_automatic(self._estimator.landmark_ids).any():
             return ''
-        return 'points have no ids: give the pose on initialpose'
+        return f'{self._estimator.localisation_problem} on initialpose'
 
     def _rejection_warnings(self, new: Counter[str]) -> list[str]:
         """Report that more points or orientations were rejected of late than are outliers."""

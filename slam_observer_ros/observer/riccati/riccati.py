@@ -5,8 +5,9 @@ of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i f
 
     H_i = [ 0  I  0 … −I … 0 ],
 
-and what no observation can determine, the choice of the world's frame, is exactly in its null
-space: the covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
+or with R̂ D_i at the calibration of the sensor that saw it (:mod:`.sensor_calibration`), and what
+no observation can determine, the choice of the world's frame, is exactly in its null space: the
+covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
 X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
 in large maps less: :mod:`.compressed_covariance`.
 """
@@ -19,7 +20,12 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, slam_group
-from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
+from slam_observer_ros.geometry.matrices import (
+    block_diagonal,
+    mahalanobis,
+    solve_symmetric,
+    with_blocks,
+)
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
@@ -36,8 +42,14 @@ from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
 
+SAME_M = 0.01
+"""Standard deviation of how far apart two landmarks may be that are one, metres: no two views of
+a thing have quite the same centre.
+"""
+
+
 class RiccatiFilter(Filter):
-    """Gains from the full covariance P, ``joint``, of pose, velocity calibration and landmarks."""
+    """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
 
     joint: JointCovariance
     has_joint_covariance: ClassVar[bool] = True
@@ -90,11 +102,21 @@ class RiccatiFilter(Filter):
         C = self.joint.output_matrix(residuals, chord=0.5)
         return self.joint.outputs(C, residuals.rows)
 
-    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+    def add_sensor(self, frame: str) -> None:
+        """Let the calibration of the sensor of another frame be part of the state, and of P."""
+        sensor = self.calibration.add_sensor(frame)
+        if len(sensor.variances):
+            self.joint = self.joint.dense()
+            self.joint.add_calibration(sensor.variances)
+            self._compress_if_large(0)
+
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
         self._compress_if_large(len(points))
         super().add(points, covariances)
-        self.joint.add_seen(self.observer.turned(covariances))
+        self.joint.add_seen(self.observer.turned(covariances), D)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks whose errors are independent of all else, or only of all others."""
@@ -108,11 +130,17 @@ class RiccatiFilter(Filter):
         super().add_known(known)
         self._compress_if_large(0)
 
-    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
         self.joint.activate(rows)
         super().relocate(rows, points, covariances)
-        self.joint.relocate(rows, self.observer.turned(covariances))
+        self.joint.relocate(rows, self.observer.turned(covariances), D)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""
@@ -169,6 +197,24 @@ class RiccatiFilter(Filter):
         self.remove(copies)
         self.observer.set_reference(self.observer.points)
         self._compress_if_large(0)
+
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit, and forget the copies.
+
+        Return the normalised square of how far they are apart, per axis; they fit up to ``most``.
+        """
+        self.joint = joint = self.joint.dense()
+        own, other = self.points[rows], self.points[copies]
+        H = joint.difference(rows, copies, own, other)
+        HP, r = H @ joint.P, (own - other)[:, : self.axes.point].ravel()
+        S = HP @ H.T + SAME_M**2 * np.eye(len(r))
+        square = float(r @ solve_symmetric(S, r)) / len(r)
+        if square <= most:
+            self._move(-joint.update(HP, S, r))
+            self.remove(copies)
+            self.observer.set_reference(self.observer.points)
+        self._compress_if_large(0)
+        return square
 
     def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
         """Merge those of landmarks ``rows`` (m,) with the map's, which are at ``copies``."""
