@@ -248,14 +248,10 @@ class Hypotheses:
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
-<<<<<<< HEAD
-            for taken in interpretations(
-                state, index, event, matched, new_ids, new_cost, worst - cost
-            ):
-=======
             seen = corrected(state, event)
-            for taken in interpretations(state, index, seen, matched, new_ids, worst - cost):
->>>>>>> main
+            for taken in interpretations(
+                state, index, seen, matched, new_ids, new_cost, worst - cost
+            ):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)

@@ -69,7 +69,8 @@ def interpretations(
     It is taken as it came, at no cost, where there is no joint covariance to judge it by.
     ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
     with the landmarks that its ids name. Points taken for landmarks not seen before get
-    ``new_ids`` (m,), which costs ``new_cost`` for one without an id. Interpretations that cost more than ``budget`` need not be returned.
+    ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
+    Interpretations that cost more than ``budget`` need not be returned.
     """
     if not state.filter.has_joint_covariance:
         return [Interpretation(event, 0.0)]

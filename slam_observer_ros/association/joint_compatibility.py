@@ -193,7 +193,7 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
 
 
 def pruning_cost(ids: IntArray) -> float:
-    """Return how much more than the cheapest an interpretation of points with ids (m,) may cost."""
+    """Return how much more than the cheapest an interpretation of points (m,) may cost."""
     return PRUNING_COST if np.count_nonzero(ids == UNKNOWN_ID) else PRUNING_COST_OF_IDS
 
 

@@ -41,7 +41,6 @@ from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
-
 SAME_M = 0.01
 """Standard deviation of how far apart two landmarks may be that are one, metres: no two views of
 a thing have quite the same centre.
