@@ -51,8 +51,8 @@ def main() -> None:
     threadpool_limits(1)
     logging.getLogger('slam_observer_ros').setLevel(logging.ERROR)
     sys.stdout.write(
-        '| run | landmarks | error with ids, m | without | + false | ANEES | + false '
-        '| CPU with ids, s | without | + false |\n' + '| --- ' * 10 + '|\n'
+        '| run | landmarks | error with ids, m | without | + false | ANEES with ids '
+        '| without | + false | CPU with ids, s | without | + false |\n' + '| --- ' * 11 + '|\n'
     )
     kinds: dict[str, list[list[float]]] = {}
     for kind, name, world, draws in runs(args.seeds, args.mrclam_s):
@@ -91,7 +91,7 @@ def measured(name: str, world: World, draws: range) -> list[float]:
     sys.stdout.write(
         f'| {name} | {", ".join(map(str, counts))} | {with_ids.rmse_m:.3f} | '
         f'{without.rmse_m / with_ids.rmse_m:.2f} × | {error_m / with_ids.rmse_m:.2f} × | '
-        f'{without.anees:.2f} | {anees:.2f} | {with_ids.cpu_s:.1f} | '
+        f'{with_ids.anees:.2f} | {without.anees:.2f} | {anees:.2f} | {with_ids.cpu_s:.1f} | '
         f'{without.cpu_s / with_ids.cpu_s:.1f} × | {cpu_s / with_ids.cpu_s:.1f} × |\n'
     )
     sys.stdout.flush()

@@ -250,7 +250,7 @@ class Hypotheses:
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
             for taken in interpretations(
-                state, index, seen, matched, new_ids, new_cost, worst - cost
+                state, index, seen, matched, new_ids, new_cost, worst - cost, len(self._all) == 1
             ):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + margin)

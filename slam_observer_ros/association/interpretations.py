@@ -63,6 +63,7 @@ def interpretations(
     new_ids: IntArray,
     new_cost: float,
     budget: float,
+    is_alone: bool = False,
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
@@ -70,7 +71,8 @@ def interpretations(
     ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
     with the landmarks that its ids name. Points taken for landmarks not seen before get
     ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
-    Interpretations that cost more than ``budget`` need not be returned.
+    Interpretations that cost more than ``budget`` need not be returned. Where there is no other
+    state, ``is_alone``, costs are compared with each other only.
     """
     if not state.filter.has_joint_covariance:
         return [Interpretation(event, 0.0)]
@@ -84,7 +86,7 @@ def interpretations(
     suspects = state.landmarks.ids[residuals.rows[is_suspect]]
     # Points that may be of several landmarks.
     if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
-        found = find_assignments(state, index, event, new_cost, budget)
+        found = find_assignments(state, index, event, new_cost, budget, is_alone)
         return _by_assignments(state, event, new_ids, suspects, found)
     # All ids are right, or those of one or all suspects are wrong, or the robot slipped.
     if is_contradicted:

@@ -17,6 +17,12 @@ Some are seen more seldom than others: from afar, or from one side only.
 TOO_SELDOM = 5
 """How many times more seldom than others a landmark may be seen that was confirmed once."""
 
+NEW_S, OLD_S = 60.0, 20.0
+"""A landmark is new for so long, and an old one was not seen for so long, seconds."""
+
+MIN_LOOP = 5
+"""New landmarks, and old ones, that can say by how they lie whether a loop has closed."""
+
 _COLUMNS = (
     'ids',
     'counts',
@@ -135,6 +141,18 @@ class LandmarkTable:
         if np.count_nonzero(was_never_seen):
             unseen_s[was_never_seen] = np.inf
         return unseen_s
+
+    def are_new(self, rows: IntArray, stamp_ns: int) -> BoolArray:
+        """Return which ``rows`` (m,) were first seen of late and are still about."""
+        is_new: BoolArray = to_s(stamp_ns - self.born_ns[rows]) < NEW_S
+        is_about: BoolArray = to_s(stamp_ns - self.last_seen_ns[rows]) < OLD_S
+        return is_new & is_about
+
+    def are_old(self, rows: IntArray, stamp_ns: int) -> BoolArray:
+        """Return which ``rows`` (m,) are not new, and were not seen of late."""
+        is_new: BoolArray = to_s(stamp_ns - self.born_ns[rows]) < NEW_S
+        is_about: BoolArray = to_s(stamp_ns - self.last_seen_ns[rows]) < OLD_S
+        return ~is_new & ~is_about
 
     def reject(self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray) -> None:
         """Count one more rejected observation of ``rows`` (m,).

@@ -650,7 +650,7 @@ def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_so
     state = state_of(landmarks, np.array([[2.0, 0.0, 0.0]]))
     ahead = 4.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]])
     others = ObservationEvent(10, np.full(2, UNKNOWN_ID), ahead)
-    landmarks.note_in_view = lambda rows, seen: None  # so that the share stays
+    landmarks.note_in_view = lambda rows, seen, has_moved: None  # so that the share stays
     costs = [visibility.note(state, others, some_have_ids=False)]
     for landmarks.missed[0] in range(misses):
         costs.append(visibility.note(state, others, some_have_ids=False))
