@@ -115,7 +115,8 @@ def run(world: World) -> Outcome:
             continue
         cpu_s += time.process_time() - start_s
         true_pose, is_covered = interpolate(world.truth, np.array([event.stamp_ns]))
-        if is_covered[0]:
+        update = estimator.last_update
+        if is_covered[0] and update is not None:
             count += 1
             error.add(
                 event.stamp_ns,
@@ -125,6 +126,7 @@ def run(world: World) -> Outcome:
                 true_pose[0],
                 world.landmarks_at(event.stamp_ns),
                 None if count % NEES_EVERY else estimator.configuration_covariance,
+                update.ids[~update.rejected],
             )
         start_s = time.process_time()
     return Outcome(

@@ -32,6 +32,7 @@ from slam_observer_ros.association.joint_compatibility import (
 )
 from slam_observer_ros.association.new_landmarks import NewLandmarks
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
@@ -40,6 +41,7 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
+from slam_observer_ros.sensor_models.delay_evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
@@ -73,7 +75,11 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._contradictions = Contradictions()
+<<<<<<< HEAD
         self._new_landmarks = NewLandmarks()
+=======
+        self._delay_evidence = DelayEvidence()
+>>>>>>> main
 
     @property
     def counts(self) -> Counter[str]:
@@ -125,7 +131,7 @@ class Hypotheses:
         As :meth:`.State.poses_until` of each hypothesis.
         """
         if not with_covariances:
-            passage = self.best.passage(velocities, start_ns, stamps_ns)
+            passage = self.best.passage(velocities, start_ns, stamps_ns, with_covariances)
             return self.best.observer.reference_pose @ passage.poses, None
         of_each = [one.state.poses_until(velocities, start_ns, stamps_ns) for one in self._all]
         return of_each[0][0], self._mixed(of_each)
@@ -150,7 +156,19 @@ class Hypotheses:
         """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns`` (27)."""
         for hypothesis in self._all:
             state = hypothesis.state
-            state.propagate(state.motion(velocities, start_ns, end_ns))
+            motion = state.motion(velocities, start_ns, end_ns)
+            state.propagate(motion)
+            if motion.at_ends is not None and state is self.best:
+                self._delay_evidence.add(velocities, motion, start_ns, end_ns)
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """Scale, bias and delay of the velocity in the most likely state."""
+        known, initial_s = self.best.filter, self.best.settings.velocity_delay_stddev
+        return [
+            self._delay_evidence.corrected(part, initial_s) if part.name == DELAY_NAME else part
+            for part in known.calibration.estimates(known.calibration_variances)
+        ]
 
     def clear_time(self) -> None:
         """Let all hypotheses go on from where they are at any other time."""

@@ -1,4 +1,4 @@
-"""``slam-observer map``: maps of other programs."""
+"""``slam-observer map``: maps of other programs, and what a map is worth without ids."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
+from slam_observer_ros.cli import map_check
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.outputs import add_force_option, check_outputs
 from slam_observer_ros.known_map.map_file import write_map
@@ -14,7 +15,7 @@ from slam_observer_ros.known_map.map_import import import_map, TAG_AXES
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command, and its description."""
-    parser.description = 'Make map files for map_file and --load-map.'
+    parser.description = 'Make map files for map_file and --load-map, and check them.'
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
     convert = actions.add_parser(
         'convert',
@@ -52,6 +53,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_force_option(convert)
     convert.set_defaults(run=_run)
+    map_check.add_options(
+        actions.add_parser(
+            'check',
+            help='where one look finds a robot by landmarks without ids',
+            description='Looks around from places all over a map, and says where the landmarks in '
+            'view, without ids, say where the robot is.',
+        )
+    )
 
 
 def _deviation(text: str) -> float:

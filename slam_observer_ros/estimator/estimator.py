@@ -454,8 +454,7 @@ class Estimator:
     @property
     def calibration(self) -> list[CalibrationEstimate]:
         """Scale, bias and delay of the velocity, those that the settings ask for."""
-        known = self._state.filter
-        return known.calibration.estimates(known.calibration_variances)
+        return self._hypotheses.calibration
 
     @property
     def lyapunov(self) -> float:

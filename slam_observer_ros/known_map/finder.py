@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
@@ -11,6 +12,7 @@ from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.constellation import find_places
 from slam_observer_ros.known_map.distances import MappedLandmarks
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.known_map.map_check import place_for_another, symmetries
 from slam_observer_ros.known_map.places import (
     Anywhere,
     Constellation,
@@ -21,6 +23,8 @@ from slam_observer_ros.known_map.places import (
     Weighing,
 )
 from slam_observer_ros.state.state import State
+
+logger = logging.getLogger(__name__)
 
 MIN_COUNT = 2
 """How often a landmark must have been seen: most false points are seen once."""
@@ -36,6 +40,23 @@ MAX_FITTING = 50
 
 NEWS = 1.3
 """How many times as often landmarks must have been seen before it is worth searching again."""
+
+
+def warn_of_symmetry(loaded: LandmarkMap) -> None:
+    """Log that a map looks the same when turned, and where one more landmark would change that."""
+    if not (same := symmetries(loaded)):
+        return
+    differ = int(np.count_nonzero(~same[0].is_same))
+    x, y, _ = place_for_another(loaded, same[0]).tolist()
+    logger.warning(
+        'This map is the same turned by %.0f°%s: without ids or a start pose the robot %s; one '
+        'more landmark, at (%.1f m, %.1f m), would do.',
+        same[0].turn_deg,
+        f' but for {differ} landmarks' if differ else '',
+        'is found only near these' if differ else "can't be found",
+        x,
+        y,
+    )
 
 
 class Finder:
@@ -57,6 +78,7 @@ class Finder:
         self._prior: PlacePrior = (
             Anywhere(self._known) if rough is None else Near(*rough, state.axes)
         )
+        warn_of_symmetry(loaded)
         self._searched: tuple[int, int] | None = None
         self.places: Places | None = None  # that fit, when it was searched last
 

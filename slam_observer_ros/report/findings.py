@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimates import MAX_REJECTED
+from slam_observer_ros.estimates import calibration_problems, MAX_REJECTED
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.report.noise_advice import noise_advice
@@ -143,4 +143,4 @@ def _consistency(run: ReportedRun) -> list[Finding]:
 
 
 def _calibration(run: ReportedRun) -> list[Finding]:
-    return [Finding(part.problem) for part in run.calibration if part.problem]
+    return [Finding(problem) for problem in calibration_problems(run.calibration)]

@@ -15,7 +15,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns
-from slam_observer_ros.estimates import CalibrationEstimate
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
@@ -25,11 +25,11 @@ from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 NAMES = (
     *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
     *(f'{part}_bias_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
-    'velocity_delay',
+    DELAY_NAME,
 )
 """Names of six scales, six biases and the delay τ."""
 
-DELAY = NAMES.index('velocity_delay')
+DELAY = NAMES.index(DELAY_NAME)
 
 NOMINAL = np.repeat([1.0, 0.0], [6, 7])
 """(13,) what they are where the velocity is right; scales as factors 1 + s."""

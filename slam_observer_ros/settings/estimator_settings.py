@@ -289,9 +289,9 @@ class Settings(Immutable):
         maximum=100.0,
     )
     velocity_delay_stddev: float = parameter(
-        0.0,
+        0.2,
         'Scheduled and Riccati gains: delay from the stamp of a velocity to its effect in '
-        'observations, to be estimated: its standard deviation',
+        'observations, to be estimated: its standard deviation; 0 for none',
         unit='s',
         minimum=0.0,
         maximum=MAX_DELAY_S,

@@ -91,11 +91,17 @@ class State:
         self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then."""
-        passage = self.passage(velocities, start_ns, stamps_ns)
+        passage = self.passage(velocities, start_ns, stamps_ns, with_covariances=True)
         covariance, A = self.filter.pose_covariance(passage), passage.poses
         return self.observer.reference_pose @ A, covariances.of_pose(self.observer, covariance, A)
 
-    def passage(self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray) -> Passage:
+    def passage(
+        self,
+        velocities: VelocityHistory,
+        start_ns: int,
+        stamps_ns: IntArray,
+        with_covariances: bool,
+    ) -> Passage:
         """Return how the robot moves from the state's stamp through ``stamps_ns`` (s,)."""
         return integrate_until(
             velocities,
@@ -105,6 +111,7 @@ class State:
             start_ns,
             stamps_ns,
             self._end_velocity,
+            with_covariances,
         )
 
     def motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:

@@ -453,6 +453,7 @@ def test_what_is_unknown_of_a_gap_begins_where_it_leaves_the_robot():
         unknown_angular_motion=np.sqrt(turn_variance),
         unknown_linear_motion=density,
         angular_bias_stddev=(0.0, 0.0, 0.0),
+        velocity_delay_stddev=0.0,
     )
     estimator = Estimator(settings)
     for event in (velocity(0.0, [0, 0, 0, 4, 0, 0]), observation(2.0, [])):  # a second is unknown

@@ -12,6 +12,7 @@ import numpy as np
 from slam_observer_ros.cli.replay.dropped import list_dropped, unused_messages
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import (
+    calibration_problems,
     MAX_REJECTED,
     MAX_REJECTED_ORIENTATIONS,
     point_share,
@@ -204,9 +205,8 @@ def _warn_of_rejections(result: Replay) -> None:
 
 def _warn_of_calibration(result: Replay) -> None:
     """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
-    for part in result.estimator.calibration:
-        if part.problem:
-            logger.warning('%s', part.problem)
+    for problem in calibration_problems(result.estimator.calibration):
+        logger.warning('%s', problem)
 
 
 def _warn_of_unmapped(result: Replay) -> None:
