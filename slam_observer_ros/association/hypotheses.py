@@ -75,11 +75,8 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._contradictions = Contradictions()
-<<<<<<< HEAD
         self._new_landmarks = NewLandmarks()
-=======
         self._delay_evidence = DelayEvidence()
->>>>>>> main
 
     @property
     def counts(self) -> Counter[str]:
