@@ -149,10 +149,10 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
 def _are_held_back(
     state: State, seen: _Points, residuals: Residuals, at: IntArray, distances: FloatArray
 ) -> BoolArray:
-    """Return which pairs (q,) of a point and an old landmark are not yet to be told.
+    """Return which pairs (q,) of a point and an old landmark are not yet decided.
 
     There are so many that the point may be of, and so many new ones about that by how these lie
-    it can be told later which of the old ones they are.
+    it can be decided later which of the old ones they are.
     """
     landmarks, rows, stamp_ns = state.landmarks, residuals.rows, seen.stamp_ns
     held_back = np.zeros(len(at), dtype=np.bool_)

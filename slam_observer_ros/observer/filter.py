@@ -207,7 +207,7 @@ class Filter:
     def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
         """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: see :mod:`.riccati`.
 
-        Gains that know no joint covariance can't tell, and return infinity.
+        Gains that know no joint covariance merge nothing, and return infinity.
         """
         return math.inf
 

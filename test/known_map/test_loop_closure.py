@@ -38,7 +38,7 @@ def grid():
 
 
 def after_a_loop(points, seen, seed=0):
-    """A state with old landmarks, of which it has mapped ``seen`` anew after drifting."""
+    """A state with old landmarks, of which it has mapped ``seen`` again after drifting."""
     rng = np.random.default_rng(seed)
     state = State(make_filter(PLANAR, np.eye(4)), PLANAR)
     old = np.arange(len(points))
@@ -94,7 +94,7 @@ def test_it_takes_five_to_close_a_loop(seen):
 
 
 @pytest.mark.parametrize('new', [4, 6])
-def test_points_are_held_back_from_many_old_landmarks_while_new_ones_can_tell_later(new):
+def test_points_are_held_back_from_many_old_landmarks_while_new_ones_can_decide_later(new):
     points = points_in_a_hall(2)
     state, true_pose = after_a_loop(points, np.arange(new))
     body = se3.transform(se3.inverse(true_pose), points[10:14])
