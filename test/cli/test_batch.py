@@ -153,7 +153,9 @@ def test_the_same_recording_under_two_names_is_run_once(slam_observer, recording
         (['--grid', 'gains=constant', '--smooth'], '--smooth needs riccati gains'),
         (['--shard', '3/2'], 'i from 1 to N'),
         (['nothing/*.mcap'], "no file is named 'nothing/*.mcap'"),
-        (['--workers', '0'], 'at least one'),
+        (['--grid', 'range_noise=0.1,0.10'], '--grid range_noise: 0.1 is given twice'),
+        (['--workers', '0'], 'a number of processes from 1 is needed'),
+        (['--workers', 'many'], 'a number of processes from 1 is needed'),
     ],
 )
 def test_what_can_not_be_run_is_refused_before_anything_is(

@@ -40,6 +40,9 @@ def check_files(args: argparse.Namespace) -> None:
         '--mcap': args.mcap,
         '--rerun': args.rerun or None,
     }
+    if args.plot is not None:
+        figures = figure_files(args, FIGURES)
+        kept |= {f'{name} of --plot,': args.plot / name for name in figures}
     check_inputs_are_kept(kept, read | loaded)
     check_inputs_are_kept({'--map': args.map}, read)
     check_outputs([args.tum, args.map, args.report, args.mcap, args.rerun or None], args.force)
