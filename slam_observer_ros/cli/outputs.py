@@ -82,17 +82,24 @@ def figure_files(args: argparse.Namespace, figures: Iterable[str]) -> list[str]:
     return [f'{name}.{args.plot_format}' for name in figures]
 
 
-def check_plots(args: argparse.Namespace, figures: Iterable[str]) -> None:
+def check_plots(
+    args: argparse.Namespace, figures: Iterable[str], others: Iterable[Path | None]
+) -> None:
     """Raise a UsageError if the figures can't be written to the directory of ``--plot``.
 
-    It need not exist, but its parent must.
+    It need not exist, but its parent must; ``others`` are the other outputs.
     """
     directory: Path | None = args.plot
     if directory is None:
         return
     check_directory(directory)
+    files = [directory / name for name in figure_files(args, figures)]
+    written = {os.path.realpath(file) for file in (directory, *files)}
+    for other in others:
+        if other is not None and os.path.realpath(other) in written:
+            raise UsageError(f'{other} is named for two outputs')
     if directory.is_dir():
-        check_outputs((directory / name for name in figure_files(args, figures)), args.force)
+        check_outputs(files, args.force)
 
 
 def check_directory(directory: Path) -> None:

@@ -549,8 +549,11 @@ class Estimator:
         closure.note(state, stamp_ns)
         if not closure.is_due(state, stamp_ns):
             return
+        merged = state.counts['merged_landmark']
         if closure.close(state, stamp_ns):
             self._hypotheses.prune_to_best()
+            merged = state.counts['merged_landmark'] - merged
+            logger.info('A loop has closed: %d landmarks without ids were seen before.', merged)
         if len(self._hypotheses) == 1:
             closure.merge_twins(state)
 

@@ -394,7 +394,8 @@ class Settings(Immutable):
     max_hypotheses: int = parameter(
         8,
         'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
-        'have slipped: most hypotheses that are followed until it is clear which one is right',
+        'have slipped: most hypotheses that are followed until it is clear which one is right; '
+        'where points have no id, no more than two',
         minimum=1,
         maximum=1000,
     )

@@ -8,6 +8,7 @@ import math
 import os
 from pathlib import Path
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -54,6 +55,23 @@ def fixture_recordings(tmp_path):
     folder = tmp_path / 'recordings' / 'monday'
     folder.mkdir(parents=True)
     return [write_mcap(folder / 'one.mcap'), write_rosbag1(folder / 'two.bag')]
+
+
+def test_a_line_that_does_not_fit_on_the_disk_is_an_error_that_names_the_file(tmp_path):
+    path = tmp_path / 'runs.jsonl'
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40, limits[1]))
+    try:
+        with (
+            pytest.raises(OutputError, match=r"can't write .*runs\.jsonl: File too large"),
+            opened_log(path) as log,
+        ):
+            log.append(RUN)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with opened_log(path) as log:
+        log.append(RUN)
+    assert list(read_logs(tmp_path)) == ['a']
 
 
 def lines_of(directory: Path):

@@ -151,6 +151,21 @@ def test_no_output_replaces_what_is_read_even_by_force(slam_observer, recording,
     assert recording.read_bytes() == SAMPLE.read_bytes()
 
 
+@pytest.mark.parametrize(
+    'words',
+    [
+        ('simulate', '--output', 'a.mcap', '--plot', 'a.mcap'),
+        ('replay', 'run.mcap', '--tum', 'a', '--plot', './a'),
+        ('replay', 'run.mcap', '--report', 'figures/map.png', '--plot', 'figures'),
+    ],
+    ids=' '.join,
+)
+def test_a_folder_of_figures_is_no_other_output(slam_observer, recording, words):
+    Path('figures').mkdir()
+    assert 'is named for two outputs' in slam_observer.fail(*words, '--force')
+    assert not Path('a.mcap').exists()
+
+
 def test_what_is_held_out_is_read_before_the_search(slam_observer, recording, monkeypatch):
     monkeypatch.setattr('slam_observer_ros.cli.tune.command.most_likely', None)
     words = ('tune', recording, '--hold-out')
