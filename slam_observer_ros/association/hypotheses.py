@@ -25,7 +25,12 @@ from slam_observer_ros.association.interpretations import (
     is_ambiguous,
     may_relabel,
 )
-from slam_observer_ros.association.joint_compatibility import PRUNING_COST, RESOLUTION
+from slam_observer_ros.association.joint_compatibility import (
+    pruning_cost,
+    RESOLUTION,
+    unpaired_cost,
+)
+from slam_observer_ros.association.new_landmarks import NewLandmarks
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.events import (
@@ -41,6 +46,11 @@ from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, Outcome, step
+
+MOST_WITHOUT_IDS = 2
+"""Hypotheses that are followed at most where points have no ids: each costs as much as the first,
+and a third one is hardly ever the right one.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +80,7 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._contradictions = Contradictions()
+        self._new_landmarks = NewLandmarks()
         self._delay_evidence = DelayEvidence()
 
     @property
@@ -194,6 +205,8 @@ class Hypotheses:
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
+        if unknown:
+            self._new_landmarks.note(event, self._all[0].visibility.confirmed_now)
         return children[0].outcome
 
     def _observe_alone(self, event: ObservationEvent, matched: MatchedObservation) -> Outcome:
@@ -206,6 +219,9 @@ class Hypotheses:
         self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
     ) -> list[_Child]:
         """Let hypotheses use an observation as interpreted; return them, the cheapest first."""
+        limit = self._limit
+        if np.count_nonzero(event.ids == UNKNOWN_ID):
+            limit = min(limit, MOST_WITHOUT_IDS)
         # A state is copied for each use of it but the last.
         uses = Counter(number for number, taken in possible if taken.slipped is None)
         children: list[_Child] = []
@@ -221,7 +237,7 @@ class Hypotheses:
             child = self._child(hypothesis, taken, event)
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
-            if len(children) == self._limit:
+            if len(children) == limit:
                 break
         return sorted(children, key=lambda child: child.hypothesis.cost)
 
@@ -248,15 +264,19 @@ class Hypotheses:
         The cost is that of the hypothesis as well. A point has the same id in all of them that
         take it for a new landmark.
         """
-        new_ids = self._new_ids(len(event.ids))
+        new_ids, margin = self._new_ids(len(event.ids)), pruning_cost(event.ids)
+        gate_cost = unpaired_cost(self.best.settings.rejection_threshold)
+        new_cost = self._new_landmarks.cost(gate_cost)
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
-            for taken in interpretations(state, index, seen, matched, new_ids, worst - cost):
+            for taken in interpretations(
+                state, index, seen, matched, new_ids, new_cost, worst - cost, len(self._all) == 1
+            ):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
-                worst = min(worst, cost + taken.cost + PRUNING_COST)
+                worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
         return [(number, taken) for number, taken in possible if taken.cost <= worst]
 

@@ -7,7 +7,6 @@ from importlib import metadata
 from importlib.util import find_spec
 import json
 import os
-from pathlib import Path
 import platform
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from typing import Any
 
 from slam_observer_ros.cli.console import print_json, print_table
 from slam_observer_ros.cli.fitting_file import fitting_file
+from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.version import VERSION
 
@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'why.'
     )
     parser.add_argument(
-        'recording', nargs='?', type=Path, metavar='RECORDING', help='as replay takes it'
+        'recording', nargs='?', type=named_path, metavar='RECORDING', help='as replay takes it'
     )
     parser.add_argument(
         '--seconds', type=float, default=3.0, metavar='S', help='how long to listen (default 3)'

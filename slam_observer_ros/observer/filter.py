@@ -8,6 +8,7 @@ covariances (m, 3, 3), m².
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -212,6 +213,13 @@ class Filter:
     def joint_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks."""
         return None
+
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: see :mod:`.riccati`.
+
+        Gains that know no joint covariance merge nothing, and return infinity.
+        """
+        return math.inf
 
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m²."""

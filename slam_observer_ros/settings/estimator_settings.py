@@ -305,7 +305,8 @@ class Settings(Immutable):
     sensor_rotation_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Riccati gains: how far a sensor of landmarks may be turned against what /tf says, about '
-        'the body axes x y z, to be estimated for each sensor frame: its standard deviation',
+        'the body axes x y z, to be estimated for each sensor frame: its standard deviation; '
+        'brackets are turned by some 0.035 (2°)',
         unit='rad',
         minimum=0.0,
         maximum=1.0,
@@ -399,7 +400,8 @@ class Settings(Immutable):
     max_hypotheses: int = parameter(
         8,
         'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
-        'have slipped: most hypotheses that are followed until it is clear which one is right',
+        'have slipped: most hypotheses that are followed until it is clear which one is right; '
+        'where points have no id, no more than two',
         minimum=1,
         maximum=1000,
     )

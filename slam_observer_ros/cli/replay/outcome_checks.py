@@ -204,11 +204,12 @@ def _warn_of_rejections(result: Replay) -> None:
 
 
 def _warn_of_calibration(result: Replay) -> None:
-    """Say what may be wrong if a scale, bias, delay or noise is one that nobody can mean."""
-    estimator = result.estimator
-    noisier = [part.problem for part in estimator.motion_factors if part.problem]
-    for problem in calibration_problems(estimator.calibration) + noisier:
-        logger.warning('%s', problem)
+    """Say what may be wrong if nobody can mean an estimate, and how sensors are really mounted."""
+    calibration = result.estimator.calibration
+    advice = [part.advice for part in calibration if part.advice]
+    noisier = [part.problem for part in result.estimator.motion_factors if part.problem]
+    for text in [*calibration_problems(calibration), *advice, *noisier]:
+        logger.warning('%s', text)
 
 
 def _warn_of_unmapped(result: Replay) -> None:
