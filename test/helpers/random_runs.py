@@ -16,6 +16,7 @@ PLAIN = Settings(
     rejection_threshold=1e9,
     relinearization_interval=0,
     angular_bias_stddev=(0.0, 0.0, 0.0),
+    velocity_delay_stddev=0.0,
 )
 """No robustness, no relinearising, no calibration: a plain filter."""
 
