@@ -72,7 +72,7 @@ class Robot:
         return (self.world.events[-1].stamp_ns - self.world.events[0].stamp_ns) * 1e-9
 
     def pose(self, stamp_ns: int) -> FloatArray | None:
-        """Return its true pose (4, 4); None where it is not known."""
+        """Return where it truly is (4, 4); None where that is not known."""
         poses, are_known = interpolate(self.world.truth, np.array([stamp_ns]))
         return poses[0] if are_known[0] else None
 

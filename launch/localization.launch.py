@@ -25,6 +25,10 @@ from slam_observer_ros.nodes.localization_setup import (
 
 RESPAWN_DELAY_S = 2.0
 
+LOCALIZATION = PathJoinSubstitution(
+    [FindPackageShare('slam_observer_ros'), 'config', 'localization.yaml']
+)
+
 HAS_BOND = find_spec('bondpy') is not None
 """Whether the lifecycle manager can notice that the observer has died."""
 
@@ -49,17 +53,13 @@ def observer(given, common):
         name='observer_node',
         # A robot in a known map would, by default, add to it whatever it sees beside.
         parameters=[
-            *([config('localization.yaml')] if given['map_file'] else []),
+            *([LOCALIZATION] if given['map_file'] else []),
             given['params_file'],
             parameters(given, HAS_BOND),
         ],
         remappings=remappings(given),
         **common,
     )
-
-
-def config(name):
-    return PathJoinSubstitution([FindPackageShare('slam_observer_ros'), 'config', name])
 
 
 def map_server(given, common):
@@ -91,7 +91,9 @@ def map_server(given, common):
 
 
 def generate_launch_description():
-    default_parameters = config('wheeled_robot.yaml')
+    default_parameters = PathJoinSubstitution(
+        [FindPackageShare('slam_observer_ros'), 'config', 'wheeled_robot.yaml']
+    )
     return LaunchDescription(
         [
             DeclareLaunchArgument(

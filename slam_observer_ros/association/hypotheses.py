@@ -220,7 +220,7 @@ class Hypotheses:
     ) -> list[_Child]:
         """Let hypotheses use an observation as interpreted; return them, the cheapest first."""
         limit = self._limit
-        if np.count_nonzero(event.ids == UNKNOWN_ID):
+        if (event.ids == UNKNOWN_ID).all():
             limit = min(limit, MOST_WITHOUT_IDS)
         # A state is copied for each use of it but the last.
         uses = Counter(number for number, taken in possible if taken.slipped is None)

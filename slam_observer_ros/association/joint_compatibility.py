@@ -193,8 +193,11 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
 
 
 def pruning_cost(ids: IntArray) -> float:
-    """Return how much more than the cheapest an interpretation of points (m,) may cost."""
-    return PRUNING_COST if np.count_nonzero(ids == UNKNOWN_ID) else PRUNING_COST_OF_IDS
+    """Return how much more than the cheapest an interpretation of points (m,) may cost.
+
+    More where some have an id, which may be wrong: what speaks against it comes later.
+    """
+    return PRUNING_COST if (ids == UNKNOWN_ID).all() else PRUNING_COST_OF_IDS
 
 
 def unpaired_cost(gate: float) -> float:

@@ -89,10 +89,8 @@ class BaseFrame:
         """
         frame_id = self._sensor_frame or frame_id
         plain = frame_id.lstrip('/')
-        if plain != self.name or self._sensor_pose is not None:
-            axis = _ALONG_Z if OPTICAL in plain else _ALONG_X
-            frame = '' if plain == self.name else plain
-            event = replace(event, sensor_frame=frame, sensor_axis=axis)
+        axis = _ALONG_Z if OPTICAL in plain else _ALONG_X
+        event = replace(event, sensor_frame='' if plain == self.name else plain, sensor_axis=axis)
         if self._sensor_pose is not None:
             return event.moved(self._sensor_pose)
         self._refuse_map_frame(frame_id)

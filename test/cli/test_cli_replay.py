@@ -879,14 +879,13 @@ class TestRealData:
         assert '1900' in output
         expected_m = {
             'constant': (0.081, 0.053),
-            'scheduled': (0.040, 0.034),
-            'riccati': (0.038, 0.033),
+            'scheduled': (0.048, 0.035),
+            'riccati': (0.041, 0.034),
         }
         report = self.check(slam_observer, path, 'stereo_inertial', expected_m)
         assert report['dead_reckoning_ate_rmse_m'] == pytest.approx(0.83, abs=0.01)
         assert report['landmarks'] == 20
-        # Over all poses, also those of 78 s without a landmark, where odometry alone leads.
-        assert report['smoothed_ate_rmse_m'] < 0.85 * report['ate_rmse_m']
+        assert report['smoothed_ate_rmse_m'] < 0.6 * report['ate_rmse_m']
 
     def test_mrclam(self, slam_observer, data_dir, tmp_path):
         path = tmp_path / 'robot4.mcap'

@@ -90,9 +90,9 @@ def _read(file: Path) -> dict[str, FloatArray]:
             variables: dict[str, FloatArray] = scipy.io.loadmat(stream)
     except FileNotFoundError as error:
         raise DataSetError(f'{file}: no such file; give dataset3.mat of Starry Night') from error
-    except OSError as error:
-        raise DataSetError(message_of(error)) from error
     except Exception as error:  # SciPy's reader raises nearly anything where bytes are damaged
+        if isinstance(error, OSError) and error.errno:
+            raise DataSetError(message_of(error)) from error
         raise DataSetError(f'{file}: not a MATLAB file, or damaged: {error}') from error
     missing = [name for name in _SHAPES if name not in variables]
     if missing:
