@@ -147,7 +147,9 @@ def test_an_observation_acts_on_all_landmarks_as_in_a_kalman_filter(rng, n):
 @pytest.mark.parametrize('two_d_mode', [False, True])
 def test_few_landmarks_are_estimated_as_with_riccati_gains(two_d_mode):
     """A map that fits into the core has its full covariance."""
-    settings = Settings(two_d_mode=two_d_mode, relinearization_interval=0)
+    settings = Settings(
+        two_d_mode=two_d_mode, relinearization_interval=0, motion_noise_factor='stated'
+    )
     world = drive(settings, 20.0, landmarks=CAPACITY, seen=4)
     riccati, scheduled = (
         estimate(world, replace(settings, gains=gains)) for gains in ('riccati', 'scheduled')

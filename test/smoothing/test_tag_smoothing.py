@@ -35,6 +35,7 @@ SETTINGS = Settings(
     rejection_threshold=100.0,
     angular_bias_stddev=(0.0, 0.0, 0.0),
     velocity_delay_stddev=0.0,
+    motion_noise_factor='stated',  # the batch has it so
     max_hypotheses=1,
     confirmations=1,
     reorder_window=0.0,
