@@ -195,7 +195,7 @@ class _Sides:
         return float(np.max(self.lengths_m + GATE * self._deviations_m))
 
     def bases(self, matches: int) -> IntArray:
-        """Return those (b, k) that find places with so many matches, but not with more."""
+        """Return points (b, k) of the bases for places with so many matches, but not with more."""
         m, k = len(self._order), self._k
         pool = self._order[: m - matches + k].tolist()
         if matches == m:
