@@ -295,9 +295,9 @@ class Estimator:
         (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
         had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
         landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``, ``'merged_landmark'``) and points not
-        used (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
-        ``'unweighed_point'``).
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``, ``'merged_landmark'``,
+        ``'doubled_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
+        ``'reserved_id'``, ``'impossible_id'``, ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
@@ -571,6 +571,7 @@ class Estimator:
             logger.info('A loop has closed: %d landmarks without ids were seen before.', merged)
         if len(self._hypotheses) == 1:
             closure.merge_twins(state)
+            closure.count_doubled(state)
 
     def _doubt_rough_pose(self, event: ObservationEvent) -> None:
         """Search about a given pose that is too rough for the points of an observation."""

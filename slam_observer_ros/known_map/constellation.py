@@ -95,9 +95,8 @@ class _Search:
 
     def _could_matter(self, matches: int) -> bool:
         """Return whether a place with so many matches could be as likely as the best one."""
-        best = max(
-            self.log_rival, *(place.log_mass for place in self.found), self.weighing.log_none
-        )
+        masses = [place.log_mass for place in self.found]
+        best = max(self.log_rival, self.weighing.log_none, *masses)
         return self.weighing.at_best(matches) > best + self.margin
 
     def _is_undecided(self) -> bool:

@@ -46,9 +46,7 @@ class Localiser:
 
     def __init__(self) -> None:
         self.maps: list[LandmarkMap] = []  # in one of which the robot is
-        self.loaded: LandmarkMap | None = (
-            None  # that one; None if it is not known, or there is none
-        )
+        self.loaded: LandmarkMap | None = None  # that one, once it is known
         self.is_localised = True  # in the final frame: always, unless a map was loaded
         self.counts: Counter[str] = Counter()  # 'not_localised' observations, poses 'lost'
         self._trial: PoseTrial | None = None

@@ -18,7 +18,7 @@ from slam_observer_ros.runs.replay import Replay
 NEARLY_ALL = 0.99
 """Share of the trajectory that the truth covers, up to which it is printed."""
 
-LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported')
+LANDMARK_CHANGES = ('moved', 'forgotten', 'unsupported', 'doubled')
 """What may happen to landmarks of the map; counted under these names."""
 
 
