@@ -8,6 +8,7 @@ sensor's part, which begins with the first observation from its frame, is in
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 import math
 
@@ -76,6 +77,13 @@ class Calibration:
         self.count = self.of_velocity = len(self._estimated)  # c, and how many are no sensor's
         self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
         self._set_variances(errors[self._estimated] ** 2)
+
+    def copy(self) -> Calibration:
+        """Return an independent copy."""
+        other = copy(self)
+        other._all = self._all.copy()
+        other.sensors = {frame: copy(sensor) for frame, sensor in self.sensors.items()}
+        return other
 
     def _set_variances(self, variances: FloatArray) -> None:
         self.initial_variances = variances

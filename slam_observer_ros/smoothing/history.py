@@ -110,7 +110,7 @@ class History:
         self._latest = self._none
         self._new: list[_Step] = []
 
-    def __deepcopy__(self, memo: dict[int, object]) -> History:
+    def copy(self) -> History:
         """Return an independent history: no array is ever changed in place."""
         other = copy(self)
         for name, value in vars(self).items():
