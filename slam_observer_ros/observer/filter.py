@@ -17,7 +17,6 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
-from slam_observer_ros.observer.arrays import FilterArrays
 from slam_observer_ros.observer.configuration import turned_moment
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
@@ -59,7 +58,7 @@ class Filter:
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
-        self.observer = Observer(FilterArrays(reference_pose))  # X̂ and its reference ξ°
+        self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
         estimated = settings if self.has_joint_covariance else without_sensor_calibration(settings)
         self.calibration = Calibration(estimated, self.axes)  # of velocities and sensors
         self.motion_noise = MotionNoise(settings)
@@ -67,7 +66,7 @@ class Filter:
     def copy(self) -> Self:
         """Return an independent copy."""
         other = copy(self)
-        other.observer = Observer(self.observer.arrays.copy())
+        other.observer = self.observer.copy()
         other.calibration = self.calibration.copy()
         other.motion_noise = self.motion_noise.copy()
         return other

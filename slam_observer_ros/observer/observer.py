@@ -14,48 +14,11 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.observer.arrays import FilterArrays
 
 
-class Observer:
-    """State X̂ on SLAM_n(3) with its reference ξ°, in ``arrays``.
+class Observer(FilterArrays):
+    """State X̂ on SLAM_n(3) with its reference ξ°: what the paper does to these arrays.
 
-    What it returns are copies, but for the arrays themselves, which change with the state.
+    What methods return are copies.
     """
-
-    def __init__(self, arrays: FilterArrays) -> None:
-        self.arrays = arrays
-
-    def __len__(self) -> int:
-        """Return the number of landmarks n."""
-        return len(self.arrays)
-
-    @property
-    def reference_pose(self) -> FloatArray:
-        """(4, 4) P°, body to world."""
-        return self.arrays.reference_pose
-
-    @property
-    def A(self) -> FloatArray:  # noqa: N802 (the paper's name for it)
-        """(4, 4) Â."""
-        return self.arrays.A
-
-    @property
-    def a(self) -> FloatArray:
-        """(n, 3) â_i."""
-        return self.arrays.a
-
-    @property
-    def y_ref(self) -> FloatArray:
-        """(n, 3) y_i°."""
-        return self.arrays.y_ref
-
-    @property
-    def u(self) -> FloatArray:
-        """(n, 3) velocities R_Â v_i, m/s; zero at rest."""
-        return self.arrays.u
-
-    @property
-    def have_moved(self) -> bool:
-        """Whether any landmark has had a velocity so far."""
-        return self.arrays.have_moved
 
     @property
     def pose(self) -> FloatArray:
@@ -92,14 +55,14 @@ class Observer:
 
     def propagate(self, path: FloatArray) -> None:
         """Advance Â to the end of a ``path`` (k + 1, 4, 4), along which it is Â exp(V dt) (27)."""
-        A = self.arrays.A
+        A = self.A
         A[...] = path[-1]
         A[:3, :3] = so3.normalise(A[:3, :3])
 
     def move_landmarks(self, duration_s: float) -> None:
         """Add R_Â v_i dt to â_i, where (27) has zero: here landmarks may have velocities (19)."""
         if self.have_moved:  # else this would cost O(n) at every step
-            self.arrays.a += self.u * duration_s
+            self.a += self.u * duration_s
 
     def correct(self, D: FloatArray, rows: IntArray | slice, d: FloatArray) -> None:
         """Move the state from the left: X̂ ← (D, d_i) · X̂, d_i (m, 3) for landmarks ``rows``.
@@ -112,7 +75,7 @@ class Observer:
     def correct_velocities(self, D: FloatArray, change: FloatArray) -> None:
         """Turn the landmarks' velocities by D (4, 4), and add ``change`` (n, 3), m/s."""
         self.u[...] = se3.rotate(D, self.u) + change
-        self.arrays.have_moved = True
+        self.have_moved = True
 
     def add_landmarks(self, points: FloatArray) -> None:
         """Append landmarks where they are seen: y_i° = Â y_i for ``points`` y_i (m, 3)."""
@@ -120,7 +83,7 @@ class Observer:
 
     def add_reference_landmarks(self, y_ref: FloatArray) -> None:
         """Append landmarks with given y_i° (m, 3), metres, and â_i = 0."""
-        rows = self.arrays.append_zeros(len(y_ref))
+        rows = self.append_zeros(len(y_ref))
         self.y_ref[rows] = y_ref
 
     def relocate_landmarks(self, rows: IntArray, points: FloatArray) -> None:
@@ -130,9 +93,9 @@ class Observer:
 
     def fix_landmarks(self, y_ref: FloatArray) -> None:
         """Put all landmarks at ``y_ref`` (n, 3), with â_i = 0, at rest."""
-        self.arrays.delete(np.arange(len(self)))
+        self.delete(np.arange(len(self)))
         self.add_reference_landmarks(y_ref)
-        self.arrays.have_moved = False
+        self.have_moved = False
 
     def set_reference(self, y_ref: FloatArray) -> None:
         """Put the landmarks at ``y_ref`` (n, 3), reference frame, with â_i = 0."""
@@ -141,12 +104,12 @@ class Observer:
 
     def remove_landmarks(self, rows: IntArray) -> None:
         """Delete the landmarks at ``rows``; those behind move up."""
-        self.arrays.delete(rows)
+        self.delete(rows)
 
     def set_landmark_velocities(self, rows: IntArray, velocities: FloatArray) -> None:
         """Let landmarks move at ``velocities`` v_i (m, 3), m/s, body frame now, or rest (19)."""
         self.u[rows] = se3.rotate(self.A, velocities)
-        self.arrays.have_moved = self.have_moved or bool(velocities.any())
+        self.have_moved = self.have_moved or bool(velocities.any())
 
     def set_pose(self, A: FloatArray) -> None:
         """Put the robot at Â = ``A`` (4, 4)."""

@@ -68,7 +68,7 @@ class JointCovariance:
     def copy(self, observer: Observer) -> Self:
         """Return an independent copy for a copy of the observer, which has one of P."""
         other = copy(self)
-        other._matrix = observer.arrays.covariance
+        other._matrix = observer.covariance
         return other
 
     @property

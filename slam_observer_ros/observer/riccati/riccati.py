@@ -66,7 +66,7 @@ class RiccatiFilter(Filter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        error, matrix = settings.landmark_velocity_stddev, self.observer.arrays.covariance
+        error, matrix = settings.landmark_velocity_stddev, self.observer.covariance
         self.joint = (
             MovingLandmarksCovariance(self.axes, self.calibration, matrix, error)
             if error > 0.0

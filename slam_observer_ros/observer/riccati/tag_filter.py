@@ -39,7 +39,7 @@ class RiccatiTagFilter(RiccatiFilter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        self.joint = TagCovariance(self.axes, self.calibration, self.observer.arrays.covariance)
+        self.joint = TagCovariance(self.axes, self.calibration, self.observer.covariance)
         self.orientations = LandmarkOrientations()
         self._is_exact = False  # the map
 
