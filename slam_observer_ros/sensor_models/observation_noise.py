@@ -121,7 +121,7 @@ def repetition_factors(dt_s: FloatArray, error_time_s: float) -> FloatArray:
 
 
 def _invertible(covariances: FloatArray) -> FloatArray:
-    """Return covariances (m, 3, 3) of which no direction is known exactly."""
+    """Return covariances (m, 3, 3) with no direction known exactly."""
     least = RESOLUTION_M**2 + MIN_SHARE * covariances.trace(axis1=1, axis2=2)
     invertible: FloatArray = covariances + least[:, None, None] * _IDENTITY
     return invertible

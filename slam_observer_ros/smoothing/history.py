@@ -103,7 +103,7 @@ class History:
         self._end = prior.pose
         self._slip: Motion | None = None
         self._motion_noise, self._sensitivity, self._drift = self._at_rest()
-        # Keyframes as arrays: those that are summarised, in pieces, and those that are not.
+        # Keyframes as arrays: the summarised ones, in pieces, and the others.
         q = 0 if prior.orientations is None else axes.turn
         self._none = no_keyframes(axes.p, len(prior.calibration), axes.point, q)
         self._summarised: list[Keyframes] = []
