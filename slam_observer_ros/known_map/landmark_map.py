@@ -29,7 +29,7 @@ class LandmarkMap:
     # (3 (n + t), …) of all positions together, m², whose blocks on the diagonal are the
     # covariances, and then of the rotation vectors, map axes, of the t that have an orientation
     joint_covariance: FloatArray | None = None
-    name: str = ''  # to tell several maps apart: that of its file
+    name: str = ''  # its file's, by which several maps are named
 
     def select(self, rows: IntArray | BoolArray) -> LandmarkMap:
         """Return the map of the landmarks at ``rows``."""
