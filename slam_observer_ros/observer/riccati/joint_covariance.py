@@ -171,6 +171,12 @@ class JointCovariance:
         PC = self.P[:q, :q].dot(C.T) - to_state.T
         return PC[: self._p], C.dot(PC) - to_state.dot(C.T) + seen.take(columns, axis=1)
 
+    def change_of_residuals(self, residuals: Residuals, x: FloatArray) -> FloatArray:
+        """Return H x (m, k), by which residuals change when the state is moved by exp(x)."""
+        C, columns = self.output_matrix(residuals), self._columns(residuals.rows)
+        change: FloatArray = C @ x[: C.shape[2]] - x[columns].reshape(len(C), -1)
+        return change
+
     def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
         """Return −K r of residuals r (m, k) of noise R (m, k, k), K = P Hᵀ S⁻¹, and update P."""
         HP, HPH = self.project(C, rows)
@@ -327,6 +333,12 @@ class ExactMapCovariance(JointCovariance):
         """Return C_i of r_i = C_i (ε, c̃): [−[ŷ_i]×, I] of ε."""
         C = self._axes.output_matrix(residuals.landmarks + chord * residuals.r)
         return self._with_sensor(C, residuals.D)
+
+    def change_of_residuals(self, residuals: Residuals, x: FloatArray) -> FloatArray:
+        """Return H x (m, k)."""
+        C = self.output_matrix(residuals)
+        change: FloatArray = C @ x[: C.shape[2]]
+        return change
 
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return H P and H P Hᵀ of H x = C_i (ε, c̃)."""
