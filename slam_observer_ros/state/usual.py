@@ -12,7 +12,7 @@ from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.sensor_mounting import Sensed
-from slam_observer_ros.observer import step
+from slam_observer_ros.observer import core, step
 from slam_observer_ros.observer.flat_arrays import (
     Advanced,
     Estimate,
@@ -23,6 +23,7 @@ from slam_observer_ros.observer.flat_arrays import (
     Seen,
 )
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
+from slam_observer_ros.observer.riccati.riccati import AT_ONCE
 from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
@@ -50,7 +51,7 @@ def advance(
         np.empty(6),
         np.empty(6),
     )
-    status = step.advance(x, velocities.flat(), interval, filter_.motion_noise.figures, out)
+    status = core.advance(x, velocities.flat(), interval, filter_.motion_noise.figures, out)
     if status == step.UNUSUAL:
         return None
     if state.relinearisation is not None and state.relinearisation.is_active:
@@ -69,8 +70,10 @@ def advance(
 
 def observe(state: State, event: ObservationEvent) -> Outcome | None:
     """Let a state use an observation (28)–(31) made at its instant."""
+    if not 0 < len(event.ids) <= AT_ONCE or not len(state.landmarks):
+        return None
     x, seen = _estimate(state), _seen(state, event)
-    if x is None or seen is None or not len(state.landmarks) or not len(event.ids):
+    if x is None or seen is None:
         return None
     settings, noise, table = state.settings, state.motion_noise.factors, state.landmarks
     m, factors = len(event.ids), noise.flat()
@@ -104,7 +107,7 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
         table.seen_before_ns,
     )
     figures = state.observation_noise.figures
-    if step.observe(x, landmarks, seen, figures, limits, factors, out) == step.UNUSUAL:
+    if core.observe(x, landmarks, seen, figures, limits, factors, out) == step.UNUSUAL:
         return None
     noise.take(factors)
     before, state.observer.A = state.observer.A, out.A
