@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 import math
 
@@ -46,7 +45,8 @@ from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import disbelieve, Outcome, step
+from slam_observer_ros.state.step import disbelieve, step
+from slam_observer_ros.state.usual import Outcome
 
 MOST_WITHOUT_IDS = 2
 """Hypotheses that are followed at most where points have no ids: each costs as much as the first,
@@ -240,7 +240,7 @@ class Hypotheses:
             else:
                 uses[number] -= 1
                 if uses[number]:
-                    hypothesis = deepcopy(hypothesis)
+                    hypothesis = hypothesis.copy()
             # Of hypotheses that become one, the first stands for all.
             child = self._child(hypothesis, taken, event)
             if not any(_are_one(child, other) for other in children):

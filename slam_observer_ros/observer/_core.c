@@ -297,7 +297,7 @@ static void mirror(double *P, long room, long N) /* the upper triangle to the lo
 
 /* ------------------------------------------------- the door: tuples of arrays from flat_arrays.py */
 
-enum { MAX_ARRAYS = 32, ANY = -1 };
+enum { MAX_ARRAYS = 48, ANY = -1 };
 
 typedef struct {
     Py_buffer views[MAX_ARRAYS];

@@ -24,8 +24,15 @@ def _compiled() -> ModuleType | None:
 
 COMPILED = _compiled()
 
-NAME = 'numpy' if COMPILED is None else 'C'
-"""Which of the two it is."""
+
+def description() -> str:
+    """Say which of the two it is, and why."""
+    if COMPILED is not None:
+        return 'C'
+    if os.environ.get(VARIABLE) == 'numpy':
+        return f'numpy, as {VARIABLE} says'
+    return 'numpy, three times slower: no C compiler or Python headers when this was installed'
+
 
 advance = step.advance if COMPILED is None else COMPILED.advance
 observe = step.observe if COMPILED is None else COMPILED.observe

@@ -5,9 +5,11 @@ Both return None, with nothing changed, where anything is unusual: see :mod:`.ob
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimates import NormalisedInnovation
 from slam_observer_ros.events import ObservationEvent
@@ -28,9 +30,19 @@ from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import Outcome
 
 _NO_ENTRIES, _NO_IDS = np.empty(0), np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What an observation did to a state."""
+
+    ids: IntArray  # (m,) ids of the landmarks seen that were known before
+    residuals: FloatArray  # (m, 3) before the correction, metres, reference frame
+    rejected: BoolArray  # (m,) which of them were too far off to be used
+    moved_ids: IntArray  # ids of landmarks that it showed to have moved
+    innovation: NormalisedInnovation | None = None
 
 
 def advance(
@@ -62,7 +74,7 @@ def advance(
     of_driving = out.noise - out.of_turning
     is_rest = status == step.AT_REST
     filter_.motion_noise.factors.move(None if is_rest else np.array([out.of_turning, of_driving]))
-    state.observer.A = out.A
+    x.A[...] = out.A
     if reach_ns:
         state._end_velocity = out.at_end
     return out.variances
@@ -110,7 +122,8 @@ def observe(state: State, event: ObservationEvent) -> Outcome | None:
     if core.observe(x, landmarks, seen, figures, limits, factors, out) == step.UNUSUAL:
         return None
     noise.take(factors)
-    before, state.observer.A = state.observer.A, out.A
+    before = x.A.copy()
+    x.A[...] = out.A
     if len(out.shift):
         state.filter.calibration.shift(out.shift)
     state.rejected_in_a_row, state.was_contradicted = 0, False

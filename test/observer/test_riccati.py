@@ -73,7 +73,7 @@ def residual_after(truth, x):
     error = slam_group.exp(x[:6], x[6:].reshape(n, 3))
     estimate = Observer(np.eye(4))
     estimate.add_reference_landmarks(se3.rotate(error.A, truth.points) + error.a)
-    estimate.A = error.A @ truth.A
+    estimate.A[...] = error.A @ truth.A
     return estimate.errors(slice(None), truth.body_points(np.arange(n)))[1].ravel()
 
 
@@ -114,7 +114,7 @@ def test_prediction_is_the_covariance_of_noisy_motions_composed(rng):
     V = rng.normal(size=(pieces, 6))
     Q = random_covariances(rng, pieces, 6)
     riccati = RiccatiFilter(PLAIN, np.eye(4))
-    riccati.observer.A = start = se3.exp(rng.normal(size=6))
+    riccati.observer.A[...] = start = se3.exp(rng.normal(size=6))
     propagate(riccati, V, np.full(pieces, dt_s), Q)
 
     def error(piece, w):

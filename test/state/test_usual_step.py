@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,7 +88,7 @@ class BothWays:
         monkeypatch.setattr(usual, 'observe', self.observe)
 
     def advance(self, state, velocities, start_ns, end_ns):
-        other = deepcopy(state)
+        other = state.copy()
         variances = self._advance(state, velocities, start_ns, end_ns)
         if variances is None:
             assert_same(state, other, 'an unusual motion')
@@ -102,7 +101,7 @@ class BothWays:
         return variances
 
     def observe(self, state, event):
-        other = deepcopy(state)
+        other = state.copy()
         self.observed += 1
         outcome = self._observe(state, event)
         if outcome is None:

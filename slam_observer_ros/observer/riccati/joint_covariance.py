@@ -13,6 +13,9 @@ The blocks C_i of all methods are of ε (m, k, p), or of (ε, c̃), the first en
 
 from __future__ import annotations
 
+from copy import copy
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.linalg.blas import dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf
@@ -26,22 +29,28 @@ from slam_observer_ros.geometry.matrices import (
     with_blocks,
 )
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
+from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.symmetric_matrix import SymmetricMatrix
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 
 class JointCovariance:
-    """P, and which of its columns are whose."""
+    """P, kept in ``matrix``, and which of its columns are whose."""
 
     # Whether all landmarks are in P, and the rows of those that are, in its order: a correction
     # moves these. See :mod:`.compressed_covariance`.
     is_dense = True
     active: IntArray | slice = slice(None)
 
-    def __init__(self, axes: EstimatedAxes, calibration: Calibration) -> None:
-        self._axes, self._p = axes, axes.p
+    def __init__(
+        self, axes: EstimatedAxes, calibration: Calibration, matrix: SymmetricMatrix
+    ) -> None:
+        self._axes, self._p, self._matrix = axes, axes.p, matrix
         self.P = calibration.initial_covariance()
         self.first = len(self.P)  # p + c, the first column of the landmarks
         self._stride = axes.point  # columns of each landmark
@@ -54,7 +63,13 @@ class JointCovariance:
 
     @P.setter
     def P(self, covariance: FloatArray) -> None:  # noqa: N802
-        self._matrix = SymmetricMatrix(covariance)
+        self._matrix.set(covariance)
+
+    def copy(self, observer: Observer) -> Self:
+        """Return an independent copy for a copy of the observer, which has one of P."""
+        other = copy(self)
+        other._matrix = observer.covariance
+        return other
 
     @property
     def pose(self) -> FloatArray:
@@ -313,8 +328,8 @@ class ExactMapCovariance(JointCovariance):
         self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray
     ) -> None:
         self._axes, self._p, self.first = axes, axes.p, joint.first
-        self._first_columns = joint._first_columns
-        self.P = joint.P[: self.first, : self.first].copy()
+        self._first_columns, self._matrix = joint._first_columns, joint._matrix
+        self.P = joint.P[: self.first, : self.first]
         self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:

@@ -14,7 +14,7 @@ in large maps less: :mod:`.compressed_covariance`.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 AT_ONCE = 32
 """Points that are used at once; each block of so many is judged by what those before it left."""
 
@@ -63,12 +66,18 @@ class RiccatiFilter(Filter):
 
     def __init__(self, settings: Settings, reference_pose: FloatArray) -> None:
         super().__init__(settings, reference_pose)
-        error = settings.landmark_velocity_stddev
+        error, matrix = settings.landmark_velocity_stddev, self.observer.covariance
         self.joint = (
-            MovingLandmarksCovariance(self.axes, self.calibration, error)
+            MovingLandmarksCovariance(self.axes, self.calibration, matrix, error)
             if error > 0.0
-            else JointCovariance(self.axes, self.calibration)
+            else JointCovariance(self.axes, self.calibration, matrix)
         )
+
+    def copy(self) -> Self:
+        """Return an independent copy."""
+        other = super().copy()
+        other.joint = self.joint.copy(other.observer)
+        return other
 
     def propagate(self, motion: Motion) -> None:
         """Move pose and landmarks along a motion (27), and add its noise to P."""
