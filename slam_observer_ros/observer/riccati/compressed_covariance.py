@@ -20,8 +20,9 @@ from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry.matrices import symmetric, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import symmetric, transpose
 from slam_observer_ros.observer.observer import Observer
+from slam_observer_ros.observer.orientations import LandmarkOrientations
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance, sheared
 from slam_observer_ros.observer.riccati.outside_landmarks import (
     Change,
@@ -65,8 +66,15 @@ class CompressedCovariance(JointCovariance):
     active: IntArray
     is_dense = False
 
-    def __init__(self, dense: JointCovariance, observer: Observer, size: BlockSize) -> None:
+    def __init__(
+        self,
+        dense: JointCovariance,
+        observer: Observer,
+        size: BlockSize,
+        orientations: LandmarkOrientations | None = None,
+    ) -> None:
         vars(self).update(vars(dense))
+        self.orientations = orientations  # of tags
         self._form, self._observer, self._size = copy(dense), observer, size
         self._form._matrix = SymmetricMatrix(self.P[: self.first, : self.first])
         n = len(observer.y_ref)
@@ -76,7 +84,7 @@ class CompressedCovariance(JointCovariance):
         # (n,) where each landmark is outside, −1 for nowhere; and (slots,) which ones are there
         self._slots = np.full(n, -1)
         self._in_slots: IntArray = np.empty(0, dtype=np.int64)
-        self._postponed = PostponedCorrection(self.P, self._axes.point)
+        self._postponed = self._nothing_postponed()
         self._corrections, self._most = 0, size.most
         self._changed = 0  # panels, since the last correction
 
@@ -97,19 +105,25 @@ class CompressedCovariance(JointCovariance):
 
     # The step
 
-    def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
-        """Update P and return the error x of pose, calibration and active landmarks."""
-        HP, HPH = self.project(C, rows)
-        postponed, p, q = self._postponed, self._p, C.shape[2]
-        H_Phi = C.reshape(-1, q) @ postponed.Phi[:q] - postponed.Phi[self._columns(rows)]
+    def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P beside H Φ (m k, …) and H P Hᵀ (m k, m k) of H x = C_i (ε, c̃) − ξ_i."""
+        HP, HPH = super().project(C, rows)
+        q, Phi = C.shape[2], self._postponed.Phi
+        return np.hstack([HP, C.reshape(-1, q) @ Phi[:q] - Phi[self._columns(rows)]]), HPH
+
+    def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
+        """Update P by what has been projected; return K r of pose, calibration, active ones."""
+        if not len(r):
+            return np.zeros(len(self.P))
         # L⁻¹ of all that is multiplied by S⁻¹ = L⁻ᵀ L⁻¹.
-        whitened = _whitened(with_blocks(HPH, R), np.column_stack([HP, H_Phi, r.ravel()]))
+        whitened = _whitened(S, np.column_stack([HP, r]))
         W, W_Phi, z = np.split(whitened, [len(self.P), whitened.shape[1] - 1], axis=1)
         self._matrix.subtract_square(W)
-        x: FloatArray = -W.T @ z[:, 0]
-        postponed.correct(W, W_Phi, z[:, 0], self._axes.full_pose(x[:p])[:3])
+        Kr: FloatArray = W.T @ z[:, 0]
+        turn = self._axes.full_pose(-Kr[: self._p])[:3]
+        self._postponed.correct(W, W_Phi, z[:, 0], turn)
         self._work()
-        return x
+        return Kr
 
     def activate(self, rows: IntArray) -> None:
         """See to it that landmarks ``rows`` (m,), of an observation, are active."""
@@ -132,6 +146,9 @@ class CompressedCovariance(JointCovariance):
             if np.linalg.norm(off[are_out], axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
                 self._begin_anew(self.active[:0])
                 return
+            self._turn(number, X)
+        if self.orientations is not None:
+            self._forget_gains()
 
     def postponed_shifts(self, rows: IntArray) -> FloatArray:
         """Return how far the observer has yet to move landmarks (m, 3), metres."""
@@ -191,8 +208,8 @@ class CompressedCovariance(JointCovariance):
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
         self._apply()
-        m, k = len(points), self._axes.point
-        slots = self._outside.add_independent(points, covariances[:, :k, :k])
+        m = len(points)
+        slots = self._outside.add_independent(points, self._known_blocks(covariances))
         self._places = np.concatenate([self._places, np.full(m, -1)])
         self._set_slots(np.concatenate([self._slots, slots]))
 
@@ -200,7 +217,7 @@ class CompressedCovariance(JointCovariance):
         """Delete the rows and columns of landmarks."""
         self._finish()
         places, slots = self._places[rows], self._slots[rows]
-        columns = JointCovariance._columns(self, places[places >= 0])
+        columns = self._all_columns(places[places >= 0])
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
         self._postponed.remove(columns)
         self._outside.remove(slots[slots >= 0])
@@ -235,14 +252,14 @@ class CompressedCovariance(JointCovariance):
         P[:p] = P[:, :p] = 0.0
         P[:p, :p] = covariance
         self.P = sheared(P, self.first, T)
-        self._postponed = PostponedCorrection(self.P, self._axes.point)
+        self._postponed = self._nothing_postponed()
 
     def marginal(self, rows: IntArray) -> JointCovariance:
         """Return the covariance of pose, calibration and different landmarks (m,) alone."""
         is_active = self._places[rows] >= 0
         others = np.flatnonzero(~is_active)
         others = others[np.argsort(self._slots[rows[others]])]
-        local = np.append(np.arange(self.first), self._columns(rows[is_active]))
+        local = np.append(np.arange(self.first), self._all_columns(self._places[rows[is_active]]))
         postponed, outside, views = self._postponed, self._outside, self._views(rows[others])
         Phi, b = postponed.Phi[local], postponed.Phi.shape[1]
         X = np.concatenate([np.empty((0, b)), *(view.X.reshape(-1, b) for view in views)])
@@ -254,7 +271,7 @@ class CompressedCovariance(JointCovariance):
         P = sheared(P, len(local), self._all_turning(references))
         order = np.argsort(np.append(np.flatnonzero(is_active), others))
         joint = copy(self._form)
-        columns = np.append(np.arange(self.first), joint._columns(order))
+        columns = np.append(np.arange(self.first), self._all_columns(order))
         joint._matrix = SymmetricMatrix(P[np.ix_(columns, columns)])
         return joint
 
@@ -307,6 +324,8 @@ class CompressedCovariance(JointCovariance):
         rows, are_out = self._in_panel(number)
         moved = self._moved(number, rows, are_out)
         self._observer.a[rows[are_out]] += moved.shifts[are_out]
+        if self.orientations is not None:
+            self.orientations.turn(moved.turns[are_out], rows[are_out])
         self._outside.make(number, moved)
         self._changed += 1
 
@@ -326,7 +345,7 @@ class CompressedCovariance(JointCovariance):
 
     def _views(self, rows: IntArray) -> list[View]:
         """Return what landmarks (m,) out of view are now, panel by panel in ascending order."""
-        views, outside = [], self._outside
+        views, outside, k = [], self._outside, self._axes.point
         for number, local in outside.by_panel(self._slots[rows]):
             in_panel, are_out = self._in_panel(number)
             moved = None
@@ -337,6 +356,8 @@ class CompressedCovariance(JointCovariance):
             X = outside.completed(number, are_out, moved)
             shifts = shifts + self._shifts(self._points(in_panel) + shifts - panel.references, X)
             at, blocks = np.sort(local), X.reshape(len(in_panel), self._stride, -1)
+            turns = self._postponed.turns(blocks[at, k:], panel.turned, self._axes)
+            turns = turns if moved is None else turns @ moved.turns[at]
             views.append(
                 View(
                     in_panel[at],
@@ -344,10 +365,30 @@ class CompressedCovariance(JointCovariance):
                     panel.own[at],
                     panel.references[at],
                     shifts[at],
+                    turns,
                     moved,
                 )
             )
         return views
+
+    def _turn(self, number: int, X: FloatArray) -> None:
+        """Turn the tags of a panel."""
+        if self.orientations is None:
+            return
+        rows, are_out = self._in_panel(number)
+        panel, each = self._outside.panels[number], X.reshape(len(rows), self._stride, -1)
+        turns = self._postponed.turns(each[:, self._axes.point :], panel.turned, self._axes)
+        self.orientations.turn(turns[are_out], rows[are_out])
+        panel.turned = len(self._postponed.gains or [])
+
+    def _forget_gains(self) -> None:
+        """Forget those by which all tags have been turned."""
+        panels, gains = self._outside.panels, self._postponed.gains
+        done = min((panel.turned for panel in panels), default=0)
+        if gains is not None and done:
+            del gains[:done]
+            for panel in panels:
+                panel.turned -= done
 
     def _shifts(self, off: FloatArray, X: FloatArray) -> FloatArray:
         """Return how far landmarks of a panel, ``off`` (slots, 3) their references, move."""
@@ -365,7 +406,8 @@ class CompressedCovariance(JointCovariance):
         new = released[all_slots[released] < 0]
         all_slots[new] = outside.new_slots(len(new))
         released = released[np.argsort(all_slots[released])]
-        columns, points = self._columns(released), self._observer.points[released]
+        columns = self._all_columns(self._places[released])
+        points = self._observer.points[released]
         # η = ξ − T ε with x and with each other.
         T = self._all_turning(points)
         to_x = P[columns] - T @ P[:p]
@@ -391,7 +433,7 @@ class CompressedCovariance(JointCovariance):
         self.P = P[np.ix_(kept, kept)]
         self._set_active(self.active[~np.isin(self.active, released)], len(self._places))
         self._set_slots(all_slots)
-        self._postponed = PostponedCorrection(self.P, self._axes.point)
+        self._postponed = self._nothing_postponed()
 
     def _take_in(self, rows: IntArray) -> None:
         """Make landmarks (m,) active, too."""
@@ -406,6 +448,8 @@ class CompressedCovariance(JointCovariance):
         slots, views = self._slots[rows], self._views(rows)
         X = np.concatenate([view.X for view in views]).reshape(len(rows) * self._stride, -1)
         self._observer.a[rows] += np.concatenate([view.shifts for view in views])
+        if self.orientations is not None:
+            self.orientations.turn(np.concatenate([view.turns for view in views]), rows)
         among, XPsi = outside.among(slots, views), X @ postponed.Psi
         # ξ = η + T ε with x and with each other.
         T = self._all_turning(np.concatenate([view.references for view in views]))
@@ -456,8 +500,21 @@ class CompressedCovariance(JointCovariance):
         self._postponed.extend(self._stride * m)
         return new
 
+    def _known_blocks(self, covariances: FloatArray) -> FloatArray:
+        """Return the covariances (m, …, …) of all that is estimated of known landmarks."""
+        k = self._axes.point
+        return covariances[:, :k, :k]
+
+    def _nothing_postponed(self) -> PostponedCorrection:
+        return PostponedCorrection(self.P, self._axes.point, self.orientations is not None)
+
     def _columns(self, rows: IntArray) -> IntArray:
         return super()._columns(self._places[rows])
+
+    def _all_columns(self, places: IntArray) -> IntArray:
+        """Return the columns of landmarks, with those of their orientations."""
+        columns: IntArray = self.first + self._stride * places[:, None] + np.arange(self._stride)
+        return columns.ravel()
 
 
 def _whitened(S: FloatArray, right: FloatArray) -> FloatArray:

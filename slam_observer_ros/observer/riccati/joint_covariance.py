@@ -72,6 +72,11 @@ class JointCovariance:
         return other
 
     @property
+    def stride(self) -> int:
+        """How many columns each landmark has."""
+        return self._stride
+
+    @property
     def pose(self) -> FloatArray:
         """(p, p) covariance of ε."""
         return self.P[: self._p, : self._p]

@@ -50,6 +50,7 @@ class Panel:
     X: FloatArray  # (PANEL_ROWS, …) cov(η, x₀), and the first of the columns that are taken
     own: FloatArray  # (slots, k, k) diagonal blocks of B
     references: FloatArray  # (slots, 3) y_i°, metres
+    turned: int = 0  # corrections since x began by which tags have been turned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +59,7 @@ class Moved:
 
     panel: Panel
     shifts: FloatArray  # (slots, 3) how far estimates have been moved, metres
+    turns: FloatArray  # (slots, 3, 3) and turned
     U: FloatArray  # (PANEL_ROWS, r + 2 s) to be added to B
     V: FloatArray  # (PANEL_ROWS, m k) the columns of B of those that are not in x any more
 
@@ -71,6 +73,7 @@ class View:
     own: FloatArray  # (m, k, k)
     references: FloatArray  # (m, 3) metres
     shifts: FloatArray  # (m, 3) how far estimates have yet to be moved, metres
+    turns: FloatArray  # (m, 3, 3) and be turned
     moved: Moved | None  # what is left to be done to their panel
 
 
@@ -222,8 +225,9 @@ class OutsideLandmarks:
         X = before @ change.postponed.Phi.T
         # Where the estimate has moved to, the reference follows, …
         was_off = np.where(were_out[:, None], points - panel.references, 0.0)
-        off, of_points = was_off.copy(), before.reshape(len(points), self._stride, -1)[:, :k]
-        off[:, :k] = change.postponed.shifted(was_off[:, :k], of_points)
+        off, each = was_off.copy(), before.reshape(len(points), self._stride, -1)
+        off[:, :k] = change.postponed.shifted(was_off[:, :k], each[:, :k])
+        turns = change.postponed.turns(each[:, k:], panel.turned, self._axes)
         s = len(change.turns)
         D = np.zeros((PANEL_ROWS, s))
         D.reshape(len(points), self._stride, s)[:, :k] = self._axes.turn_matrix(off)[:, :, :s]
@@ -240,7 +244,7 @@ class OutsideLandmarks:
         X[rows], V[rows] = change.to_x[of_change], change.own[of_change]
         own[new] = diagonal_blocks(change.own, self._stride)[at]
         references[new] = change.points[at]
-        return Moved(Panel(X, own, references), off - was_off, U, V)
+        return Moved(Panel(X, own, references), off - was_off, turns, U, V)
 
     def make(self, number: int, moved: Moved) -> None:
         """Let a panel have changed."""

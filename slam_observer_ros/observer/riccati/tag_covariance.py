@@ -123,6 +123,12 @@ class TagCovariance(JointCovariance):
         columns = self._turn_columns(rows)
         return self.P[columns], self.P[np.ix_(columns, columns)]
 
+    def own_turns(self, rows: IntArray) -> FloatArray:
+        """Return the covariances (m, q, q) of each ω_i, rad²."""
+        columns = self._turn_columns(rows).reshape(len(rows), self._axes.turn)
+        covariances: FloatArray = self.P[columns[:, :, None], columns[:, None, :]]
+        return covariances
+
     def _project_turn(self, D: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """Return H P (q, …) and H P Hᵀ (q, q) of ε_Ω + D c̃."""
         C = self._turn_output(D)
