@@ -226,15 +226,20 @@ def test_copies_share_what_is_large_and_change_apart(rng):
     assert_same(*filters)
 
 
-@pytest.mark.parametrize('settings', [CALIBRATED, PLANAR], ids=['3D', 'planar'])
+@pytest.mark.parametrize(
+    'settings',
+    [CALIBRATED, PLANAR, TAGS, PLANAR_TAGS],
+    ids=['3D', 'planar', 'tags', 'planar tags'],
+)
 @given(generators())
 def test_known_maps_poses_that_are_set_and_known_landmarks_that_anchor(settings, rng):
     filters, world = pair(settings), World(rng, settings)
     ids = rng.permutation(len(world.points))[:15]
     covariances = 0.01 * random_covariances(rng, len(ids), 3)
     known = world.points[ids] + world.flat(0.1 * rng.standard_normal((len(ids), 3)))
+    tags = {'orientations': world.orientations[ids], 'sigmas': np.full(len(ids), 0.05)}
     for filter_ in filters:
-        filter_.add_known(KnownLandmarks(known, covariances))
+        filter_.add_known(KnownLandmarks(known, covariances, **tags if world.are_tags else {}))
     world.ids += ids.tolist()
     world.drive(filters, 30)
     assert_same(*filters)

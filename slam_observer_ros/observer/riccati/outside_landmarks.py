@@ -15,7 +15,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import block_diagonal, diagonal_blocks, transpose
+from slam_observer_ros.geometry.matrices import diagonal_blocks, transpose
 from slam_observer_ros.observer.riccati.panel_matrix import PANEL_ROWS, PanelMatrix
 from slam_observer_ros.observer.riccati.postponed_correction import PostponedCorrection
 
@@ -91,13 +91,15 @@ class OutsideLandmarks:
         self.size = size  # q₀
         self.taken: IntArray = np.empty(0, dtype=np.int64)  # (t,) slots
         self.unchanged: dict[int, Change] = {}  # panels to which one has yet to happen
-        self._free: list[int] = []
+        self._unused: list[int] = []
+        self._left: list[int] = []  # slots of landmarks that were removed
 
     def copy(self) -> OutsideLandmarks:
         """Return an independent copy."""
         other = copy(self)
         other.matrix, other.panels = self.matrix.copy(), [copy(panel) for panel in self.panels]
-        other.unchanged, other._free = self.unchanged.copy(), self._free.copy()
+        other.unchanged = self.unchanged.copy()
+        other._unused, other._left = self._unused.copy(), self._left.copy()
         return other
 
     @property
@@ -111,21 +113,26 @@ class OutsideLandmarks:
 
     def new_slots(self, count: int) -> IntArray:
         """Return free slots for so many landmarks, ascending."""
+        used = self._left[:count]
+        self._left = self._left[len(used) :]
+        return np.sort(np.append(used, self._unused_slots(count - len(used)))).astype(np.int64)
+
+    def _unused_slots(self, count: int) -> IntArray:
+        """Return slots of which B is zero, ascending."""
         each, k = self.slots_each, self._stride
-        while len(self._free) < count:
-            self._free += range(each * len(self.panels), each * (len(self.panels) + 1))
+        while len(self._unused) < count:
+            self._unused += range(each * len(self.panels), each * (len(self.panels) + 1))
             width = self.size + k * len(self.taken)
             X, own = np.zeros((PANEL_ROWS, width)), np.zeros((each, k, k))
             self.panels.append(Panel(X, own, np.zeros((each, 3))))
             self.matrix.append()
-        self._free.sort()
-        slots, self._free = self._free[:count], self._free[count:]
+        slots, self._unused = self._unused[:count], self._unused[count:]
         return np.array(slots, dtype=np.int64)
 
     def remove(self, slots: IntArray) -> None:
-        """Forget landmarks. What B has of them nobody reads."""
+        """Forget landmarks. What B has of them is replaced with that of others."""
         self.clear(slots)
-        self._free += slots.tolist()
+        self._left += slots.tolist()
 
     def clear(self, slots: IntArray) -> None:
         """Let X of landmarks be zero."""
@@ -144,8 +151,8 @@ class OutsideLandmarks:
 
     def add_independent(self, points: FloatArray, covariances: FloatArray) -> IntArray:
         """Add landmarks (m,) whose errors are independent of all others; return their slots."""
-        slots = self.new_slots(len(points))
-        self.set_independent(slots, slice(self._stride), covariances)
+        slots = self._unused_slots(len(points))
+        self._set_own(slots, slice(self._stride), covariances)
         self.refer(slots, points)
         return slots
 
@@ -155,20 +162,24 @@ class OutsideLandmarks:
         Their covariances are (m, …, …). Nothing may be taken, and no change be going on.
         """
         rows = self._rows(slots)[:, entries].ravel()
-        covariance, done = block_diagonal(covariances), 0
         for number, panel in enumerate(self.panels):
-            first, last = np.searchsorted(rows, PANEL_ROWS * np.array([number, number + 1]))
-            columns, local = np.zeros((PANEL_ROWS, len(rows))), rows[first:last] % PANEL_ROWS
-            columns[local] = covariance[first:last]
-            self.matrix.set_columns(number, rows, columns)
-            if not len(local):
-                continue
-            X, own = panel.X.copy(), panel.own.copy()
-            X[local] = 0.0
-            mine = slots[slots // self.slots_each == number] % self.slots_each
-            own[mine, entries] = own[mine, :, entries] = 0.0
-            own[mine, entries, entries] = covariances[done : done + len(mine)]
-            panel.X, panel.own, done = X, own, done + len(mine)
+            self.matrix.set_columns(number, rows, np.zeros((PANEL_ROWS, len(rows))))
+            local = rows[rows // PANEL_ROWS == number] % PANEL_ROWS
+            if len(local):
+                panel.X = panel.X.copy()
+                panel.X[local] = 0.0
+        self._set_own(slots, entries, covariances)
+
+    def _set_own(self, slots: IntArray, entries: slice, covariances: FloatArray) -> None:
+        """Set what landmarks, ascending, have on the diagonal of B, where nothing is."""
+        begin = 0
+        for number, local in self.by_panel(slots):
+            blocks, panel = covariances[begin : begin + len(local)], self.panels[number]
+            begin += len(local)
+            self.matrix.add_blocks(number, self._rows(local)[:, entries], blocks)
+            panel.own = panel.own.copy()
+            panel.own[local, entries] = panel.own[local, :, entries] = 0.0
+            panel.own[local, entries, entries] = blocks
 
     def refer(self, slots: IntArray, points: FloatArray) -> None:
         """Let landmarks, ascending, refer to ``points`` (m, 3)."""
