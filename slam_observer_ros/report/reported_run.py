@@ -64,6 +64,19 @@ class ReportedRun:
         """What was found out about the velocity in the end."""
         return self.instants[-1].calibration if self.instants else ()
 
+    def calibration_over_time(self, name: str) -> tuple[FloatArray, list[CalibrationEstimate]]:
+        """Return when a property was estimated, seconds, and what was known of it at each time.
+
+        That of a sensor begins where the sensor is heard first.
+        """
+        known = [
+            (row, part)
+            for row, instant in enumerate(self.instants)
+            for part in instant.calibration
+            if part.name == name
+        ]
+        return self.instants_s[[row for row, _ in known]], [part for _, part in known]
+
     @property
     def used_s(self) -> FloatArray:
         """(u,) times at which landmarks were used, seconds."""

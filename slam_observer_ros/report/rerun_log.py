@@ -177,13 +177,13 @@ def _log_curves(stream: rr.RecordingStream, run: ReportedRun) -> None:
             stream, 'plots/position/aligned', run.seconds(run.errors.estimate.stamps_ns), error_m
         )
     _log_anchored(stream, run)
-    for index, part in enumerate(run.instants[-1].calibration if run.instants else ()):
+    for part in run.calibration:
         factor, unit = part.for_people
-        values = [instant.calibration[index].value for instant in run.instants]
+        seconds, parts = run.calibration_over_time(part.name)
         name = f'plots/calibration/{part.name}'
         if unit:
             stream.log(name, rr.SeriesLines(names=[f'{part.name} [{unit}]']), static=True)
-        _send(stream, name, run.instants_s, factor * np.array(values))
+        _send(stream, name, seconds, factor * np.array([each.value for each in parts]))
 
 
 def _log_anchored(stream: rr.RecordingStream, run: ReportedRun) -> None:
