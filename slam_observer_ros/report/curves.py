@@ -8,7 +8,7 @@ from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import average_nees_band, normalised_squared_errors
 from slam_observer_ros.evaluation.ellipses import CHI_SQUARE_95
 from slam_observer_ros.report.lists import Json, rounded
-from slam_observer_ros.report.reported_run import ReportedRun
+from slam_observer_ros.runs.reported_run import ReportedRun
 
 MAX_GROUPS = 150
 """Points of the curve of NIS, each the mean of as many observations as that takes."""

@@ -18,7 +18,7 @@ from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.ellipses import ellipses
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.recording.writer import RecordingWriter
-from slam_observer_ros.report.findings import growth_windows
+from slam_observer_ros.runs.error_health import growth_windows
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 MEGABYTE = 1_000_000
@@ -284,7 +284,7 @@ def test_a_report_begins_with_that_nothing_was_used(slam_observer, tmp_path):
                 event = replace(event, ids=event.ids, points=np.full_like(event.points, np.nan))
             writer.write_event(event)
     assert slam_observer('replay', recording, '--report', report).code == 0
-    sentence = 'No observation was used: the trajectory is that of the velocities alone.'
-    assert numbers_of(report)['findings'][0]['text'] == sentence
+    sentence = 'No observation was used (dropped: 50 without a point that is used'
+    assert numbers_of(report)['findings'][0]['text'].startswith(sentence)
     shown = open_page(report).html
     assert shown.index(sentence) < shown.index('id="time-bar"')

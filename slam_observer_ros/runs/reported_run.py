@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,13 +27,8 @@ class ReportedRun:
 
     ``trajectory`` is the online one and ``errors`` its errors; ``dead_reckoning`` is that of the
     velocities alone; ``anees`` is that of the pose. Both are None where there is no truth.
-    ``nothing_used`` says if of velocities or observations none was of use, else it is empty.
     """
 
-    title: str
-    nothing_used: str
-    figures: Mapping[str, str]
-    warnings: Sequence[str]
     settings: Settings
     start_ns: int
     trajectory: Trajectory
