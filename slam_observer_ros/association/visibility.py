@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 import math
 
 import numpy as np
@@ -41,6 +42,12 @@ class Visibility:
         self._newest_number = 0
         self.missed = 0.0  # confirmed landmarks that should have been seen last, and were not
         self._in_view, self._seen = 1, 1  # confirmed landmarks so far
+
+    def copy(self) -> Visibility:
+        """Return an independent copy: no array is ever changed in place."""
+        other = copy(self)
+        other._field_of_view = copy(self._field_of_view)
+        return other
 
     def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
         """Count which landmarks were in view of an observation, already used, and which were seen.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 import logging
 from types import SimpleNamespace
@@ -479,7 +478,7 @@ def test_once_the_robot_is_placed_no_other_state_is_followed(is_given):
     world = World(3)
     estimator = add(Estimator(world.settings()), [world.see(0.0, world.near(0.0, 8))])
     hypotheses = estimator._hypotheses
-    hypotheses._all.append(deepcopy(hypotheses._all[0]))
+    hypotheses._all.append(hypotheses._all[0].copy())
     if is_given:
         estimator.set_pose(world.start)
     else:
