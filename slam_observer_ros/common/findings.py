@@ -239,6 +239,12 @@ KINDS = {
         'without ids it is found again in a loaded map only',
         'give its pose on initialpose, or start again',
     ),
+    'doubled_landmark': Kind(
+        Level.WARNING,
+        'a landmark without an id was added where a known one should be seen and is not: that one '
+        'was moved, or it is in the map twice now',
+        'if it was not moved, state more noise of the velocity or of the points (Tune the noise)',
+    ),
     # Events, as they come; the log has how many of each
     'dropped_message': Kind(
         Level.WARNING, 'dropped a message, {reason}: {error}', 'see Troubleshooting for the reason'

@@ -27,7 +27,7 @@ MANY_MOVED = 5
 MOVED_LATELY_NS = 60 * NANOSECONDS_PER_SECOND
 """How long ago that is at most, nanoseconds."""
 
-UNEXPECTED_POSES = ('slip', 'unexpected_place')
+UNEXPECTED_POSES = ('slip', 'unexpected_place', 'doubled_landmark')
 """What is wrong with the robot's pose when these counts grow."""
 
 

@@ -18,6 +18,7 @@ from slam_observer_ros.cli.replay.request import ReplayRequest
 from slam_observer_ros.common.errors import shown, UsageError
 from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.known_map.map_file import map_files
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 from slam_observer_ros.settings.parameter_table import changed_names, suggestion, table, Value
@@ -109,15 +110,15 @@ def part_of(recordings: Sequence[Path], points: int, shard: tuple[int, int]) -> 
 
 def make_job(request: ReplayRequest, sha256: str, point: Point) -> Job:
     """Return the job of one recording at one point, whose values the request has."""
-    load_map = request.load_map
-    map_bytes = None if load_map is None else not_special(load_map).read_bytes()
+    maps = [] if request.load_map is None else map_files(request.load_map)
+    map_bytes = b''.join(not_special(path).read_bytes() for path in maps)
     depends_on = {
         'recording': sha256,
         'version': VERSION,
         'settings': _changed(request.settings),
         'inputs': _changed(request.inputs),
         'topics': dataclasses.astuple(request.topics),
-        'map': None if map_bytes is None else _sha256_of_bytes(map_bytes),
+        'map': _sha256_of_bytes(map_bytes) if maps else None,
         'smooth': request.smooth,
     }
     run_id = _sha256_of_bytes(json.dumps(depends_on, sort_keys=True).encode())[:_ID_DIGITS]

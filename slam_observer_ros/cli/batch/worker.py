@@ -10,7 +10,7 @@ from slam_observer_ros.cli.console import kept_warnings
 from slam_observer_ros.cli.replay.files import write_report_of
 from slam_observer_ros.cli.replay.request import Records
 from slam_observer_ros.cli.replay.run import replayed
-from slam_observer_ros.cli.replay.summary import as_json, identity
+from slam_observer_ros.cli.replay.summary import as_json, identity, summary_rows
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.evaluation.trajectory import write_tum
@@ -41,7 +41,7 @@ class Work:
         if tum is not None:
             write_tum(outcome.trajectory, tum)
         if report is not None:
-            write_report_of(job.file_stem, outcome, report)
+            write_report_of(job.file_stem, outcome, summary_rows(outcome), report)
         return {
             'run': job.run_id,
             'grid': job.point,

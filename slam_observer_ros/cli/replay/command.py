@@ -17,7 +17,13 @@ from slam_observer_ros.cli.replay.files import (
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
 from slam_observer_ros.cli.replay.request import add_run_options, read_request, warn_of_unused
 from slam_observer_ros.cli.replay.run import replayed
-from slam_observer_ros.cli.replay.summary import as_json, identity, print_summary, sha256_of
+from slam_observer_ros.cli.replay.summary import (
+    as_json,
+    identity,
+    print_summary,
+    sha256_of,
+    summary_rows,
+)
 from slam_observer_ros.common.errors import LossError, OutputError
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -60,7 +66,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str) -> None:
     """Write and print all that can be, and only then say what could not be written."""
-    written, errors = write_files(args, outcome, map_frame)
+    written, errors = write_files(args, outcome, map_frame, summary_rows(outcome))
     if args.json:
         sha256 = sha256_of(args.recording)
         print_json(identity(args.recording, sha256, outcome) | as_json(outcome))

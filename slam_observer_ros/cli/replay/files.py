@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import dataclasses
 from importlib.util import find_spec
 import logging
@@ -23,14 +23,13 @@ from slam_observer_ros.cli.outputs import (
 )
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
 from slam_observer_ros.cli.replay.request import Records
-from slam_observer_ros.cli.replay.summary import summary_rows
 from slam_observer_ros.common.errors import EvaluationError, SlamObserverError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.evaluation.consistency import nees_over_time
 from slam_observer_ros.evaluation.map_shape import shape_covariances
 from slam_observer_ros.evaluation.trajectory import Trajectory, write_tum
 from slam_observer_ros.geometry import se3
-from slam_observer_ros.known_map.map_file import write_map
+from slam_observer_ros.known_map.map_file import map_files, write_map
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.runs.replay import Replay
 
@@ -111,7 +110,7 @@ def check_files(args: argparse.Namespace, config: Path | None) -> None:
     read = {f'the recording {args.recording}': files_of(args.recording)}
     if config is not None:
         read['the file of --config'] = [config]
-    loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
+    loaded = {} if args.load_map is None else {'the file of --load-map': map_files(args.load_map)}
     files = {
         '--tum': args.tum,
         '--report': args.report,
@@ -130,14 +129,14 @@ def check_files(args: argparse.Namespace, config: Path | None) -> None:
 
 
 def write_files(
-    args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str
+    args: argparse.Namespace, outcome: ReplayOutcome, map_frame: str, summary: Mapping[str, str]
 ) -> tuple[dict[str, Path], list[str]]:
     """Write what was asked for; return what was written, and why something was not."""
     title = args.recording.name
     outputs: tuple[tuple[str, Path | None, Callable[[Path], object]], ...] = (
         ('trajectory', args.tum, lambda path: write_tum(outcome.trajectory, path)),
         ('map', args.map, lambda path: _write_map(outcome, map_frame, path)),
-        ('report', args.report, lambda path: write_report_of(title, outcome, path)),
+        ('report', args.report, lambda path: write_report_of(title, outcome, summary, path)),
         (
             'Rerun file',
             args.rerun or None,
@@ -176,7 +175,9 @@ def _write_map(outcome: ReplayOutcome, map_frame: str, path: Path) -> None:
     write_map(path, landmark_map, estimator.settings)
 
 
-def write_report_of(title: str, outcome: ReplayOutcome, path: Path) -> None:
+def write_report_of(
+    title: str, outcome: ReplayOutcome, summary: Mapping[str, str], path: Path
+) -> None:
     """Write the page that shows a run, with the lines of the table that is printed."""
     from slam_observer_ros.report.page import write_report  # which few replays need
 
@@ -184,7 +185,7 @@ def write_report_of(title: str, outcome: ReplayOutcome, path: Path) -> None:
         raise EvaluationError('nothing was recorded that could be shown')
     logged = {finding.text() for finding in outcome.findings}
     warnings = [warning for warning in outcome.warnings if warning not in logged]
-    write_report(path, outcome.whole_run, title, summary_rows(outcome), outcome.findings, warnings)
+    write_report(path, outcome.whole_run, title, summary, outcome.findings, warnings)
 
 
 def _show_in_rerun(title: str, outcome: ReplayOutcome, path: Path | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 import logging
@@ -18,7 +18,7 @@ from slam_observer_ros.common.findings import Finding
 from slam_observer_ros.estimates import UNUSED_POINTS
 from slam_observer_ros.events import is_automatic
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.map_file import read_map
+from slam_observer_ros.known_map.map_file import read_maps
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import Truth
@@ -46,9 +46,9 @@ def replayed(request: ReplayRequest, *, shows_progress: bool = True) -> tuple[Re
             "No map is loaded, so localization_mode '%s' has no effect (use --load-map).",
             request.settings.localization_mode,
         )
-    landmark_map = None if request.load_map is None else read_map(request.load_map)
-    outcome = _replay(request, landmark_map, shows_progress)
-    return outcome, _frame_of_outputs(request.inputs, landmark_map)
+    maps = [] if request.load_map is None else read_maps(request.load_map)
+    outcome = _replay(request, maps, shows_progress)
+    return outcome, _frame_of_outputs(request.inputs, maps)
 
 
 def select_inputs(
@@ -65,7 +65,7 @@ def select_inputs(
 
 
 def _replay(
-    request: ReplayRequest, landmark_map: LandmarkMap | None, shows_progress: bool
+    request: ReplayRequest, maps: Sequence[LandmarkMap], shows_progress: bool
 ) -> ReplayOutcome:
     """Replay a recording; refuse an outcome without what is asked of it."""
     settings, records = request.settings, request.records
@@ -75,15 +75,15 @@ def _replay(
         if shows_progress:
             events = show_progress(events, 'replaying', recording.event_count(selected))
         recorder = _recorder(records)
-        map_frame = inputs.map_frame if landmark_map is None else landmark_map.frame_id
+        map_frame = maps[0].frame_id if maps else inputs.map_frame
         needs_poses = records.poses or records.whole_run or len(truth.stamps_ns) > 0
         with _estimate_writer(records, recording, selected, inputs, map_frame) as writer:
             recorders = [noter for noter in (recorder, writer) if noter is not None]
-            result = replay(events, settings, truth, landmark_map, needs_poses, recorders)
+            result = replay(events, settings, truth, maps or None, needs_poses, recorders)
             use = list(of_use(recording, selected, inputs, result))
             _check_used(request, use)
-            if landmark_map is not None:
-                _check_localised(request, result, landmark_map)
+            if maps:
+                _check_localised(request, result, maps)
             outcome = outcome_of(recording, selected, result, truth, recorder)
             if writer is not None:
                 writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
@@ -97,17 +97,17 @@ def _recorder(records: Records) -> RunRecorder | NisTally | None:
     return NisTally() if records.nis else None
 
 
-def _frame_of_outputs(inputs: InputSettings, landmark_map: LandmarkMap | None) -> str:
+def _frame_of_outputs(inputs: InputSettings, maps: Sequence[LandmarkMap]) -> str:
     """Return the frame of what is written: that of the map that was loaded, if one was."""
-    if landmark_map is None or landmark_map.frame_id == inputs.map_frame:
+    if not maps or maps[0].frame_id == inputs.map_frame:
         return inputs.map_frame
     logger.warning(
         "The map is in frame '%s', and so is what is written; the node takes it with "
         'map_frame: %s only.',
-        landmark_map.frame_id,
-        landmark_map.frame_id,
+        maps[0].frame_id,
+        maps[0].frame_id,
     )
-    return landmark_map.frame_id
+    return maps[0].frame_id
 
 
 def _with_base_frame(
@@ -153,7 +153,7 @@ def _check_used(request: ReplayRequest, use: list[Finding]) -> None:
             )
 
 
-def _check_localised(request: ReplayRequest, result: Replay, known: LandmarkMap) -> None:
+def _check_localised(request: ReplayRequest, result: Replay, maps: Sequence[LandmarkMap]) -> None:
     """Refuse an outcome that is not in the frame of the map that was loaded.
 
     Where the pose in it was found and lost again the trajectory is still of use, but not the map:
@@ -163,7 +163,7 @@ def _check_localised(request: ReplayRequest, result: Replay, known: LandmarkMap)
         return
     if result.localised_ns is None:
         raise UsageError(
-            f'the pose in the map {request.load_map} was not found: {_never_found(result, known)}'
+            f'the pose in the map {request.load_map} was not found: {_never_found(result, maps)}'
         )
     if request.records.map or request.smooth:
         end_s = result.seconds_until(result.localised_ns[1])
@@ -173,16 +173,17 @@ def _check_localised(request: ReplayRequest, result: Replay, known: LandmarkMap)
         )
 
 
-def _never_found(result: Replay, known: LandmarkMap) -> str:
+def _never_found(result: Replay, maps: Sequence[LandmarkMap]) -> str:
     estimator = result.estimator
     if is_automatic(estimator.landmark_ids).any():
         return f'{estimator.localisation_problem}{_advice(result)}'
     least = 'two' if estimator.settings.two_d_mode else 'three'
-    named = known.ids[~is_automatic(known.ids)]
+    ids = np.concatenate([known.ids for known in maps])
+    named = ids[~is_automatic(ids)]
     return (
         f'that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
-        f'{np.isin(named, estimator.landmark_ids).sum()} of its {len(known.ids)} were '
+        f'{np.isin(named, estimator.landmark_ids).sum()} of its {len(ids)} were '
         f'seen{_advice(result)}'
     )
 
