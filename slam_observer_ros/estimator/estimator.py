@@ -23,7 +23,7 @@ from slam_observer_ros.estimator.checks import (
     usable_points,
 )
 from slam_observer_ros.estimator.event_queue import EventQueue
-from slam_observer_ros.estimator.event_warnings import EventWarnings
+from slam_observer_ros.estimator.event_warnings import EventWarnings, UNEXPECTED_POSES
 from slam_observer_ros.estimator.timeline import OnMotion, Timeline
 from slam_observer_ros.events import (
     AngularVelocityEvent,
@@ -679,7 +679,7 @@ class Estimator:
             warnings.warn('more_than_max', count=len(event.ids), limit=limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
-        warnings.unexpected_poses(self._hypotheses.count)
+        warnings.unexpected_poses(self._hypotheses.some_counts(UNEXPECTED_POSES))
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
         warnings.large_map(len(state.landmarks), limit, is_dense)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
 import logging
 
 from slam_observer_ros.common.findings import found
@@ -77,12 +77,12 @@ class EventWarnings:
             self._moved_ns = {}
             self.warn('many_moved', count=len(lately))
 
-    def unexpected_poses(self, count: Callable[[str], int]) -> None:
-        """Warn that the robot is not where it was taken to be, if ``count`` says so again."""
-        for name in UNEXPECTED_POSES:
-            if count(name) > self._reported.get(name, 0):
+    def unexpected_poses(self, counts: Sequence[int]) -> None:
+        """Warn that the robot is not where it was taken to be, if one of these has grown."""
+        for name, count in zip(UNEXPECTED_POSES, counts, strict=True):
+            if count > self._reported.get(name, 0):
                 self.warn(name)
-                self._reported[name] = count(name)
+                self._reported[name] = count
 
     def _warn_once(self, kind: str, **figures: object) -> None:
         self._counts[kind] += 1
