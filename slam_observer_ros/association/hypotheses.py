@@ -10,7 +10,7 @@ have ids or are well separated there is nearly always one.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 import math
 
