@@ -130,7 +130,7 @@ class CompressedCovariance(JointCovariance):
             off = self._points(rows) - self._outside.panels[number].references
             off += self._shifts(off, X)
             if np.linalg.norm(off[are_out], axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
-                self._begin_anew(self.active[:0])
+                self._restart(self.active[:0])
                 return
 
     def postponed_shifts(self, rows: IntArray) -> FloatArray:
@@ -280,12 +280,12 @@ class CompressedCovariance(JointCovariance):
         """Make landmarks active, and no others."""
         released = self.active[~np.isin(self.active, rows)]
         if len(released):
-            self._begin_anew(released)
+            self._restart(released)
         self._take_in(rows[self._places[rows] < 0])
 
     def _apply(self) -> None:
         """Do what is postponed; refer to present estimates."""
-        self._begin_anew(self.active[:0])
+        self._restart(self.active[:0])
         self._finish()
 
     def _work(self) -> None:
@@ -357,8 +357,8 @@ class CompressedCovariance(JointCovariance):
             shifts[:, :k] = self._postponed.shifted(off[:, :k], X[:, :k]) - off[:, :k]
         return shifts
 
-    def _begin_anew(self, released: IntArray) -> None:
-        """Let x begin anew, without landmarks (m,), and all else be changed little by little."""
+    def _restart(self, released: IntArray) -> None:
+        """Let x start again, without landmarks (m,), and all else be changed little by little."""
         self._finish()
         outside, P, p, angles = self._outside, self.P, self._p, self._p - self._axes.point
         all_slots = self._slots.copy()
