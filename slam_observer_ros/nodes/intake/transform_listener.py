@@ -17,7 +17,7 @@ from slam_observer_ros.common.errors import MessageError, TransformError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.inputs.frames import insert_transforms, TransformSource
 from slam_observer_ros.inputs.transform_buffer import ALWAYS_NS, TransformBuffer
-from slam_observer_ros.messages.poses_and_velocities import decode_transforms, pose_matrices
+from slam_observer_ros.messages.poses import decode_transforms, pose_matrices
 from slam_observer_ros.nodes.intake.input_topic import take
 from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
 from slam_observer_ros.nodes.throttled_log import ThrottledLog
