@@ -14,11 +14,11 @@ import pytest
 import recordings
 import ros_messages as ros
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
-from slam_observer_ros.messages.poses import PoseBlock, PoseMessage
 
 from slam_observer_ros.common.errors import RecordingError
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.events import Event, ObservationEvent, VelocityEvent
+from slam_observer_ros.messages.poses import PoseBlock, PoseMessage
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.recorded_truth import LandmarkTracks, other_frames
 from slam_observer_ros.recording.sources import BagSource, SplitSource
@@ -49,6 +49,9 @@ def assert_same_events(actual: list[Event], expected: list[Event]) -> None:
         other = dataclasses.replace(other, receive_ns=one.receive_ns)
         if isinstance(other, ObservationEvent):
             other = dataclasses.replace(other, sensor_axis=np.array([1.0, 0.0, 0.0]))
+        else:
+            assert one.sensor_frame in ('', 'base_link')
+            other = dataclasses.replace(other, sensor_frame=one.sensor_frame)
         for name, value in dataclasses.asdict(other).items():
             np.testing.assert_array_equal(getattr(one, name), value)
 
