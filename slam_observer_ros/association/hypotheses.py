@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 import math
 
@@ -232,7 +231,7 @@ class Hypotheses:
             else:
                 uses[number] -= 1
                 if uses[number]:
-                    hypothesis = deepcopy(hypothesis)
+                    hypothesis = hypothesis.copy()
             # Of hypotheses that become one, the first stands for all.
             child = self._child(hypothesis, taken, event)
             if not any(_are_one(child, other) for other in children):

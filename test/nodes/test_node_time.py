@@ -29,9 +29,7 @@ from slam_observer_ros.inputs.frames import BaseFrame
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.clouds import decode_point_cloud2
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
-from slam_observer_ros.nodes.message_classes import MESSAGES
-from slam_observer_ros.nodes.publishing.transform_publisher import TFMessage
-from slam_observer_ros.nodes.qos import LATCHED_QOS
+from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.simulation import Scenario, Simulation
@@ -254,7 +252,7 @@ class AnotherClock:
         self.node.resolve_topic_name = lambda name: f'/{name.lstrip("/")}'
         self.estimator = Estimator(Settings(reorder_window=0.0))
         base_frame = BaseFrame(settings, self.transforms)
-        self.feed = EstimatorFeed(self.node, settings, self.estimator, base_frame)
+        self.feed = EstimatorFeed(self.node, settings, self.estimator, base_frame, Mock(), Mock())
         self.feed.is_active = True
 
     def send(self, received_ns):

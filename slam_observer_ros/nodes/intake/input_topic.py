@@ -17,10 +17,9 @@ from slam_observer_ros.common.errors import MessageError, ParameterError
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.estimator.checks import MAX_STAMP_NS
 from slam_observer_ros.messages.cdr import Buffer
-from slam_observer_ros.nodes.intake.backlog import Backlog
-from slam_observer_ros.nodes.intake.load_shedding import LoadShedding, Waiting
+from slam_observer_ros.nodes.intake.load import Backlog, LoadShedding, Waiting
+from slam_observer_ros.nodes.logs import ThrottledLog
 from slam_observer_ros.nodes.message_classes import message_class
-from slam_observer_ros.nodes.throttled_log import ThrottledLog
 
 DISCOVERY_S = 5.0
 """How long a topic may be without publisher or message before that is logged.
@@ -89,7 +88,7 @@ class InputTopic(Generic[MessageT]):
     topic : str
         Topic name after remapping.
     received, malformed : int
-        Messages so far, and those that could not be decoded.
+        Messages so far, and how many could not be decoded.
     shedding : LoadShedding
         What is dropped, and how much was, as they come faster than they can be used.
     advice : mapping of str to str
@@ -99,7 +98,7 @@ class InputTopic(Generic[MessageT]):
     is_shared : bool
         Whether several may publish on it, as several sensors of landmarks.
     read_first : sequence of InputTopic
-        Other inputs, of which what was received before a message of this one is read before it.
+        Other inputs: what they received before a message of this one is read before it.
         An executor reads one message of each topic in turn, so after the node was busy a slow
         topic would run far ahead of a fast one. It still does where the middleware does not
         report when it has received a message.

@@ -17,9 +17,9 @@ from slam_observer_ros.messages.poses import (
     decode_pose_with_covariance_stamped,
     PoseMessage,
 )
-from slam_observer_ros.nodes.intake.clock_offset import FUTURE_NS
-from slam_observer_ros.nodes.intake.transformed_odometry import TransformedOdometry
-from slam_observer_ros.nodes.qos import RELIABLE_QOS
+from slam_observer_ros.nodes.intake.clocks import FUTURE_NS
+from slam_observer_ros.nodes.intake.transforms import TransformedOdometry
+from slam_observer_ros.nodes.message_classes import RELIABLE_QOS
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M
 from slam_observer_ros.state.covariances import MAX_POSE_ERRORS, of_moved_pose
 
@@ -59,7 +59,8 @@ class InitialPoseListener:
             return
         self._on_move()
         x, y, z = message.position.tolist()
-        self._node.get_logger().info(f'the robot is set to ({x:.2f}, {y:.2f}, {z:.2f}) m')
+        what = 'is set to' if self._estimator.is_localised else 'is searched for about'
+        self._node.get_logger().info(f'the robot {what} ({x:.2f}, {y:.2f}, {z:.2f}) m')
 
     def _set(self, pose: FloatArray, covariance: FloatArray, stamp_ns: int) -> None:
         """Move the robot to where it was at a stamp, and add how it moved since, as AMCL does."""
