@@ -72,7 +72,7 @@ def _landmark_input(
     else:
         chosen = _chosen('landmarks', settings.landmarks_type)
         for cloud in chosen.keys() & CLOUDS:
-            chosen[cloud] = CloudDecoder(node, cloud, chosen[cloud])
+            chosen[cloud] = CloudDecoder(node, cloud)
         if not any(map(is_installed, chosen)):
             message_class(next(iter(chosen)))  # raises, and says what to install
     qos = _qos(settings.landmarks_qos, settings.queue_depth)

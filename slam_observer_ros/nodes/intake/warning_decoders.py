@@ -14,7 +14,7 @@ from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.poses import decode_transforms, PoseMessage
-from slam_observer_ros.messages.registry import Decode
+from slam_observer_ros.messages.registry import Decode, decoders
 from slam_observer_ros.messages.velocities import decode_odometry
 
 MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero
@@ -27,9 +27,10 @@ class CloudDecoder:
     These are then distinguished by their positions, as is wanted, or as a name is misspelt.
     """
 
-    def __init__(self, node: Node, message_type: str, decode: Decode[ObservationEvent]) -> None:
+    def __init__(self, node: Node, message_type: str) -> None:
         self._node = node
-        self._message_type, self._decode = message_type, decode
+        self._message_type = message_type
+        self._decode: Decode[ObservationEvent] = decoders('landmarks')[message_type]
         self._is_checked = False
 
     def __call__(self, raw: Buffer, receive_ns: int) -> ObservationEvent:
