@@ -17,6 +17,7 @@ from slam_observer_ros.cli.fitting_file import fitting_file
 from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.version import VERSION
+from slam_observer_ros.observer import core
 from slam_observer_ros.settings.message_types import message_types
 
 LISTENER = 'slam_observer_ros.nodes.live_inputs'
@@ -88,6 +89,7 @@ def _installed() -> dict[str, str]:
         'slam_observer_ros': VERSION,
         'Python': f'{platform.python_version()} ({sys.executable})',
         'ROS': _ros(),
+        'step of the filter': core.description(),
     }
     for package, use in _message_packages().items():
         found[package] = _presence(find_spec(package) is not None, use)
