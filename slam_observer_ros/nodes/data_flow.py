@@ -52,7 +52,7 @@ class DataFlow:
     feed : EstimatorFeed
     inputs : list of InputTopic
     timers : list of Timer
-        Those that run only while something waits.
+        They run only while something waits.
 
     """
 

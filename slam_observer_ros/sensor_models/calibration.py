@@ -151,7 +151,7 @@ class Calibration:
         ]
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
-        """Return velocities (…, 6) as (1 + s) ∘ V + b; those that are exactly zero stay so."""
+        """Return velocities (…, 6) as (1 + s) ∘ V + b; exact zeros stay so."""
         # Wheels that stand turn no robot, however unlike, and no gyroscope gives zero on all axes.
         biases = _moves(body_velocities)[..., None] * self._all[6:DELAY]
         return body_velocities * self._all[:6] + biases

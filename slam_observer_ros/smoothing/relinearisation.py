@@ -7,7 +7,7 @@ how far its corrections have turned the robot.
 What was relinearised stays as it is: from then on a summary stands for it, in coordinates in
 which later corrections hardly change it (:meth:`.Prior.least_nonlinear`). After a blind stretch
 there may be no such summary until landmarks seen before are seen again. Else the cost does not
-grow with the history, of which only :meth:`Relinearisation.smooth` needs all.
+grow with the history; only :meth:`Relinearisation.smooth` needs all of it.
 
 It is O(n³) for n landmarks. In a map without a dense covariance (:mod:`.compressed_covariance`)
 nothing is relinearised any more. Its history goes on, to be smoothed, until it would have to begin
@@ -267,7 +267,7 @@ class Relinearisation:
     @property
     def _is_due(self) -> bool:
         """Whether corrections have turned far, with enough observations since it last was due."""
-        if self._is_overdue:  # it could not be summed up for a landmark in doubt
+        if self._is_overdue:  # a landmark that may have moved kept it from being summed up
             return True
         settings = self._settings
         least = max(
@@ -316,7 +316,7 @@ class Relinearisation:
         """Take the last step's start for the reference; the step is a correction from there.
 
         ``covariance`` belongs to that start. Taken for that of the step's end it would say
-        something of the gauge, of which nothing is known.
+        something of the gauge, which is unknown.
         """
         start, end, observer = step.start, step.end, self._observer
         # The reference and its covariance, in the coordinates of the filter.
