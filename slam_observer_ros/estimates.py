@@ -188,11 +188,11 @@ def calibration_problems(calibration: Iterable[CalibrationEstimate]) -> list[str
     parts = list(calibration)
     for part in parts:
         notable_s = max(NOTABLE_DELAY_S, CERTAIN * part.deviation)
-        if part.name == DELAY_NAME and abs(part.value) > notable_s:
+        if part.name == DELAY_NAME and abs(part.value - part.nominal) > notable_s:
             when = 'late' if part.value > 0.0 else 'early'
             return [
-                f'The odometry takes effect {abs(part.value):.2f} s {when}: mind it in the driver '
-                '(Tune the noise).'
+                f'The odometry takes effect {abs(part.value):.2f} s {when}: mind it in the '
+                f'driver, or set velocity_delay: {part.value:.2f} (Tune the noise).'
             ]
     return [part.problem for part in parts if part.problem]
 
@@ -245,4 +245,6 @@ class Smoothed:
     since: str
     slips: int
     # (n, 3, 3) of the landmarks, world, zero where unknown; None if it is not estimated
-    orientations: FloatArray | None = None
+    orientations: FloatArray | None
+    calibration: list[CalibrationEstimate]  # c, of the last pose if it drifts
+    calibration_correlations: FloatArray  # (c, c)
