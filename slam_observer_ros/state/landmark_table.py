@@ -20,6 +20,11 @@ Some are seen more seldom than others: from afar, or from one side only.
 TOO_SELDOM = 5
 """How many times more seldom than others a landmark may be seen that was confirmed once."""
 
+MIN_SHARE, MOST_SHARE = 0.1, 0.9
+"""How often a landmark in view is seen at least, as in a map that was loaded, and at most: one
+that was seen each time may yet be hidden.
+"""
+
 NEW_S, OLD_S = 60.0, 20.0
 """A landmark is new for so long, and an old one was not seen for so long, seconds."""
 
@@ -189,6 +194,10 @@ class LandmarkTable(LandmarkColumns):
         self.passed[rows] += has_moved
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
 
+    def note_missed(self, rows: IntArray, seen: BoolArray) -> None:
+        """Count once more that rows (m,) in view were missed, but for those ``seen`` (n,)."""
+        self.missed[rows] = np.where(seen[rows], 0, self.missed[rows] + 1)
+
     def _sort(self) -> None:
         # The rows in the order of their ids, and these.
         self._order: IntArray = np.argsort(self.ids)
@@ -198,6 +207,11 @@ class LandmarkTable(LandmarkColumns):
     def seen_share(self) -> float:
         """How often a confirmed landmark without an id is seen while in view; 0 if unknown."""
         return self._confirmed_seen / self._confirmed_in_view if self._confirmed_in_view else 0.0
+
+    @property
+    def likely_share(self) -> float:
+        """The same, within what is likely."""
+        return min(max(self.seen_share, MIN_SHARE), MOST_SHARE)
 
     def unsupported(self, min_support: int) -> IntArray:
         """Return rows without an id that were seen too seldom to be landmarks.

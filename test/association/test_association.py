@@ -129,6 +129,7 @@ def test_false_points_among_those_without_ids_leave_few_landmarks_behind(seed):
     estimator = gain_worlds.estimate(with_false_points(world, 0.05, seed), PLANAR)
     assert estimator.counts['unsupported_landmark'] > 20
     assert len(estimator.landmark_ids) <= len(named.landmark_ids) + 3
+    assert estimator.counts['doubled_landmark'] == 0
     assert_allclose(estimator.pose, named.pose, atol=0.1)
 
 
@@ -674,6 +675,24 @@ def test_reflectors_that_come_one_a_message_are_all_kept():
         point = points[[step % 24]] + random.normal(scale=0.02, size=(1, 3)) * [1.0, 1.0, 0.0]
         observe(estimator, 0.02 * step, point)
     assert estimator.counts['unsupported_landmark'] == 0
+
+
+@pytest.mark.parametrize('loaded', [False, True], ids=['mapped', 'loaded'])
+@pytest.mark.parametrize('shift_m', [0.0, 0.8])
+def test_a_landmark_added_where_a_known_one_should_be_seen_is_said(shift_m, loaded, caplog):
+    """The robot is moved on its stand, which nobody told it."""
+    random, estimator = np.random.default_rng(0), Estimator(PLANAR)
+    post = np.array([[3.0, 0.0, 0.0]])
+    if loaded:
+        surveyed = np.array([1e-4 * np.eye(3)])
+        estimator.load_map(LandmarkMap(np.array([7]), post, surveyed, np.array([0])), np.eye(4))
+    for step in range(120):
+        stand(estimator, 0.1 * step)
+        noise = random.normal(scale=0.02, size=3) * [1.0, 1.0, 0.0]
+        observe(estimator, 0.1 * step, post + noise - [shift_m * (step > 40), 0.0, 0.0])
+    is_said = shift_m > 0.0
+    assert estimator.counts['doubled_landmark'] == is_said
+    assert ('added where a known one should be seen' in caplog.text) == is_said
 
 
 def test_a_landmark_that_was_placed_again_has_its_chance_again():
