@@ -42,9 +42,11 @@ from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
 from slam_observer_ros.sensor_models.delay_evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
+from slam_observer_ros.state import usual
 from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
-from slam_observer_ros.state.step import disbelieve, Outcome, step
+from slam_observer_ros.state.step import disbelieve, step
+from slam_observer_ros.state.usual import Outcome
 
 MOST_WITHOUT_IDS = 2
 """Hypotheses that are followed at most where points have no ids: each costs as much as the first,
@@ -157,10 +159,14 @@ class Hypotheses:
         """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns`` (27)."""
         for hypothesis in self._all:
             state = hypothesis.state
-            motion = state.motion(velocities, start_ns, end_ns)
-            state.propagate(motion)
-            if motion.at_ends is not None and state is self.best:
-                self._delay_evidence.add(velocities, motion, start_ns, end_ns)
+            variances = usual.advance(state, velocities, start_ns, end_ns)
+            if variances is None:
+                motion = state.motion(velocities, start_ns, end_ns)
+                state.propagate(motion)
+                variances = np.diagonal(motion.covariances.sum(axis=0))
+            calibration = state.filter.calibration
+            if calibration.delay_error_ns and state is self.best:
+                self._delay_evidence.add(velocities, calibration, variances, start_ns, end_ns)
 
     @property
     def calibration(self) -> list[CalibrationEstimate]:
@@ -189,6 +195,9 @@ class Hypotheses:
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
+        if len(self._all) == 1 and (outcome := usual.observe(self.best, event)) is not None:
+            self._some_have_ids = True
+            return outcome
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
         matches = [match(hypothesis.state, event) for hypothesis in self._all]
