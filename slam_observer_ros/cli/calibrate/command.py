@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict, replace
 
-from slam_observer_ros.cli.calibrate.finder import Finder, Found
+from slam_observer_ros.cli.calibrate.finder import Finder
 from slam_observer_ros.cli.calibrate.stated import (
     depth_text,
+    Found,
     is_off,
     is_seen,
     looked_for,

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 import numpy as np
 
 from slam_observer_ros.cli.calibrate.driven import driven, opened
+from slam_observer_ros.cli.calibrate.stated import Found
 from slam_observer_ros.cli.tune.material import Material
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, of_points, scaled
 from slam_observer_ros.cli.tune.noise_search import search_noise
 from slam_observer_ros.cli.tune.verdict import judge, Judged, SURE
 from slam_observer_ros.common.errors import UsageError
-from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_ns
-from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, MotionFactor
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry.axes import axes_of
@@ -33,29 +33,6 @@ MOSTLY_NOISE = 0.5
 
 MAX_BEHIND = 0.01
 """Share of the points so far off the sensor's axis that it does not measure depth along that."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """What was found; ``gains`` are of the log likelihood, with their standard deviations."""
-
-    parts: list[CalibrationEstimate]  # c
-    correlations: FloatArray  # (c, c)
-    range_is_depth: bool
-    depth_gain: tuple[float, float] | None  # of depth over range; None if it can't be
-    gain: tuple[float, float]  # of all over what was stated
-    noise: list[tuple[NoiseKind, float, float]]  # of points: ln factor and its deviation
-    factors: list[MotionFactor]
-    too_noisy: list[str]  # scales of velocities that were not looked for
-
-    @property
-    def frames(self) -> set[str]:
-        """The frames of the sensors; '' is the base frame."""
-        return {
-            part.name.partition('/')[2]
-            for part in self.parts
-            if part.name.startswith(('sensor_', 'range_'))
-        }
 
 
 class Finder:

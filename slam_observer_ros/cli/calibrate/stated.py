@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_observer_ros.cli.calibrate.finder import Found
-from slam_observer_ros.cli.tune.noise_kinds import of_motion, scaled
+from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, of_motion, scaled
 from slam_observer_ros.cli.tune.tuned_file import certainty, rounded
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME, MotionFactor
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings, Pose6
@@ -31,6 +30,29 @@ CLEARLY_NOISIER = math.log(1.2)
 MOUNT = ('sensor_rotation', 'sensor_translation')
 
 Values = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What was found; ``gains`` are of the log likelihood, with their standard deviations."""
+
+    parts: list[CalibrationEstimate]  # c
+    correlations: FloatArray  # (c, c)
+    range_is_depth: bool
+    depth_gain: tuple[float, float] | None  # of depth over range; None if it can't be
+    gain: tuple[float, float]  # of all over what was stated
+    noise: list[tuple[NoiseKind, float, float]]  # of points: ln factor and its deviation
+    factors: list[MotionFactor]
+    too_noisy: list[str]  # scales of velocities that were not looked for
+
+    @property
+    def frames(self) -> set[str]:
+        """The frames of the sensors; '' is the base frame."""
+        return {
+            part.name.partition('/')[2]
+            for part in self.parts
+            if part.name.startswith(('sensor_', 'range_'))
+        }
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,8 @@ def run(args: argparse.Namespace) -> None:
         raise UsageError('a recording is given twice; what is trained on can not be held out, too')
     # What the settings that are tried give reason to warn of is nobody's concern.
     with muted_warnings(), shown_steps('tuning') as advance:
-        kinds, found = search_noise(trained_on, asked.settings, kinds_of(asked.settings), advance)
+        likelihoods = [material.likelihood for material in trained_on]
+        kinds, found = search_noise(likelihoods, asked.settings, kinds_of(asked.settings), advance)
     if not kinds:
         raise UsageError('no noise figure has an effect: messages state all covariances')
     tuned = _rounded(scaled(asked.settings, kinds, found.log_factors.tolist()), kinds)
