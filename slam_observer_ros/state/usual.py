@@ -156,16 +156,16 @@ def _seen(state: State, event: ObservationEvent) -> Seen | None:
         return None
     if event.sensed is not None:  # late, and carried forward
         return None
-    arms, covariances, calibration = (
-        event.lines_of_sight,
-        event.covariances,
-        state.filter.calibration,
-    )
-    sensor = calibration.sensors.get(event.sensor_frame)
-    if not calibration.corrects_points:
-        return Seen(event.stamp_ns, event.ids, arms, event.sensor, covariances, None, _NO_IDS, 0)
-    if sensor is None:
-        return None
+    arms, covariances = _plain(event.lines_of_sight), event.covariances
+    ids, origins = np.ascontiguousarray(event.ids, np.int64), event.sensor
+    calibration = state.filter.calibration
+    values, estimated, column = None, _NO_IDS, 0
+    if calibration.corrects_points:
+        sensor = calibration.sensors.get(event.sensor_frame)
+        if sensor is None:  # seen for the first time
+            return None
+        values, estimated = sensor.values, sensor.estimated
+        column = calibration.columns(sensor).start
     if state.settings.range_is_depth:
         cosines = sensing.cosines(arms, event.sensor_axis)
         arms = arms / cosines[:, None]
@@ -173,14 +173,19 @@ def _seen(state: State, event: ObservationEvent) -> Seen | None:
             covariances = covariances / cosines[:, None, None] ** 2
     return Seen(
         event.stamp_ns,
-        event.ids,
+        ids,
         arms,
-        event.sensor,
-        covariances,
-        sensor.values,
-        sensor.estimated,
-        calibration.columns(sensor).start,
+        None if origins is None else _plain(origins),
+        None if covariances is None else _plain(covariances),
+        values,
+        estimated,
+        column,
     )
+
+
+def _plain(array: FloatArray) -> FloatArray:
+    """Return an array that may be of another precision or order as C has it."""
+    return np.ascontiguousarray(array, np.float64)
 
 
 def _record(

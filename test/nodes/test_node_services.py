@@ -30,6 +30,7 @@ from slam_observer_ros.messages.point_clouds import decode_point_cloud2
 from slam_observer_ros.nodes.message_classes import LATCHED_QOS, MESSAGES, TFMessage
 from slam_observer_ros.nodes.publishing import diagnostics as node_diagnostics
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher, MANY_UNUSED
+from slam_observer_ros.runs.health import of_calibration
 from slam_observer_ros.simulation import Scenario
 
 pytestmark = pytest.mark.ros
@@ -351,7 +352,11 @@ def test_a_calibration_that_nobody_can_mean_is_reported():
     wrong = CalibrationEstimate('angular_scale_z', -0.5, 0.01, '', nominal=1.0, stated=0.03)
     status = Publishing(calibration=[wrong]).publish(observation=1)
     assert status.level == DiagnosticStatus.WARN
-    assert status.message == wrong.problem
+    (finding,) = of_calibration([wrong])
+    assert (status.message, values_of(status)[f'to do: {finding.what}']) == (
+        finding.what,
+        finding.remedy,
+    )
 
 
 def test_points_rejected_long_ago_are_reported_no_more():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 
 from slam_observer_ros.cli.calibrate.finder import Finder
 from slam_observer_ros.cli.calibrate.stated import (
@@ -16,7 +18,6 @@ from slam_observer_ros.cli.calibrate.stated import (
     Stated,
     with_noise,
 )
-from slam_observer_ros.cli.calibrate.trades import trades
 from slam_observer_ros.cli.console import (
     muted_warnings,
     print_columns,
@@ -24,19 +25,13 @@ from slam_observer_ros.cli.console import (
     print_table,
     shown_steps,
 )
-from slam_observer_ros.cli.options import (
-    add_settings_options,
-    named_path,
-    read_assignments,
-    read_config,
-)
+from slam_observer_ros.cli.options import add_settings_options, Given, named_path, read_given
 from slam_observer_ros.cli.outputs import (
     add_force_option,
     check_inputs_are_kept,
     check_outputs,
 )
-from slam_observer_ros.cli.replay.asked import Asked, read_asked
-from slam_observer_ros.cli.replay.input_options import add_input_options
+from slam_observer_ros.cli.replay.request import add_input_options, read_request, ReplayRequest
 from slam_observer_ros.cli.replay.run import select_inputs
 from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
 from slam_observer_ros.cli.tune.tuned_file import (
@@ -50,11 +45,12 @@ from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.events import VelocityEvent
-from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
+from slam_observer_ros.runs.health import of_mounting, of_noise
+from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 
 
@@ -101,69 +97,70 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Calibrate by a recording, and judge on what was held out."""
-    asked = read_asked(args)
-    if not DESIGNS[asked.settings.gains].has_joint_covariance:
-        raise UsageError(f'calibrate needs riccati gains, not {asked.settings.gains}')
+    given = read_given(args)
+    request = read_request(args, given, args.recording)
+    if not DESIGNS[request.settings.gains].has_joint_covariance:
+        raise UsageError(f'calibrate needs riccati gains, not {request.settings.gains}')
     read = {f'the recording {path}': files_of(path) for path in (args.recording, *args.hold_out)}
     survey = None
     if args.survey is not None:
         read['the map'] = [args.survey]
         survey = read_map(args.survey)
-        if asked.settings.localization_mode == 'off':
-            asked = replace(asked, settings=replace(asked.settings, localization_mode='uncertain'))
+        if request.settings.localization_mode == 'off':
+            request = request.with_values({'localization_mode': 'uncertain'})
     check_inputs_are_kept({'--out': args.out}, read)
     check_outputs([args.out], args.force)
     share = 0.0 if args.hold_out else HELD_OUT_SHARE
-    material = read_material(args, args.recording, asked, share, survey)
-    kept = read_assignments(args)
+    material = read_material(request, share, survey)
     # What the settings that are tried give reason to warn of is nobody's concern.
     with muted_warnings(), shown_steps('calibrating') as advance:
-        found = Finder(material, asked.settings, kept, advance).find()
-        pose = _sensor_pose(args, asked, found)
-        stated = state_found(asked.settings, asked.inputs, found, pose)
-        stated, verdict = _judged(args, asked, material, stated, found, survey)
+        found = Finder(material, request.settings, given.assigned, advance).find()
+        pose = _sensor_pose(request, found)
+        stated = state_found(request.settings, request.inputs, found, pose)
+        stated, verdict = _judged(request, args.hold_out, material, stated, found)
     _print(args, material, found, stated, verdict)
     if verdict.objection:
         raise IncompleteError(f'no improvement: on what was held out {verdict.objection}')
     if args.out is not None:
-        _write(args, material, found, stated, verdict)
+        _write(args, given, material, found, stated, verdict)
 
 
-def _sensor_pose(args: argparse.Namespace, asked: Asked, found: Found) -> FloatArray | None:
+def _sensor_pose(request: ReplayRequest, found: Found) -> FloatArray | None:
     """Return the pose (4, 4) of the only sensor; None if there are several, or it moves."""
     if len(found.frames) != 1:
         return None
-    with Recording(args.recording) as recording:
-        selected, inputs, _ = select_inputs(args, recording, asked)
+    with Recording(request.recording) as recording:
+        selected, inputs, _ = select_inputs(request, recording)
         return recording.sensor_pose(selected, inputs, next(iter(found.frames)))
 
 
 def _judged(
-    args: argparse.Namespace,
-    asked: Asked,
+    request: ReplayRequest,
+    held_out: Sequence[Path],
     material: Material,
     stated: Stated,
     found: Found,
-    survey: LandmarkMap | None,
 ) -> tuple[Stated, Verdict]:
     """Judge on what was held out; leave the noise as it was if that is no improvement."""
+    share = 1.0 if held_out else HELD_OUT_SHARE
 
-    def results(asked: Asked) -> list[Judged]:
-        if args.hold_out:
-            held_out = [read_material(args, path, asked, 1.0, survey) for path in args.hold_out]
-        else:
-            share = HELD_OUT_SHARE
-            held_out = [read_material(args, args.recording, asked, share, survey)]
-        judged = [one.judged(asked.settings) for one in held_out]
+    def results(settings: Settings, inputs: InputSettings) -> list[Judged]:
+        asked = replace(request, settings=settings, inputs=inputs)
+        judged = [
+            read_material(replace(asked, recording=path), share, material.landmark_map).judged(
+                settings
+            )
+            for path in held_out or [request.recording]
+        ]
         if not all(len(one.likelihood.stamps_ns) for one in judged):
             raise UsageError('nothing is seen twice in what is held out')
         return judged
 
-    before = results(asked)
-    after = results(Asked(stated.settings, stated.inputs))
+    before = results(request.settings, request.inputs)
+    after = results(stated.settings, stated.inputs)
     velocities = (event for event in material.events if isinstance(event, VelocityEvent))
     noisy = with_noise(stated, found, all(event.covariance is None for event in velocities))
-    after_noise = results(Asked(noisy.settings, noisy.inputs))
+    after_noise = results(noisy.settings, noisy.inputs)
     if not judge(after, after_noise).objection:
         stated, after = noisy, after_noise
     return stated, judge(before, after)
@@ -190,7 +187,7 @@ def _print(
                     | {'seen': part.deviation / part.stated, 'is_off': is_off(part)}
                     for part in found.parts
                 },
-                'trades': [asdict(trade) for trade in trades(found.parts, found.correlations)],
+                'trades': [asdict(trade) for trade in found.trades],
                 'range_is_depth': found.range_is_depth,
                 'depth_gain': found.depth_gain,
                 'log_likelihood_gain': found.gain,
@@ -209,7 +206,8 @@ def _print(
     lines = {'ranges': depth_text(found)}
     lines |= {f'noise of {kind.name}': certainty(log, d) for kind, log, d in found.noise}
     lines |= {f'noise of {part.name}': str(part) for part in found.factors}
-    lines |= {f'to do: {part.name}': part.advice for part in found.parts if part.advice}
+    to_do = [*of_mounting(found.parts), *of_noise(found.factors)]
+    lines |= {f'to do: {finding.what}': finding.remedy for finding in to_do}
     lines |= _open_questions(found)
     lines['log likelihood, gain'] = '{:.1f} ± {:.1f}'.format(*found.gain)
     lines |= {f'held out: {name}': text for name, text in verdict_lines(verdict).items()}
@@ -222,13 +220,14 @@ def _open_questions(found: Found) -> dict[str, str]:
     lines = {'not seen': f'{", ".join(unseen)}: left as stated'} if unseen else {}
     if found.too_noisy:
         lines['too noisy'] = f'velocities for their scale: {", ".join(found.too_noisy)}'
-    for number, trade in enumerate(trades(found.parts, found.correlations), 1):
+    for number, trade in enumerate(found.trades, 1):
         lines[f'trade {number}'] = trade.text
     return lines
 
 
 def _write(
     args: argparse.Namespace,
+    given: Given,
     material: Material,
     found: Found,
     stated: Stated,
@@ -244,5 +243,4 @@ def _write(
         *judged_lines(held_out, verdict),
         'Values ± their standard deviations; what the recording says little of is as it was.',
     ]
-    given = read_config(args) | read_assignments(args)
-    write_found(args.out, head, given, stated.groups)
+    write_found(args.out, head, given.values, stated.groups)

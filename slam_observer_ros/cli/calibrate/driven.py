@@ -61,8 +61,10 @@ def opened(
 ) -> Settings:
     """Return settings that know little of all that is calibrated, but for those to be ``kept``.
 
-    Noise in proportion to the speed is taken to be the same all the time: as noisy velocities
-    state it, those too small by chance would weigh more, and scales come out too large.
+    Without a surveyed map the scale of ranges is as stated: nothing shows how large a map is, but
+    noise stated in metres makes a smaller one more likely. Noise in proportion to the speed is
+    taken to be the same all the time: as noisy velocities state it, those too small by chance
+    would weigh more, and scales come out too large.
     """
     is_usable = motion.noise_share < (NOISY if is_surveyed else 1.0)
     scales = np.where(is_usable, SCALE, 0.0)
@@ -79,6 +81,8 @@ def opened(
     wide: dict[str, Any] = {
         name: _at_least(getattr(settings, name), value) for name, value in least.items()
     }
+    if not is_surveyed:
+        wide['range_scale_stddev'] = 0.0
     wide |= {
         'angular_scale_stddev': tuple(scales[:3].tolist()),
         'linear_scale_stddev': tuple(scales[3:].tolist()),

@@ -10,6 +10,7 @@ import numpy as np
 
 from slam_observer_ros.cli.calibrate.driven import driven, opened
 from slam_observer_ros.cli.calibrate.stated import Found
+from slam_observer_ros.cli.calibrate.trades import COMMON_SCALE, trades
 from slam_observer_ros.cli.tune.material import Material
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, of_points, scaled
 from slam_observer_ros.cli.tune.noise_search import search_noise
@@ -73,9 +74,13 @@ class Finder:
         estimator, after = self._run(settings)
         # A filter seems to know what only shows where it has linearised: a common scale.
         smoothed = estimator.smooth()
+        parts = [self._part(part, delay) for part in smoothed.calibration]
+        pairs = trades(parts, smoothed.calibration_correlations)
+        if self._material.landmark_map is None and not settings.range_scale_stddev:
+            pairs.insert(0, COMMON_SCALE)
         return Found(
-            [self._part(part, delay) for part in smoothed.calibration],
-            smoothed.calibration_correlations,
+            parts,
+            pairs,
             settings.range_is_depth,
             depth_gain,
             _gain(before, after),
@@ -141,7 +146,9 @@ class Finder:
 
     def _noise(self, settings: Settings) -> list[tuple[NoiseKind, float, float]]:
         """Return the kinds of noise of points, with ln of their most likely factors, ± so much."""
-        kinds, found = search_noise([self._material], settings, of_points(settings), self._advance)
+        kinds, found = search_noise(
+            [self._material.likelihood], settings, of_points(settings), self._advance
+        )
         logs, deviations = found.log_factors.tolist(), found.deviations.tolist()
         return list(zip(kinds, logs, deviations, strict=True))
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slam_observer_ros.cli.calibrate.trades import Trade
 from slam_observer_ros.cli.tune.noise_kinds import NoiseKind, of_motion, scaled
 from slam_observer_ros.cli.tune.tuned_file import certainty, rounded
 from slam_observer_ros.common.types import FloatArray
@@ -37,7 +38,7 @@ class Found:
     """What was found; ``gains`` are of the log likelihood, with their standard deviations."""
 
     parts: list[CalibrationEstimate]  # c
-    correlations: FloatArray  # (c, c)
+    trades: list[Trade]
     range_is_depth: bool
     depth_gain: tuple[float, float] | None  # of depth over range; None if it can't be
     gain: tuple[float, float]  # of all over what was stated

@@ -48,6 +48,15 @@ class Trade:
     text: str
 
 
+COMMON_SCALE = Trade(
+    ('linear_scale_x', 'range_scale'),
+    1.0,
+    'range scale and wheel scale trade: the wheels are as the ranges have them; for both of them '
+    + _ADVICE[0][1],
+)
+"""What no map that is made on the way shows: how large it is."""
+
+
 def trades(parts: list[CalibrationEstimate], correlations: FloatArray) -> list[Trade]:
     """Return the pairs among parts (c,) that can't be distinguished, the closest first."""
     unknown = np.array([part.deviation > WELL_KNOWN * part.stated for part in parts])

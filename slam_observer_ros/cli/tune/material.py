@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slam_observer_ros.cli.replay.asked import Asked
-from slam_observer_ros.cli.replay.identity import sha256_of
+from slam_observer_ros.cli.replay.request import ReplayRequest
 from slam_observer_ros.cli.replay.run import select_inputs
+from slam_observer_ros.cli.replay.summary import sha256_of
 from slam_observer_ros.cli.tune.verdict import Judged
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimator.estimator import Estimator
@@ -78,16 +77,13 @@ class Material:
 
 
 def read_material(
-    args: argparse.Namespace,
-    path: Path,
-    asked: Asked,
-    held_out_share: float,
-    landmark_map: LandmarkMap | None = None,
+    request: ReplayRequest, held_out_share: float, landmark_map: LandmarkMap | None = None
 ) -> Material:
     """Read a recording, of which the last part is to be held out."""
+    path = request.recording
     with Recording(path) as recording:
-        selected, inputs, truth = select_inputs(args, recording, asked)
-        events = list(recording.events(selected, inputs, asked.settings.velocity_timeout))
+        selected, inputs, truth = select_inputs(request, recording)
+        events = list(recording.events(selected, inputs, request.settings.velocity_timeout))
     seen = [event for event in events if isinstance(event, ObservationEvent) and len(event.ids)]
     if not seen:
         raise UsageError(f'{path}: no landmark is seen')
