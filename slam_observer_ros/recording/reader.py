@@ -26,8 +26,8 @@ from slam_observer_ros.inputs.event_builder import (
 )
 from slam_observer_ros.inputs.frames import BaseFrame, insert_transforms
 from slam_observer_ros.inputs.transform_buffer import TransformBuffer
-from slam_observer_ros.messages.pose_blocks import PoseBlock
-from slam_observer_ros.messages.velocity_blocks import BlockDecoder
+from slam_observer_ros.messages.poses import PoseBlock
+from slam_observer_ros.messages.registry import BlockDecoder
 from slam_observer_ros.recording.arrivals import Arrivals
 from slam_observer_ros.recording.contents import Contents
 from slam_observer_ros.recording.decoding import (
@@ -330,11 +330,13 @@ def _velocities_of(raw: RawBlock, reading: _Reading) -> VelocityBlock | None:
     if reading.decode_block is None or len(raw.data) < FEWEST_IN_BLOCK:
         return None
     try:
-        frame_id, velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
+        velocities = reading.decode_block(raw.data, raw.receive_stamps_ns)
     except MessageError:
         return None
     has_stamps = raw.topic in reading.simulated or velocities.stamps_ns.all()
-    return velocities if has_stamps and reading.builder.passes_on(frame_id) else None
+    return (
+        velocities if has_stamps and reading.builder.passes_on(velocities.sensor_frame) else None
+    )
 
 
 def _pose_block(raw: RawBlock) -> PoseBlock | None:
