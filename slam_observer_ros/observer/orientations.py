@@ -77,7 +77,7 @@ class LandmarkOrientations(LandmarkColumns):
         """Let landmarks have no orientation."""
         self.B[rows] = 0.0
 
-    def turn(self, turns: FloatArray, rows: IntArray | slice) -> None:
+    def turn(self, rows: IntArray | slice, turns: FloatArray) -> None:
         """Let those of landmarks (m,) become R_i B̂_i of ``turns`` R_i (m, 3, 3)."""
         self.B[rows] = turns @ self.B[rows]
 

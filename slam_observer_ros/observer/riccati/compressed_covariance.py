@@ -21,9 +21,10 @@ from scipy.linalg.lapack import dpotrf
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry.matrices import symmetric, transpose
+from slam_observer_ros.observer.chart import sheared
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import LandmarkOrientations
-from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance, sheared
+from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.observer.riccati.outside_landmarks import (
     Change,
     Moved,
@@ -105,11 +106,16 @@ class CompressedCovariance(JointCovariance):
 
     # The step
 
-    def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return H P beside H Φ (m k, …) and H P Hᵀ (m k, m k) of H x = C_i (ε, c̃) − ξ_i."""
-        HP, HPH = super().project(C, rows)
-        q, Phi = C.shape[2], self._postponed.Phi
-        return np.hstack([HP, C.reshape(-1, q) @ Phi[:q] - Phi[self._columns(rows)]]), HPH
+    def _project(self, C: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return H P beside H Φ (r, …) and H P Hᵀ (r, r)."""
+        HP, HPH = super()._project(C, columns)
+        Phi = self._postponed.Phi
+        return np.hstack([HP, C @ Phi[: C.shape[1]] - Phi[columns]]), HPH
+
+    def project_own_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same of ω_i."""
+        HP, HPH = super().project_own_turns(rows)
+        return np.hstack([HP, self._postponed.Phi[self._turn_columns(rows)]]), HPH
 
     def update(self, HP: FloatArray, S: FloatArray, r: FloatArray) -> FloatArray:
         """Update P by what has been projected; return K r of pose, calibration, active ones."""
@@ -144,7 +150,7 @@ class CompressedCovariance(JointCovariance):
             off = self._points(rows) - self._outside.panels[number].references
             off += self._shifts(off, X)
             if np.linalg.norm(off[are_out], axis=1).max(initial=0.0) > REFERENCE_SHIFT_M:
-                self._begin_anew(self.active[:0])
+                self._restart(self.active[:0])
                 return
             self._turn(number, X)
         if self.orientations is not None:
@@ -213,11 +219,49 @@ class CompressedCovariance(JointCovariance):
         self._places = np.concatenate([self._places, np.full(m, -1)])
         self._set_slots(np.concatenate([self._slots, slots]))
 
+    def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
+        """Take over orientations (m,) whose errors (m, q, q) are independent of all else."""
+        is_active = self._places[rows] >= 0
+        super().add_known_turns(rows[is_active], covariances[is_active])
+        if not is_active.all():
+            self._apply()
+            slots = self._slots[rows[~is_active]]
+            order, turns = np.argsort(slots), slice(self._axes.point, self._stride)
+            self._outside.set_independent(slots[order], turns, covariances[~is_active][order])
+
+    def own_turns(self, rows: IntArray) -> FloatArray:
+        """Return the covariances (m, q, q) of each ω_i, rad²."""
+        is_active, q = self._places[rows] >= 0, self.chart.turn
+        covariances, at = np.empty((len(rows), q, q)), np.flatnonzero(~is_active)
+        covariances[is_active] = super().own_turns(rows[is_active])
+        at, k, begin = at[np.argsort(self._slots[rows[at]])], self._axes.point, 0
+        for view in self._views(rows[at]):
+            X, mine = view.X[:, k:], at[begin : begin + len(view.rows)]
+            own = view.own[:, k:, k:] - (X @ self._postponed.Psi) @ transpose(X)
+            covariances[mine], begin = own, begin + len(view.rows)
+        return covariances
+
+    def of_landmarks(
+        self, rows: IntArray, points: FloatArray, tags: IntArray
+    ) -> FloatArray | None:
+        """Return the covariance (m k + t q) of ã_i of ``rows`` (m,) and ω_i of ``tags`` (t,)."""
+        every = np.union1d(rows, tags)
+        at, of_tags = np.searchsorted(every, rows), np.searchsorted(every, tags)
+        return self.marginal(every).of_landmarks(at, points, of_tags)
+
+    def turned(self, rows: IntArray, B: FloatArray) -> FloatArray:
+        """Return what orientations ``B`` (m, 3, 3) of tags will be once all is done."""
+        every = np.tile(np.eye(3), (len(self._places), 1, 1))
+        for view in self._views(np.unique(rows[self._places[rows] < 0])):
+            every[view.rows] = view.turns
+        turned: FloatArray = every[rows] @ B
+        return turned
+
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
         self._finish()
         places, slots = self._places[rows], self._slots[rows]
-        columns = self._all_columns(places[places >= 0])
+        columns = self.chart.of_landmarks(places[places >= 0])
         self.P = np.delete(np.delete(self.P, columns, axis=0), columns, axis=1)
         self._postponed.remove(columns)
         self._outside.remove(slots[slots >= 0])
@@ -259,7 +303,9 @@ class CompressedCovariance(JointCovariance):
         is_active = self._places[rows] >= 0
         others = np.flatnonzero(~is_active)
         others = others[np.argsort(self._slots[rows[others]])]
-        local = np.append(np.arange(self.first), self._all_columns(self._places[rows[is_active]]))
+        local = np.append(
+            np.arange(self.first), self.chart.of_landmarks(self._places[rows[is_active]])
+        )
         postponed, outside, views = self._postponed, self._outside, self._views(rows[others])
         Phi, b = postponed.Phi[local], postponed.Phi.shape[1]
         X = np.concatenate([np.empty((0, b)), *(view.X.reshape(-1, b) for view in views)])
@@ -271,7 +317,7 @@ class CompressedCovariance(JointCovariance):
         P = sheared(P, len(local), self._all_turning(references))
         order = np.argsort(np.append(np.flatnonzero(is_active), others))
         joint = copy(self._form)
-        columns = np.append(np.arange(self.first), self._all_columns(order))
+        columns = np.append(np.arange(self.first), self.chart.of_landmarks(order))
         joint._matrix = SymmetricMatrix(P[np.ix_(columns, columns)])
         return joint
 
@@ -297,12 +343,12 @@ class CompressedCovariance(JointCovariance):
         """Make landmarks active, and no others."""
         released = self.active[~np.isin(self.active, rows)]
         if len(released):
-            self._begin_anew(released)
+            self._restart(released)
         self._take_in(rows[self._places[rows] < 0])
 
     def _apply(self) -> None:
         """Do what is postponed; refer to present estimates."""
-        self._begin_anew(self.active[:0])
+        self._restart(self.active[:0])
         self._finish()
 
     def _work(self) -> None:
@@ -325,7 +371,7 @@ class CompressedCovariance(JointCovariance):
         moved = self._moved(number, rows, are_out)
         self._observer.a[rows[are_out]] += moved.shifts[are_out]
         if self.orientations is not None:
-            self.orientations.turn(moved.turns[are_out], rows[are_out])
+            self.orientations.turn(rows[are_out], moved.turns[are_out])
         self._outside.make(number, moved)
         self._changed += 1
 
@@ -378,7 +424,7 @@ class CompressedCovariance(JointCovariance):
         rows, are_out = self._in_panel(number)
         panel, each = self._outside.panels[number], X.reshape(len(rows), self._stride, -1)
         turns = self._postponed.turns(each[:, self._axes.point :], panel.turned, self._axes)
-        self.orientations.turn(turns[are_out], rows[are_out])
+        self.orientations.turn(rows[are_out], turns[are_out])
         panel.turned = len(self._postponed.gains or [])
 
     def _forget_gains(self) -> None:
@@ -398,15 +444,15 @@ class CompressedCovariance(JointCovariance):
             shifts[:, :k] = self._postponed.shifted(off[:, :k], X[:, :k]) - off[:, :k]
         return shifts
 
-    def _begin_anew(self, released: IntArray) -> None:
-        """Let x begin anew, without landmarks (m,), and all else be changed little by little."""
+    def _restart(self, released: IntArray) -> None:
+        """Let x start again, without landmarks (m,), and all else be changed little by little."""
         self._finish()
         outside, P, p, angles = self._outside, self.P, self._p, self._p - self._axes.point
         all_slots = self._slots.copy()
         new = released[all_slots[released] < 0]
         all_slots[new] = outside.new_slots(len(new))
         released = released[np.argsort(all_slots[released])]
-        columns = self._all_columns(self._places[released])
+        columns = self.chart.of_landmarks(self._places[released])
         points = self._observer.points[released]
         # η = ξ − T ε with x and with each other.
         T = self._all_turning(points)
@@ -449,7 +495,7 @@ class CompressedCovariance(JointCovariance):
         X = np.concatenate([view.X for view in views]).reshape(len(rows) * self._stride, -1)
         self._observer.a[rows] += np.concatenate([view.shifts for view in views])
         if self.orientations is not None:
-            self.orientations.turn(np.concatenate([view.turns for view in views]), rows)
+            self.orientations.turn(rows, np.concatenate([view.turns for view in views]))
         among, XPsi = outside.among(slots, views), X @ postponed.Psi
         # ξ = η + T ε with x and with each other.
         T = self._all_turning(np.concatenate([view.references for view in views]))
@@ -485,11 +531,9 @@ class CompressedCovariance(JointCovariance):
         own = own + turned + transpose(turned) + T @ self.pose @ transpose(T)
         return to_state + T @ self.P[:p, :q], own
 
-    def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
-        super()._insert(rows, C, noise)
-        Phi = self._postponed.Phi
-        q = C.shape[2]
-        Phi[self._columns(rows)] = C.reshape(-1, q) @ Phi[:q]
+    def _set(self, columns: IntArray, C: FloatArray, noise: FloatArray) -> None:
+        super()._set(columns, C, noise)
+        self._postponed.Phi[columns] = C @ self._postponed.Phi[: C.shape[1]]
 
     def _make_room(self, m: int) -> IntArray:
         """Append rows and columns for m landmarks; return which landmarks they are."""
@@ -502,8 +546,10 @@ class CompressedCovariance(JointCovariance):
 
     def _known_blocks(self, covariances: FloatArray) -> FloatArray:
         """Return the covariances (m, …, …) of all that is estimated of known landmarks."""
-        k = self._axes.point
-        return covariances[:, :k, :k]
+        k, blocks = self._axes.point, np.zeros((len(covariances), self._stride, self._stride))
+        blocks[:, :k, :k] = covariances[:, :k, :k]
+        blocks[:, np.arange(k, self._stride), np.arange(k, self._stride)] = self._unknown
+        return blocks
 
     def _nothing_postponed(self) -> PostponedCorrection:
         return PostponedCorrection(self.P, self._axes.point, self.orientations is not None)
@@ -511,10 +557,8 @@ class CompressedCovariance(JointCovariance):
     def _columns(self, rows: IntArray) -> IntArray:
         return super()._columns(self._places[rows])
 
-    def _all_columns(self, places: IntArray) -> IntArray:
-        """Return the columns of landmarks, with those of their orientations."""
-        columns: IntArray = self.first + self._stride * places[:, None] + np.arange(self._stride)
-        return columns.ravel()
+    def _turn_columns(self, rows: IntArray) -> IntArray:
+        return super()._turn_columns(self._places[rows])
 
 
 def _whitened(S: FloatArray, right: FloatArray) -> FloatArray:

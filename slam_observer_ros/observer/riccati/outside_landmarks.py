@@ -22,7 +22,7 @@ from slam_observer_ros.observer.riccati.postponed_correction import PostponedCor
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """What has yet to be done to all landmarks as x began anew: (q,) entries, then fewer."""
+    """What has yet to be done to all landmarks as x started again: (q,) entries, then fewer."""
 
     postponed: PostponedCorrection  # until then
     root: FloatArray  # (q₀, r) of its Ψ
@@ -80,7 +80,7 @@ class View:
 class OutsideLandmarks:
     """B, the covariance of all η, and X = cov(η, x), both as of one instant.
 
-    The variables x of X are those that x had when it last began, (q₀), then the η of landmarks
+    The variables x of X are those that x had when it last started, (q₀), then the η of landmarks
     that have been taken in since.
     """
 
