@@ -158,10 +158,17 @@ class Hypotheses:
 
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
+        matches = [match(hypothesis.state, event) for hypothesis in self._all]
+        if self.best.filter.has_joint_covariance:
+            for hypothesis, matched in zip(self._all, matches, strict=True):
+                hypothesis.slipping.note(hypothesis.state, matched)
+        return self._observe(event, matches)
+
+    def _observe(self, event: ObservationEvent, matches: list[MatchedObservation]) -> Outcome:
+        """Use an observation that all hypotheses are matched with."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
-        matches = [match(hypothesis.state, event) for hypothesis in self._all]
         if len(self._all) == 1 and not unknown:
             if not self.best.filter.has_joint_covariance:
                 return self._observe_alone(event, matches[0])
