@@ -2,7 +2,7 @@
 
 ``python benchmark/one_look.py`` prints, for halls of random reflectors and halls that look the
 same from several places, in how many of 200 looks the place was found, and wrong, and the CPU time
-of one core.
+of one core. ``--needed`` prints how many points it takes (docs/surveyed_reflectors.md).
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ HEIGHT_M = 6.0
 RANGE_M = 30.0
 SEEN_SHARE = 0.7  # of the reflectors in range; others are hidden
 MAPS = 4
+
+SIGMAS_M, FALSE_SHARES, SIZES = (0.02, 0.05, 0.1), (0.0, 0.1, 0.3), (50, 500, 2000)
+MOST_POINTS = 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +114,48 @@ def is_right(place: Place, pose: FloatArray) -> bool:
     return bool(np.linalg.norm(off[:3, 3]) < 0.5 and turn_rad < 0.1)
 
 
-def measure(case: Case, looks: int) -> str:
+def print_needed(looks: int) -> None:
+    """Print how many points it takes in the plane, by noise, false points and size of the map."""
+    sys.stdout.write('| σ | false | ' + ' | '.join(f'{n} mapped' for n in SIZES) + ' |\n')
+    sys.stdout.write('| --- ' * (2 + len(SIZES)) + '|\n')
+    for sigma_m in SIGMAS_M:
+        for share in FALSE_SHARES:
+            cells = [_needed(sigma_m, share, n, looks) for n in SIZES]
+            row = ' | '.join([f'{100 * sigma_m:.0f} cm', f'{share:.0%}', *cells])
+            sys.stdout.write(f'| {row} |\n')
+            sys.stdout.flush()
+
+
+def _needed(sigma_m: float, false_share: float, landmarks: int, looks: int) -> str:
+    """Return the fewest points by which nine of ten looks are enough."""
+    for points in range(4, MOST_POINTS + 1):
+        case = Case('random', points, false_share, PLANAR, landmarks, sigma_m)
+        if measure(case, looks).right >= 0.9 * looks:
+            return str(points)
+    return f'> {MOST_POINTS}'
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What came of some looks."""
+
+    right: int
+    wrong: int
+    times_s: list[float]
+
+
+def row(case: Case, looks: int) -> str:
     """Return the row of a case."""
+    found = measure(case, looks)
+    median_ms, most_ms = 1e3 * float(np.median(found.times_s)), 1e3 * max(found.times_s)
+    return (
+        f'| {case.label} | {found.right / looks:.1%} | {found.wrong} of {looks} | '
+        f'{median_ms:.0f} | {most_ms:.0f} |'
+    )
+
+
+def measure(case: Case, looks: int) -> Figures:
+    """Look around in halls of a case."""
     rng = np.random.default_rng(0)
     maps = []
     for _ in range(MAPS):
@@ -134,24 +177,25 @@ def measure(case: Case, looks: int) -> str:
         if place is not None:
             right += is_right(place, pose)
             wrong += not is_right(place, pose)
-    median_ms, most_ms = 1e3 * float(np.median(times_s)), 1e3 * max(times_s)
-    return (
-        f'| {case.label} | {right / looks:.1%} | {wrong} of {looks} | {median_ms:.0f} | '
-        f'{most_ms:.0f} |'
-    )
+    return Figures(right, wrong, times_s)
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--looks', type=int, default=200, help='in each case')
-    looks = parser.parse_args().looks
+    parser.add_argument('--needed', action='store_true', help='print how many points it takes')
+    args = parser.parse_args()
+    looks = args.looks
+    if args.needed:
+        print_needed(looks)
+        return
     sys.stdout.write(
         '| 2000 reflectors, σ 2 cm | found | wrong | CPU, median, ms | at most, ms |\n'
     )
     sys.stdout.write('| --- | --- | --- | --- | --- |\n')
     for case in CASES:
-        sys.stdout.write(measure(case, looks) + '\n')
+        sys.stdout.write(row(case, looks) + '\n')
         sys.stdout.flush()
 
 

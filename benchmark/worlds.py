@@ -33,6 +33,8 @@ from slam_observer_ros.simulation import Scenario, Simulation
 CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIG_FOLDER = CHECKOUT / 'config'
 VELOCITY_RATE_HZ = 20
+OBSERVED_AFTER_S = 0.017
+"""Time from a velocity to an observation: equal stamps hide what a delay costs."""
 SPEED = 0.5
 DETECTED_SHARE = 0.7
 LANDMARK_SPEED = (0.05, 0.3)
@@ -195,6 +197,7 @@ def graph_settings(turn_rad: float, step_m: float, point_m: float) -> Settings:
         two_d_mode=True,
         angular_velocity_noise=(0.0, 0.0, turn_rad),
         linear_velocity_noise=(step_m, step_m, 0.0),
+        velocity_delay_stddev=0.0,  # steps have no time
         observation_model='cartesian',
         point_noise=point_m,
     )
@@ -238,14 +241,23 @@ def drive(loop: Loop, settings: Settings, seed: int) -> World:
     walks = _walks(loop, settings.two_d_mode, seed) @ course[0][:3, :3]
     points -= loop.lap_s * np.linspace(0.0, 1.0, loop.landmarks)[:, None] * walks
     landmarks = LandmarkTruth(np.arange(loop.landmarks), points)
+    # Truth is at the stamps of velocities and between them, where landmarks are seen.
+    steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:])
+    between = poses[:-1] @ se3.exp(OBSERVED_AFTER_S * VELOCITY_RATE_HZ * steps)
+    between_ns = stamps_ns[:-1] + round(OBSERVED_AFTER_S * 1e9)
+    order = np.argsort(np.append(stamps_ns, between_ns))
+    truth = Trajectory(
+        np.append(stamps_ns, between_ns)[order], np.append(poses, between, axis=0)[order]
+    )
     events: list[Event] = []
-    world = World(settings, events, Trajectory(stamps_ns, poses), landmarks, walks)
-    velocities = _measured_velocities(poses, settings, rng)
-    for k, stamp_ns in enumerate(stamps_ns.tolist()):
-        events.append(VelocityEvent(stamp_ns, velocities[min(k, len(velocities) - 1)]))
+    world = World(settings, events, truth, landmarks, walks)
+    velocities = _measured_velocities(steps, settings, rng)
+    for k, stamp_ns in enumerate(stamps_ns[:-1].tolist()):
+        events.append(VelocityEvent(stamp_ns, velocities[k]))
         if k % (VELOCITY_RATE_HZ // loop.observation_rate_hz) == 0:
-            there = world.landmarks_at(stamp_ns)
-            seen = _look(stamp_ns, poses[k], there, loop, rng)
+            seen_ns = int(between_ns[k])
+            there = world.landmarks_at(seen_ns)
+            seen = _look(seen_ns, between[k], there, loop, rng)
             if len(seen.ids):
                 events.append(_measured(seen, settings, rng))
     return world
@@ -310,11 +322,11 @@ def _walks(loop: Loop, planar: bool, seed: int) -> FloatArray:
 
 
 def _measured_velocities(
-    poses: FloatArray, settings: Settings, rng: np.random.Generator
+    steps: FloatArray, settings: Settings, rng: np.random.Generator
 ) -> FloatArray:
-    """Return the velocities (k − 1, 6) that lead from pose to pose, with white noise."""
+    """Return the velocities of motions (k, 6), each of one period, with white noise."""
     dt_s = 1.0 / VELOCITY_RATE_HZ
-    velocities = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / dt_s
+    velocities = steps / dt_s
     k = len(velocities)
     held = HeldVelocities(
         velocities,

@@ -47,10 +47,19 @@ def observer(given, common):
         package='slam_observer_ros',
         executable='lifecycle_observer_node',
         name='observer_node',
-        parameters=[given['params_file'], parameters(given, HAS_BOND)],
+        # A robot in a known map would, by default, add to it whatever it sees beside.
+        parameters=[
+            *([config('localization.yaml')] if given['map_file'] else []),
+            given['params_file'],
+            parameters(given, HAS_BOND),
+        ],
         remappings=remappings(given),
         **common,
     )
+
+
+def config(name):
+    return PathJoinSubstitution([FindPackageShare('slam_observer_ros'), 'config', name])
 
 
 def map_server(given, common):
@@ -82,9 +91,7 @@ def map_server(given, common):
 
 
 def generate_launch_description():
-    default_parameters = PathJoinSubstitution(
-        [FindPackageShare('slam_observer_ros'), 'config', 'wheeled_robot.yaml']
-    )
+    default_parameters = config('wheeled_robot.yaml')
     return LaunchDescription(
         [
             DeclareLaunchArgument(

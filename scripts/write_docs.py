@@ -51,7 +51,7 @@ INPUTS = {
     'landmarks': "the landmarks seen at one instant in the sensor's frame, with ids or without",
     '/tf': 'sensor poses; `odom_frame` → `base_frame`; fiducials, if asked for',
     '/tf_static': 'sensor poses',
-    'initialpose': "where the robot is in the map, as RViz's *2D Pose Estimate* gives it",
+    'initialpose': "where the robot was at its stamp, as RViz's *2D Pose Estimate* gives it",
     '~/set_pose': 'the same, for programs',
     '~/forget_landmark': 'the id of a landmark to forget',
 }
@@ -81,7 +81,7 @@ OUTPUTS = {
 SERVICES = {
     '~/reset': 'forget the motion and what was mapped, and start again',
     '~/pause': 'hold the pose and drop what comes in',
-    '~/resume': 'end the pause',
+    '~/resume': 'end the pause; the robot is where its odometry on /tf has brought it',
     '~/save_map': 'write the map to the file that the parameter `map_path` names',
     '~/load_map': 'read it from there',
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 import math
 
@@ -13,6 +14,8 @@ UNUSED_POINTS = {
     'unknown_id': 'without id',
     'repeated_id': 'of a repeated id',
     'reserved_id': 'of a reserved id',
+    'unweighed_point': 'more than can be weighed',
+    'impossible_id': 'of an impossible id',
     'unmapped_landmark': 'not mapped',
 }
 """Names under which observed points that are not used are counted, and what they are."""
@@ -22,6 +25,12 @@ MAX_REJECTED = 0.1
 
 MAX_REJECTED_ORIENTATIONS = 0.5
 """Share of the points beyond which they are more than the flips of small or frontal tags."""
+
+NOTABLE_DELAY_S, CERTAIN = 0.1, 3.0
+"""Least delay of velocities that is worth a finding, and by how many of its deviations."""
+
+DELAY_NAME = 'velocity_delay'
+"""Name of the delay of velocities."""
 
 IMPLAUSIBLE = 4.0
 """Stated standard deviations by which no calibration is off: something else is wrong."""
@@ -122,6 +131,20 @@ class CalibrationEstimate:
         if 0.0 < deviation < math.inf:
             digits = min(max(digits, 1 - math.floor(math.log10(deviation))), 9)
         return f'{value:.{digits}f} ± {deviation:.{digits}f} {unit}'.rstrip()
+
+
+def calibration_problems(calibration: Iterable[CalibrationEstimate]) -> list[str]:
+    """Return what there is to say of estimates: a delay first, as scales make up for it."""
+    parts = list(calibration)
+    for part in parts:
+        notable_s = max(NOTABLE_DELAY_S, CERTAIN * part.deviation)
+        if part.name == DELAY_NAME and abs(part.value) > notable_s:
+            when = 'late' if part.value > 0.0 else 'early'
+            return [
+                f'The odometry takes effect {abs(part.value):.2f} s {when}: mind it in the driver '
+                '(Tune the noise).'
+            ]
+    return [part.problem for part in parts if part.problem]
 
 
 @dataclass(frozen=True, slots=True)

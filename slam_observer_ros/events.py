@@ -18,9 +18,13 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.matrices import limited, MAX_DEVIATION
+from slam_observer_ros.geometry.sensor_mounting import Sensed
 
 UNKNOWN_ID = -1
 """Landmark id of a point that its sensor could not identify."""
+
+IMPOSSIBLE_ID = -(2**31)
+"""Landmark id of a point whose message has a number there that can't be one: it is not used."""
 
 MAX_ID = 2**32 - 2
 """Largest landmark id: those that go out are uint32, whose last one says that it is unknown."""
@@ -137,6 +141,9 @@ class ObservationEvent:
     # (m, 3, 3) of each landmark's own axes; all zero where unknown, as of a point
     orientations: FloatArray | None = None
     orientation_covariances: FloatArray | None = None  # (m, 3, 3) of rotation vectors, rad²
+    sensor_frame: str = ''  # of the sensor that saw them; each has a calibration of its own
+    sensor_axis: FloatArray | None = None  # (3,) along which it looks, x by default
+    sensed: Sensed | None = None  # as the sensor showed them, where they have been corrected
 
     def moved(self, pose: FloatArray) -> ObservationEvent:
         """Return it in the frame in which its own has ``pose`` (4, 4)."""
@@ -148,6 +155,7 @@ class ObservationEvent:
             covariances=None if self.covariances is None else _turned(self.covariances, R),
             velocities=None if self.velocities is None else se3.rotate(pose, self.velocities),
             sensor=se3.transform(pose, sensor),
+            sensor_axis=None if self.sensor_axis is None else R @ self.sensor_axis,
             orientations=None if self.orientations is None else R @ self.orientations,
             orientation_covariances=None
             if self.orientation_covariances is None
@@ -161,7 +169,7 @@ class ObservationEvent:
 
     def repeated_ids(self) -> list[int]:
         """Return the ids that more than one of the points has."""
-        ids = [landmark_id for landmark_id in self.ids.tolist() if landmark_id != UNKNOWN_ID]
+        ids = [landmark_id for landmark_id in self.ids.tolist() if landmark_id >= 0]
         if len(set(ids)) == len(ids):  # as nearly always
             return []
         return [landmark_id for landmark_id, count in Counter(ids).items() if count > 1]
@@ -177,6 +185,7 @@ class ObservationEvent:
             covariances=None if self.covariances is None else self.covariances[mask],
             velocities=None if self.velocities is None else self.velocities[mask],
             sensor=None if self.sensor is None else self.sensor[mask],
+            sensed=None if self.sensed is None else self.sensed.select(mask),
             orientations=None if self.orientations is None else self.orientations[mask],
             orientation_covariances=None
             if self.orientation_covariances is None

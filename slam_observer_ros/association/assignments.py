@@ -28,9 +28,10 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
-from slam_observer_ros.geometry.matrices import mahalanobis, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import cholesky, mahalanobis, transpose, with_blocks
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.state.matching import sensitivity
 from slam_observer_ros.state.state import State
 
 MAX_CANDIDATES = 10
@@ -70,7 +71,7 @@ def find_assignments(
     margin = 0.0 if certain.all() else PRUNING_COST
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
     # Of the pairings that put the robot at one pose, the cheapest, which comes first.
-    scale = np.linalg.inv(np.linalg.cholesky(seen.noise[:, : axes.point, : axes.point]))
+    scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
     J = scale @ axes.output_matrix(seen.points)  # how a pose error moves the points, in σ
     assignments: list[Assignment] = []
     moves: list[FloatArray] = []
@@ -93,6 +94,8 @@ class _Points:
         self.noise = state.observer.turned(state.observation_noise.covariances(event))
         # (m,) rows of the landmarks whose ids they have, −1 for none; whether an id is new
         self.known_rows = state.landmarks.rows_of(event.ids)
+        # (m, 3, c) how they change with the calibration
+        self.D = sensitivity(state, event)
         self.is_new_id = (event.ids != UNKNOWN_ID) & (self.known_rows < 0)
 
 
@@ -118,6 +121,9 @@ def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     C = SPATIAL.output_matrix(seen.points)
     of_points = C @ of_pose @ transpose(C) + seen.noise
     spread_m = _spread_m(of_points) + np.max(_spread_m(of_landmarks), initial=0.0)
+    if seen.D is not None:
+        deviations = np.sqrt(state.filter.calibration_variances)
+        spread_m = spread_m + np.linalg.norm(seen.D, axis=1) @ deviations
     reach_m = state.settings.rejection_threshold * spread_m
     return index.near(state.filter.points, seen.points, reach_m)
 
@@ -134,9 +140,8 @@ def _as_residuals(filter_: Filter, seen: _Points, at: IntArray, rows: IntArray) 
     """Return the residuals if the points ``at`` (q,) were of the landmarks ``rows`` (q,)."""
     a = filter_.translations(rows)
     e = seen.points[at] - a
-    return Residuals(
-        rows, e, e - filter_.observer.y_ref[rows], a, seen.noise[at], np.zeros(len(rows))
-    )
+    r, D = e - filter_.observer.y_ref[rows], None if seen.D is None else seen.D[at]
+    return Residuals(rows, e, r, a, seen.noise[at], np.zeros(len(rows)), D)
 
 
 def _largest(vectors: FloatArray) -> float:

@@ -79,6 +79,7 @@ class Contradictions:
             covariances=np.array([other.covariance for other in rejected]),
             velocities=None,
             sensor=None,
+            sensed=None,
         )
         if (rows < 0).any():  # one was forgotten meanwhile
             return False

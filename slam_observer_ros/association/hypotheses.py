@@ -27,6 +27,7 @@ from slam_observer_ros.association.interpretations import (
 )
 from slam_observer_ros.association.joint_compatibility import PRUNING_COST, RESOLUTION
 from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.events import (
     FIRST_AUTOMATIC_ID,
     is_automatic,
@@ -35,8 +36,9 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import mahalanobis, transpose
+from slam_observer_ros.sensor_models.delay_evidence import DelayEvidence
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
-from slam_observer_ros.state.matching import match, MatchedObservation
+from slam_observer_ros.state.matching import corrected, match, MatchedObservation
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, Outcome, step
 
@@ -68,6 +70,7 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._contradictions = Contradictions()
+        self._delay_evidence = DelayEvidence()
 
     @property
     def counts(self) -> Counter[str]:
@@ -86,6 +89,11 @@ class Hypotheses:
     def best(self) -> State:
         """The most likely state."""
         return self._all[0].state
+
+    @property
+    def missed(self) -> float:
+        """Landmarks that should have been among the points without ids seen last, and were not."""
+        return self._all[0].visibility.missed
 
     def prune_to_best(self) -> State:
         """Give up all hypotheses but the most likely one, and return its state."""
@@ -114,7 +122,7 @@ class Hypotheses:
         As :meth:`.State.poses_until` of each hypothesis.
         """
         if not with_covariances:
-            passage = self.best.passage(velocities, start_ns, stamps_ns)
+            passage = self.best.passage(velocities, start_ns, stamps_ns, with_covariances)
             return self.best.observer.reference_pose @ passage.poses, None
         of_each = [one.state.poses_until(velocities, start_ns, stamps_ns) for one in self._all]
         return of_each[0][0], self._mixed(of_each)
@@ -139,7 +147,19 @@ class Hypotheses:
         """Move all hypotheses, which are those of ``start_ns``, on to ``end_ns`` (27)."""
         for hypothesis in self._all:
             state = hypothesis.state
-            state.propagate(state.motion(velocities, start_ns, end_ns))
+            motion = state.motion(velocities, start_ns, end_ns)
+            state.propagate(motion)
+            if motion.at_ends is not None and state is self.best:
+                self._delay_evidence.add(velocities, motion, start_ns, end_ns)
+
+    @property
+    def calibration(self) -> list[CalibrationEstimate]:
+        """Scale, bias and delay of the velocity in the most likely state."""
+        known, initial_s = self.best.filter, self.best.settings.velocity_delay_stddev
+        return [
+            self._delay_evidence.corrected(part, initial_s) if part.name == DELAY_NAME else part
+            for part in known.calibration.estimates(known.calibration_variances)
+        ]
 
     def clear_time(self) -> None:
         """Let all hypotheses go on from where they are at any other time."""
@@ -240,7 +260,8 @@ class Hypotheses:
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
-            for taken in interpretations(state, index, event, matched, new_ids, worst - cost):
+            seen = corrected(state, event)
+            for taken in interpretations(state, index, seen, matched, new_ids, worst - cost):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
                 worst = min(worst, cost + taken.cost + PRUNING_COST)
         possible.sort(key=lambda pair: pair[1].cost)
@@ -273,7 +294,7 @@ def are_one(
     They have if the points, and each landmark that either takes one of them for, have the same
     positions: which was which in this observation does not matter then.
     """
-    if not np.array_equal(event.points, other_event.points):  # one takes some for outliers
+    if not np.array_equal(_shown(event), _shown(other_event)):  # one takes some for outliers
         return False
     # How far the points seen are from each other, and the landmarks they are taken for.
     here, there = state.observer.pose, other.observer.pose
@@ -287,3 +308,8 @@ def are_one(
             shifts.append(state.world_points[rows] - other.world_points[other_rows])
     distances = mahalanobis(np.concatenate(shifts), np.tile(noise, (len(shifts), 1, 1)))
     return len(distances) > 0 and bool(np.max(distances) <= RESOLUTION)
+
+
+def _shown(event: ObservationEvent) -> FloatArray:
+    """Return the points (m, 3) as the sensor showed them, whatever a hypothesis makes of that."""
+    return event.points if event.sensed is None else event.sensed.arms

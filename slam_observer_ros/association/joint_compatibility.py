@@ -25,7 +25,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis, transpose
+from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis, transpose
 
 MAX_PARTIAL = 16
 """Pairings of the points so far, the cheapest, that are extended by the next point.
@@ -152,7 +152,7 @@ class JointSearch:
         own = k * options[:, None] + np.arange(k)
         W = L[:, None] @ S[columns[:, None, :, None], own[:, None, :]]  # (b, o, q k, k)
         left = S[own[:, :, None], own[:, None, :]] - transpose(W) @ W
-        corners = np.linalg.inv(np.linalg.cholesky(left))
+        corners = np.linalg.inv(cholesky(left))
         ahead = r[options] - (z[:, None, None] @ W)[:, :, 0]
         tails = (corners @ ahead[..., None])[..., 0]
         # By how much the cost rises with each option, and without any.
@@ -182,7 +182,7 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
     """
     order = np.argsort(mahalanobis(r, diagonal_blocks(S, r.shape[1])), kind='stable')
     columns = columns_of(order.tolist(), r.shape[1])
-    L = np.linalg.cholesky(S[np.ix_(columns, columns)])
+    L = cholesky(S[np.ix_(columns, columns)])
     z = np.linalg.solve(L, r[order].ravel()).reshape(r.shape)
     log_det = 2.0 * np.log(np.diagonal(L)).sum() - np.linalg.slogdet(noise)[1].sum()
     return float(huber_loss(np.sqrt((z * z).sum(axis=1))).sum() + log_det)

@@ -10,7 +10,7 @@ from slam_observer_ros.association.joint_compatibility import huber_loss
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
-from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.geometry.matrices import solve_symmetric, transpose
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.state.matching import MatchedObservation
@@ -108,5 +108,5 @@ def _likeliest_pose(
         strayed = se3.log(se3.inverse(A) @ found)[axes.pose]
         H = np.diag(1.0 / variances) + np.sum(CW @ C, axis=0)
         gradient = strayed / variances + np.sum(CW @ left, axis=0)[:, 0]
-        found = found @ se3.exp(-axes.full_pose(np.linalg.solve(H, gradient)))
+        found = found @ se3.exp(-axes.full_pose(solve_symmetric(H, gradient)))
     return found

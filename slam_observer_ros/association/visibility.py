@@ -33,6 +33,8 @@ class Visibility:
         # without an id that were numbered up to here.
         self._evidence = 0.0
         self._newest_number = 0
+        self.missed = 0.0  # confirmed landmarks that should have been seen last, and were not
+        self._in_view, self._seen = 1, 1  # confirmed landmarks so far
 
     def note(self, state: State, event: ObservationEvent, some_have_ids: bool) -> float:
         """Count which landmarks were in view of an observation, already used, and which were seen.
@@ -54,12 +56,22 @@ class Visibility:
         # Those without an id of their own: what it costs to have missed them, and their counts.
         rows = np.flatnonzero(is_numbered & in_view)
         cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
+        self.missed = self._missed(in_view & ~landmarks.tentative, seen)
         landmarks.note_in_view(rows, seen[rows])
         self._field_of_view.include(event.points)
         # Those that were seen too seldom.
         unsupported = landmarks.unsupported(state.settings.min_support)
         state.forget(unsupported, 'unsupported_landmark')
         return cost
+
+    def _missed(self, in_view: BoolArray, seen: BoolArray) -> float:
+        """Return how many landmarks (n,) in view should have been seen, and were not."""
+        if not self._field_of_view.is_known:
+            return 0.0
+        share = self._seen / self._in_view
+        self._in_view += int(np.count_nonzero(in_view))
+        self._seen += int(np.count_nonzero(in_view & seen))
+        return share * int(np.count_nonzero(in_view & ~seen))
 
     def _cost(self, landmarks: LandmarkTable, unseen: IntArray) -> float:
         """Return what it costs that confirmed landmarks (u,) in view were not seen once more.

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+import logging
 from pathlib import Path
+import re
 
 from slam_observer_ros.cli.console import print_columns, print_json
-from slam_observer_ros.cli.figures import FIGURES
+from slam_observer_ros.cli.figures import (
+    ACCURACY_ROWS,
+    FIGURES,
+    number_text,
+    TRAJECTORY_ROWS,
+)
 from slam_observer_ros.cli.options import add_settings_options
 from slam_observer_ros.cli.outputs import add_force_option, check_outputs
 from slam_observer_ros.cli.replay.asked import (
@@ -19,17 +26,26 @@ from slam_observer_ros.cli.replay.asked import (
     without_outputs,
 )
 from slam_observer_ros.cli.replay.run import replayed, select_inputs
-from slam_observer_ros.cli.replay.summary import as_json
+from slam_observer_ros.cli.replay.summary import as_json, NEARLY_ALL
 from slam_observer_ros.common.errors import EvaluationError, UsageError
 from slam_observer_ros.evaluation.metrics import trajectory_errors
 from slam_observer_ros.evaluation.plots.drawing import SUFFIXES
 from slam_observer_ros.evaluation.plots.overlay_plot import plot_overlay
+from slam_observer_ros.evaluation.relative_errors import trajectory_figures
 from slam_observer_ros.evaluation.trajectory import read_tum, Trajectory
 from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.settings.input_settings import InputSettings
 
+_ROWS = list(TRAJECTORY_ROWS)
+NAMES = (*_ROWS[:2], *FIGURES[:2], *_ROWS[2:], 'drift_length_m', *FIGURES[2:])
+"""Figures of each, in the order of the table."""
+
 TUM_SUFFIXES = ('.tum', '.txt')
+
+_NAMES = {'nis': 'NIS', 'seconds': 'CPU time [s]'}
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +94,7 @@ def run(args: argparse.Namespace) -> None:
     compared = {what: _compared(args, what, asked[what], truth) for what in args.what}
     if args.plot is not None:
         plot_overlay(args.plot, *_in_one_frame(compared, truth))
+    _warn_of_parts(compared)
     _print(args, compared)
 
 
@@ -107,7 +124,11 @@ def _compared(
         options = without_outputs(args, args.recording)
         options.tum = Path(what)  # nothing is written there; all poses are kept for it
         outcome, _ = replayed(options, asked)
-        return Compared(outcome.trajectory, as_json(outcome))
+        errors = outcome.accuracy.pose_errors
+        figures = as_json(outcome) | (
+            {} if errors is None or truth is None else trajectory_figures(errors, truth)
+        )
+        return Compared(outcome.trajectory, figures)
     trajectory = read_tum(Path(what))
     if truth is None:
         return Compared(trajectory, {})
@@ -116,7 +137,7 @@ def _compared(
     except EvaluationError as error:
         raise EvaluationError(f'{what}: {error}') from error
     figures = {'ate_rmse_m': errors.ate_rmse_m, 'heading_rmse_rad': errors.heading_rmse_rad}
-    return Compared(trajectory, figures)
+    return Compared(trajectory, figures | trajectory_figures(errors, truth))
 
 
 def _in_one_frame(
@@ -133,19 +154,53 @@ def _in_one_frame(
     return aligned, truth.during(next(iter(aligned.values())))
 
 
-def _print(args: argparse.Namespace, compared: Mapping[str, Compared]) -> None:
-    rows = {
-        what: {name: one.figures.get(name) for name in FIGURES} for what, one in compared.items()
+def _warn_of_parts(compared: Mapping[str, Compared]) -> None:
+    """Say whose figures are of a part of the time only: it may have been the easy one."""
+    shares = {
+        what: share
+        for what, one in compared.items()
+        if isinstance(share := one.figures.get('time_compared'), float)
     }
+    most = max(shares.values(), default=0.0)
+    for what, share in shares.items():
+        if share < NEARLY_ALL * most:
+            logger.warning(
+                '%s covers %.1f %% of the time of the truth, another one %.1f %%: its figures are '
+                'of that part only.',
+                what,
+                100.0 * share,
+                100.0 * most,
+            )
+
+
+def _print(args: argparse.Namespace, compared: Mapping[str, Compared]) -> None:
+    figures = {what: one.figures for what, one in compared.items()}
     if args.json:
+        rows = {what: {name: row.get(name) for name in NAMES} for what, row in figures.items()}
         print_json({'recording': str(args.recording), 'compared': rows})
         return
-    known = [name for name in FIGURES if any(row[name] is not None for row in rows.values())]
-    lines = [[name, *(_text(row[name]) for row in rows.values())] for name in known]
-    print_columns(str(args.recording), ['', *rows], lines)
+    known = [name for name in NAMES if any(row.get(name) is not None for row in figures.values())]
+    length_m = next((row['drift_length_m'] for row in figures.values() if 'drift' in row), None)
+    lines = [
+        [_label(name, length_m), *(_text(name, row.get(name)) for row in figures.values())]
+        for name in known
+        if name != 'drift_length_m'
+    ]
+    print_columns(str(args.recording), ['', *_headings(list(compared))], lines)
 
 
-def _text(value: object) -> str:
-    if value is None:
-        return ''
-    return f'{value:.4g}' if isinstance(value, float) else str(value)
+def _label(key: str, length_m: object) -> str:
+    name, unit = (TRAJECTORY_ROWS | ACCURACY_ROWS).get(key, (_NAMES.get(key, key), ''))
+    over = f' over {length_m:g} m' if key.startswith('drift') else ''
+    of_unit = re.match(r'[^ ,(]+', unit)
+    return f'{name}{over} [{of_unit.group()}]' if of_unit else f'{name}{over}'
+
+
+def _headings(names: Sequence[str]) -> list[str]:
+    """Return names of files without their folders, where these still differ."""
+    short = [Path(name).name for name in names]
+    return [one if short.count(one) == 1 else name for name, one in zip(names, short, strict=True)]
+
+
+def _text(key: str, value: object) -> str:
+    return number_text(key, value) if isinstance(value, (int, float)) else ''

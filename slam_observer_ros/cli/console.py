@@ -15,6 +15,7 @@ from slam_observer_ros.common.digits import json_text
 PROGRAM = 'slam-observer'
 
 _FOREVER_S = 1e9
+_COLUMN_FRAME = 3  # characters of a column's border and padding
 
 _Item = TypeVar('_Item')
 
@@ -157,11 +158,26 @@ def print_table(title: str, rows: Mapping[str, str]) -> None:
     Console(highlight=False, markup=False).print(table_of(title, rows))
 
 
-def print_columns(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a line for each of ``rows`` on standard output, the first of which is its name."""
+def print_columns(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a line for each of ``rows`` on standard output, the first of which is its name.
+
+    Columns that don't fit beside each other follow below, in a table of their own.
+    """
     with leaving_at_once():
+        from rich.cells import cell_len
         from rich.console import Console
 
         from slam_observer_ros.common.tables import columns_of
 
-    Console(highlight=False, markup=False).print(columns_of(title, headings, rows))
+    console = Console(highlight=False, markup=False)
+    columns = list(zip(headings, *rows, strict=True))
+    widths = [max(map(cell_len, column)) + _COLUMN_FRAME for column in columns]
+    tables: list[list[int]] = [[0, 1]]
+    for number in range(2, len(columns)):
+        if sum(widths[n] for n in (*tables[-1], number)) < console.width:
+            tables[-1].append(number)
+        else:
+            tables.append([0, number])
+    for table in tables:
+        headings, *lines = zip(*(columns[number] for number in table), strict=True)
+        console.print(columns_of(title, headings, [line for line in lines if any(line[1:])]))

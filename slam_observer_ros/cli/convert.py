@@ -7,10 +7,21 @@ from pathlib import Path
 
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.outputs import add_force_option, check_outputs, recording_path
+from slam_observer_ros.common.errors import OutputError
+from slam_observer_ros.common.output_files import unfinished_file
 from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
 from slam_observer_ros.recording.datasets.graph import load_graph
 from slam_observer_ros.recording.datasets.mrclam import load_mrclam
 from slam_observer_ros.recording.datasets.starry_night import load_starry_night
+
+GRAPH_PARAMETERS = """\
+# A graph in the plane: the second that a pose takes is only a name for its step.
+/**:
+  ros__parameters:
+    two_d_mode: true
+    velocity_delay_stddev: 0.0  # s; no step is early or late
+"""
+"""What any graph takes to be replayed."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     graph.add_argument(
         '--truth', type=Path, metavar='FILE', help='the same graph with true, or the best, values'
     )
-    graph.set_defaults(run=_run, load=lambda args: load_graph(args.file, args.truth))
+    graph.set_defaults(run=_run_graph, load=lambda args: load_graph(args.file, args.truth))
     for data_set in (starry_night, mrclam, graph):
         data_set.add_argument(
             'output', type=recording_path, metavar='OUT.mcap', help='recording to make'
@@ -48,8 +59,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         add_force_option(data_set)
 
 
+def _run_graph(args: argparse.Namespace) -> None:
+    """Write a graph, and beside it the parameters without which its steps mean something else."""
+    parameters: Path = args.output.with_suffix('.yaml')
+    check_outputs([args.output, parameters], args.force)
+    rows = _written(args)
+    try:
+        with unfinished_file(parameters) as file:
+            file.write(GRAPH_PARAMETERS)
+    except OSError as error:
+        raise OutputError(f"can't write {parameters}: {error.strerror}") from error
+    rows['parameters, but for noise'] = f'--config {parameters}'
+    print_table(str(args.output), rows)
+
+
 def _run(args: argparse.Namespace) -> None:
     check_outputs([args.output], args.force)
+    print_table(str(args.output), _written(args))
+
+
+def _written(args: argparse.Namespace) -> dict[str, str]:
+    """Write a recording; return what there is to say of it."""
     data_set: DataSet = args.load(args)
     write_data_set(data_set, args.output, args.force)
     rows = {
@@ -59,4 +89,4 @@ def _run(args: argparse.Namespace) -> None:
         'true landmarks': str(len(data_set.landmarks.ids)),
     }
     rows |= {f'left out: {reason}': str(count) for reason, count in data_set.left_out.items()}
-    print_table(str(args.output), rows)
+    return rows

@@ -33,7 +33,7 @@ EXIT_OF: dict[type[Exception], int] = {LossError: EXIT_LOSS, IncompleteError: EX
 COMMANDS = {
     'simulate': ('simulate', "run the paper's simulation"),
     'convert': ('convert', 'make a recording of a public data set'),
-    'map': ('map', 'make a map file of a map of another program'),
+    'map': ('map', 'make a map file of a map of another program, or check one'),
     'replay': ('replay.command', 'run a recording through the observer'),
     'tune': ('tune.command', 'find the noise figures that a recording shows'),
     'config': ('config', 'show parameter files, and what can be in them'),

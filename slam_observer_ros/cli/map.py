@@ -1,4 +1,4 @@
-"""``slam-observer map``: maps of other programs."""
+"""``slam-observer map``: maps of other programs, and what a map is worth without ids."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
+from slam_observer_ros.cli import map_check
 from slam_observer_ros.cli.console import print_table
 from slam_observer_ros.cli.outputs import add_force_option, check_outputs
 from slam_observer_ros.known_map.map_file import write_map
@@ -14,17 +15,19 @@ from slam_observer_ros.known_map.map_import import import_map, TAG_AXES
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command, and its description."""
-    parser.description = 'Make map files for map_file and --load-map.'
+    parser.description = 'Make map files for map_file and --load-map, and check them.'
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
     convert = actions.add_parser(
         'convert',
-        help='make one of a CSV table, of TagSLAM or of a bundle of AprilTags',
+        help='make one of a table, of TagSLAM, a bundle of AprilTags or a field of FRC',
         description='CSV: id, x, y and, if known, z and sigma, with or without these names in '
         'the first line, and by name qx, qy, qz, qw, or the yaw in which an upright tag looks, '
         'and orientation_sigma; TagSLAM: the YAML file of bodies, or its output; the tag_bundles '
         'of apriltag_ros for ROS 1: poses in the frame of the bundle.',
     )
-    convert.add_argument('file', type=Path, metavar='FILE', help='.csv, .txt or .yaml')
+    convert.add_argument(
+        'file', type=Path, metavar='FILE', help='.csv, .tsv, .txt, .yaml or .json'
+    )
     convert.add_argument('output', type=Path, metavar='OUT.yaml', help='map file to make')
     convert.add_argument('--frame', default='map', help='frame of the positions (default map)')
     convert.add_argument(
@@ -50,6 +53,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_force_option(convert)
     convert.set_defaults(run=_run)
+    map_check.add_options(
+        actions.add_parser(
+            'check',
+            help='where one look finds a robot by landmarks without ids',
+            description='Looks around from places all over a map, and says where the landmarks in '
+            'view, without ids, say where the robot is.',
+        )
+    )
 
 
 def _deviation(text: str) -> float:

@@ -10,12 +10,13 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.errors import InvalidEventError, MapError, ParameterError
-from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.estimator.event_warnings import EventWarnings
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
     flatten,
+    IMPOSSIBLE_ID,
     is_automatic,
     MAX_ID,
     ObservationEvent,
@@ -29,6 +30,7 @@ from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.map_correlations import check_joint
 from slam_observer_ros.known_map.map_file import MAX_NUMBER
 from slam_observer_ros.settings.estimator_settings import MAX_POSITION_M, Settings
+from slam_observer_ros.state.landmark_table import LandmarkTable
 
 ROTATION_TOLERANCE = 1e-3
 """How far RᵀR of a pose may be from identity: much further than single precision puts it."""
@@ -41,6 +43,12 @@ MAX_MEASURED = 1e6
 
 NEARLY = 1.0 - 1e-9
 """Of a limit: what is below that is below the limit, however it is rounded."""
+
+MAX_WEIGHED = 100
+"""Points of one observation that are weighed against landmarks without ids, at most.
+
+It takes the cube of them, and memory the square: a second and 100 MB by then.
+"""
 
 _INTEGERS = (int, np.int64)
 
@@ -216,7 +224,7 @@ def _check_observation(event: ObservationEvent) -> None:
     if event.ids.shape != (m,):
         raise InvalidEventError('wrong_shape', f'ids {event.ids.shape} for {m} landmark points')
     for landmark_id in event.ids.tolist():
-        if landmark_id < 0 and landmark_id != UNKNOWN_ID:
+        if landmark_id < 0 and landmark_id not in (UNKNOWN_ID, IMPOSSIBLE_ID):
             raise InvalidEventError('negative_id', f'landmark id {landmark_id} is negative')
         if landmark_id > MAX_ID:
             raise InvalidEventError('too_large', f'landmark id {landmark_id} is beyond {MAX_ID}')
@@ -306,6 +314,7 @@ def usable_points(
     event: ObservationEvent,
     settings: Settings,
     needs_ids: bool,
+    landmarks: LandmarkTable,
     counts: Counter[str],
     warnings: EventWarnings,
 ) -> ObservationEvent:
@@ -314,6 +323,10 @@ def usable_points(
     event = flatten(event) if settings.two_d_mode else event
     if event.orientations is not None and settings.use_tag_orientation:
         event = replace(event, orientations=so3.exact(event.orientations))
+    if (impossible := event.ids == IMPOSSIBLE_ID).any():
+        warnings.impossible_ids(int(np.sum(impossible)))
+        counts['impossible_id'] += int(np.sum(impossible))
+        event = event.select(~impossible)
     reserved = is_automatic(event.ids)  # given here, to landmarks without an id
     if np.count_nonzero(reserved):
         warnings.reserved_ids(event.ids[reserved].tolist())
@@ -324,8 +337,26 @@ def usable_points(
         repeated = np.isin(event.ids, repeated_ids)
         counts['repeated_id'] += int(np.sum(repeated))
         event = event.select(~repeated)
-    if needs_ids and (unknown := event.ids == UNKNOWN_ID).any():
+    unknown = event.ids == UNKNOWN_ID
+    if needs_ids and np.count_nonzero(unknown):
         warnings.unknown_ids(settings.gains)
         counts['unknown_id'] += int(np.sum(unknown))
         event = event.select(~unknown)
+    elif not needs_ids and len(event.ids) > MAX_WEIGHED:
+        warnings.many_points(len(event.ids))
+        if unknown.any() or is_automatic(landmarks.ids).any():
+            counts['unweighed_point'] += len(event.ids) - MAX_WEIGHED
+            warnings.unweighed_points(len(event.ids), MAX_WEIGHED)
+            event = event.select(_first_weighed(event, unknown))
     return event
+
+
+def _first_weighed(event: ObservationEvent, unknown: BoolArray) -> BoolArray:
+    """Return which points (m,) are weighed, where not all can be: with ids first, and the nearest.
+
+    The nearest are measured best, and are the same in the next observation.
+    """
+    order = np.lexsort((np.linalg.norm(event.lines_of_sight, axis=1), unknown))
+    weighed = np.zeros(len(order), dtype=np.bool_)
+    weighed[order[:MAX_WEIGHED]] = True
+    return weighed

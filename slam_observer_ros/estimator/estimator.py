@@ -35,7 +35,7 @@ from slam_observer_ros.events import (
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
-from slam_observer_ros.known_map.localiser import Localiser
+from slam_observer_ros.known_map.localiser import is_rough, Localiser
 from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -45,6 +45,9 @@ from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import Outcome
 
 logger = logging.getLogger(__name__)
+
+DIVERGED_M = 1e9
+"""Distance from the start, metres, that no estimate has."""
 
 GIVEN_POSE_STD = np.repeat([0.26, 0.5], 3)
 """Standard deviation of a pose in a map that is given without any, rad and m; RViz's."""
@@ -173,16 +176,29 @@ class Estimator:
         else:  # in a map that does not grow there is nothing to carry into another one
             self._start(None)
 
-    def set_pose(self, pose: FloatArray, covariance: FloatArray | None = None) -> None:
-        """Move the robot to ``pose`` (4, 4), body to world, as of ``stamp_ns``; the map stays.
+    def set_pose(
+        self,
+        pose: FloatArray,
+        covariance: FloatArray | None = None,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Move the robot to ``pose`` (4, 4), body to world; the map stays.
 
-        If the pose in a loaded map was unknown, it is known now. ``covariance`` (6, 6) is as in
-        :attr:`pose_covariance`; default exact. Raise :exc:`ParameterError` if one of them can't be
-        right; nothing is changed then.
+        It is where it was at ``stamp_ns``, nanoseconds, by default :attr:`stamp_ns`: the motion
+        since is added if it is known (:meth:`knows_motion_since`). If the pose in a loaded map was
+        unknown, it is known now. ``covariance`` (6, 6) is as in :attr:`pose_covariance`; default
+        exact. Raise :exc:`ParameterError` if one of them can't be right; nothing is changed then.
         """
         pose = rigid(pose, covariance)
         self._timeline.catch_up()
+        if stamp_ns is not None and self.knows_motion_since(stamp_ns):
+            known = np.zeros((6, 6)) if covariance is None else covariance
+            pose, covariance = self._timeline.moved_on(pose, known, stamp_ns)
         self._move_robot(pose, covariance)
+
+    def knows_motion_since(self, stamp_ns: int) -> bool:
+        """Return whether velocities are known from a stamp on, nanoseconds: of seconds at most."""
+        return self._timeline.knows_motion_since(stamp_ns)
 
     def change_settings(self, settings: Settings) -> None:
         """Use other values of the settings that may change while running, from now on.
@@ -269,11 +285,12 @@ class Estimator:
         Events used (``'velocity'``, ``'observation'``), late ones among them
         (``'late_velocity'``, ``'late_observation'``), points (``'observed_point'``), observations
         made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
-        (``'lost'``), the robot not where odometry had it (``'slip'``) or nothing in view where the
-        map has it (``'unexpected_place'``), landmarks (``'rejected_landmark'``,
-        ``'moved_landmark'``, ``'forgotten_landmark'``, ``'unmapped_landmark'``,
-        ``'unsupported_landmark'``) and points not used (``'unknown_id'``, ``'repeated_id'``,
-        ``'reserved_id'``).
+        (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
+        had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
+        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
+        ``'unmapped_landmark'``, ``'unsupported_landmark'``) and points not used
+        (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
+        ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
 
@@ -281,6 +298,21 @@ class Estimator:
     def is_localised(self) -> bool:
         """Whether the estimate is in its final frame, that of a map if one was loaded."""
         return self._localiser.is_localised
+
+    @property
+    def localisation_problem(self) -> str:
+        """Why the pose in a loaded map is not known; empty if it is."""
+        return self._localiser.problem(self._state.observer.A)
+
+    @property
+    def possible_poses(self) -> FloatArray:
+        """(q, 4, 4) where in a loaded map the robot may be, by points without ids, likely first.
+
+        As of the last search; empty where none fits, and where the pose is known.
+        """
+        places = [] if self.is_localised else self._localiser.places
+        poses = [place.transform @ self._state.observer.A for place in places]
+        return np.array(poses).reshape(-1, 4, 4)
 
     @property
     def landmark_map(self) -> LandmarkMap:
@@ -419,8 +451,7 @@ class Estimator:
     @property
     def calibration(self) -> list[CalibrationEstimate]:
         """Scale, bias and delay of the velocity, those that the settings ask for."""
-        known = self._state.filter
-        return known.calibration.estimates(known.calibration_variances)
+        return self._hypotheses.calibration
 
     @property
     def lyapunov(self) -> float:
@@ -490,11 +521,16 @@ class Estimator:
             self._warnings.late_velocity()
 
     def _process_observation(self, event: ObservationEvent) -> None:
-        needs_ids = not self._state.filter.has_joint_covariance
-        usable = usable_points(event, self.settings, needs_ids, self._counts, self._warnings)
+        state, warnings = self._state, self._warnings
+        needs_ids = not state.filter.has_joint_covariance
+        usable = usable_points(
+            event, self.settings, needs_ids, state.landmarks, self._counts, warnings
+        )
         event = self._timeline.synchronise(usable)
+        if self._localiser.loaded is not None:
+            self._doubt_rough_pose(event)
         outcome = self._hypotheses.observe(event)
-        self._localise(outcome)
+        self._localise(event, outcome)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
         self._warn_of(event, outcome)
@@ -502,16 +538,39 @@ class Estimator:
         if self._on_update is not None:
             self._on_update(self.last_update)
 
-    def _localise(self, outcome: Outcome) -> None:
+    def _doubt_rough_pose(self, event: ObservationEvent) -> None:
+        """Search about a given pose that is too rough for the points of an observation."""
+        if not self._localiser.may_be_rough(event):
+            return
+        pose, covariance = self.pose, self.pose_covariance
+        if covariance is not None and is_rough(covariance):
+            self._start(None)
+            self._localiser.search_near(pose, covariance)
+
+    def _localise(self, event: ObservationEvent, outcome: Outcome) -> None:
         """Look for the pose in a loaded map if it is not known, or not any more."""
         if self._localiser.loaded is None:
             return
-        reason = self._localiser.reason_to_reset(self._state, outcome)
+        missed = self._hypotheses.missed
+        reason = self._localiser.reason_to_reset(self._state, event, outcome, missed)
         if reason is not None:
             logger.warning('%s; localising again.', reason)
             self._start(None)
         if self._localiser.search(self._state):
             self._hypotheses.prune_to_best()
+        elif (found := self._localiser.pose_by_tag(self._state)) is not None:
+            self._start(found.pose, found.covariance)
+            self._localiser.try_tag(found.tag_id)
+
+    def _start_again(self, distance_m: float) -> None:
+        """Start again where settings or measurements have led the estimate out of all bounds."""
+        logger.error(
+            'The estimate has diverged: the pose is %.1e m from its origin. Starting again; the '
+            'noise of velocities and landmarks may be set orders of magnitude wrong.',
+            distance_m,
+        )
+        self._counts['diverged'] += 1
+        self._start(None)
 
     def _move_robot(self, pose: FloatArray, covariance: FloatArray | None) -> None:
         """Move the robot; if the pose in a loaded map was not known, it is now."""
@@ -524,8 +583,10 @@ class Estimator:
 
     def _start_where_settings_say(self) -> None:
         settings = self.settings
-        pose = se3.from_rpy((*settings.initial_position, 0.0, 0.0, settings.initial_yaw))
-        self._start(pose, np.diag(GIVEN_POSE_STD**2))
+        turn = settings.initial_roll, settings.initial_pitch, settings.initial_yaw
+        deviations = settings.initial_angle_stddev, settings.initial_position_stddev
+        pose = se3.from_rpy((*settings.initial_position, *turn))
+        self._start(pose, np.diag(np.repeat(deviations, 3) ** 2))
 
     def _start(self, pose: FloatArray | None, covariance: FloatArray | None = None) -> None:
         """Start again with an empty map, or the loaded one, at ``pose`` (4, 4) if it is known."""
@@ -574,6 +635,9 @@ class Estimator:
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
         warnings.large_map(len(state.landmarks), limit, is_dense)
+        distance_m = np.abs(state.observer.A[:3, 3]).max()
+        if not distance_m <= DIVERGED_M:  # nor is what is no number
+            self._start_again(distance_m)
 
     def _update(self, stamp_ns: int, outcome: Outcome) -> Update:
         observer = self._state.observer

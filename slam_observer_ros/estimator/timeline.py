@@ -18,9 +18,10 @@ from slam_observer_ros.events import (
 )
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
-from slam_observer_ros.sensor_models.integration import transition
+from slam_observer_ros.sensor_models.integration import transition, transition_covariance
 from slam_observer_ros.sensor_models.velocity_history import VelocityHistory
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
+from slam_observer_ros.state.covariances import of_moved_pose
 from slam_observer_ros.state.late_observation import carried_forward
 from slam_observer_ros.state.state import State
 
@@ -173,6 +174,23 @@ class Timeline:
         self._advance(event.stamp_ns)
         self._in_force_ns = max(self._in_force_ns, event.stamp_ns)
         return event
+
+    def knows_motion_since(self, stamp_ns: int) -> bool:
+        """Return whether velocities are known from a stamp on."""
+        begins_ns = self.velocities.begins_ns
+        return begins_ns is not None and begins_ns <= stamp_ns
+
+    def moved_on(
+        self, pose: FloatArray, covariance: FloatArray, stamp_ns: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return how a pose (4, 4) of a stamp, with its covariance (6, 6), is at ``stamp_ns``."""
+        end_ns, best = max(self.stamp_ns or 0, stamp_ns), self._hypotheses.best
+        motion = self.motion(stamp_ns, end_ns)
+        calibration = best.filter.calibration
+        noise = transition_covariance(
+            self.velocities, calibration, best.motion_noise, stamp_ns, end_ns
+        )
+        return pose @ motion, of_moved_pose(covariance, pose, motion, noise)
 
     def motion(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return how the body moves (4, 4) between two stamps, backwards if need be."""

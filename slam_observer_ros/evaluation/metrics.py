@@ -9,7 +9,12 @@ import numpy as np
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_s
-from slam_observer_ros.evaluation.trajectory import associate, MAX_GAP_NS, Trajectory
+from slam_observer_ros.evaluation.trajectory import (
+    associate,
+    is_sparse,
+    MAX_GAP_NS,
+    Trajectory,
+)
 from slam_observer_ros.evaluation.truth import LandmarkTruth
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.alignment import rigid_alignment
@@ -40,9 +45,22 @@ class TrajectoryErrors:
     errors: FloatArray
 
     @property
+    def covered_share(self) -> float:
+        """Share of the estimate that the truth covers; of a sparse one, from its first pose on."""
+        if not is_sparse(self.truth):
+            return float(self.covered.mean())
+        first, last = np.flatnonzero(self.covered)[[0, -1]].tolist()
+        return float((last - first + 1) / len(self.covered))
+
+    @property
     def ate_rmse_m(self) -> float:
         """Absolute trajectory error: RMSE of the position, metres."""
         return root_mean_square(self.errors[:, 3:])
+
+    @property
+    def distances_m(self) -> FloatArray:
+        """(k,) distances from the truth, metres."""
+        return np.asarray(np.linalg.norm(self.errors[:, 3:], axis=1))
 
     @property
     def unaligned_rmse_m(self) -> float:
@@ -78,7 +96,8 @@ def trajectory_errors(estimate: Trajectory, truth: Trajectory) -> TrajectoryErro
     if len(paired) < MIN_POSES:
         raise EvaluationError(
             f'{len(paired)} of its {len(estimate)} poses are at times that the truth covers, '
-            f'where true poses are no more than {to_s(MAX_GAP_NS)} s apart; it takes {MIN_POSES}'
+            f'where one of the two has poses no more than {to_s(MAX_GAP_NS)} s apart; '
+            f'it takes {MIN_POSES}'
         )
     alignment = rigid_alignment(paired.positions, true_paired.positions)
     aligned = paired.moved(alignment)

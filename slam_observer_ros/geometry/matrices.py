@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from scipy.linalg.lapack import dgesv, dposv
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
+
+_TINY = np.finfo(np.float64).tiny
 
 LARGE = 500
 """Equations whose solution takes longer than NumPy's overhead."""
@@ -56,13 +60,46 @@ def solve(S: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(solution, dtype=np.float64)
 
 
+def solve_symmetric(S: FloatArray, right: FloatArray) -> FloatArray:
+    """Return S⁻¹ b (…, q, k) or (q,), of S (…, q, q) that is positive but for rounding."""
+    try:
+        return np.asarray(np.linalg.solve(S, right), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.solve(definite(S), right), dtype=np.float64)
+
+
 def solve_definite(S: FloatArray, right: FloatArray) -> FloatArray:
     """Return S⁻¹ b for a symmetric, positive definite S (q, q) and b (q, …)."""
     if right.size and len(S) <= VERY_LARGE:
         _, solution, is_indefinite = dposv(S, right)
         if not is_indefinite:
             return np.asarray(solution, dtype=np.float64)
-    return solve(S, right)  # what rounding has made indefinite, too
+    try:
+        return solve(S, right)  # what rounding has made indefinite, too
+    except np.linalg.LinAlgError:
+        return solve(definite(S), right)
+
+
+def cholesky(S: FloatArray) -> FloatArray:
+    """Return L (…, q, q) with L Lᵀ = S, or :func:`definite` in its place."""
+    try:
+        return np.asarray(np.linalg.cholesky(S), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.cholesky(definite(S)), dtype=np.float64)
+
+
+def definite(S: FloatArray) -> FloatArray:
+    """Return S (…, q, q), which rounding has made indefinite, plus no more than it takes.
+
+    Where some variances are 10¹⁶ times as large as others, of the small ones nothing is left.
+    """
+    entries = np.abs(S).max(axis=(-2, -1), keepdims=True, initial=_TINY)
+    unit = S.shape[-1] * entries * np.eye(S.shape[-1])
+    for share in 10.0 ** np.arange(-16, 0):
+        with suppress(np.linalg.LinAlgError):
+            np.linalg.cholesky(S + share * unit)
+            return np.asarray(S + share * unit)
+    return np.asarray(S + 2.0 * unit)  # whatever is in S
 
 
 def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
@@ -71,7 +108,10 @@ def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
     That is (I − K C) P (I − K C)ᵀ + K R Kᵀ multiplied out, with S = C P Cᵀ + R: P stays positive
     but for rounding.
     """
-    K: FloatArray = solve(S, CP).T
+    try:
+        K: FloatArray = solve(S, CP).T
+    except np.linalg.LinAlgError:
+        K = solve(definite(S), CP).T
     half = K @ (0.5 * S @ K.T - CP)
     P += half + half.T
     return K
@@ -79,8 +119,9 @@ def kalman_update(P: FloatArray, CP: FloatArray, S: FloatArray) -> FloatArray:
 
 def mahalanobis(r: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return √(r_iᵀ Σ_i⁻¹ r_i) (m,) of residuals (m, k) with covariances (m, k, k)."""
-    whitened = np.linalg.solve(covariances, r[:, :, None])
-    return np.asarray(np.sqrt(np.einsum('ij,ij->i', r, whitened[:, :, 0])))
+    whitened = solve_symmetric(covariances, r[:, :, None])
+    squared = np.einsum('ij,ij->i', r, whitened[:, :, 0])
+    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))  # < 0 where rounding has made them so
 
 
 def block_diagonal(blocks: FloatArray) -> FloatArray:

@@ -124,7 +124,21 @@ class BaseFrame:
     def _moved(self, event: EventT, frame_id: str) -> EventT:
         if frame_id.lstrip('/') in ('', self.name):
             return event
-        return event.moved(self._transforms.lookup(self.name, frame_id, event.stamp_ns))
+        try:
+            return event.moved(self._transforms.lookup(self.name, frame_id, event.stamp_ns))
+        except TransformError as error:
+            if hint := self._prefix_hint(frame_id):
+                raise TransformError(f'{error}; {hint}') from error
+            raise
+
+    def _prefix_hint(self, frame_id: str) -> str:
+        """Say what may be meant where frames that are not connected have other prefixes."""
+        prefix = frame_id.lstrip('/').rpartition('/')[0]
+        base_prefix, _, base = self.name.rpartition('/')
+        if prefix == base_prefix or self._transforms.newest_ns(self.name, frame_id) is not None:
+            return ''
+        meant = f'{prefix}/{base}' if prefix else base
+        return f"'{frame_id}' has another prefix than base_frame: set that to '{meant}'"
 
     def _tag_pose(self, camera: str, family: str, number: int, stamp_ns: int) -> FloatArray:
         """Return the pose (4, 4) of a tag in the camera's frame, under either of its names."""

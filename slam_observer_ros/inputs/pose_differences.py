@@ -26,10 +26,13 @@ MIN_JUMP = 0.1
 """Rad or m up to which two poses may differ in any time: a stamp may be off."""
 
 SHORT = 0.5
-"""Share of the usual time between two poses below which it is one of their arrival."""
+"""Share of the time that so many poses usually take: in less, they were stamped on arrival."""
 
 RECENT = 50
-"""Poses over which that usual time is taken."""
+"""Poses over which that time is taken."""
+
+PAUSE_NS = 500_000_000
+"""Time without poses that is no interval of bursts, nanoseconds."""
 
 
 class PoseDifferences:
@@ -53,6 +56,7 @@ class PoseDifferences:
         self._used: tuple[int, FloatArray] | None = None
         self._before_pause: tuple[int, FloatArray] | None = None
         self._stamps_ns: deque[int] = deque(maxlen=RECENT)
+        self._skipped = 0  # since the last one that was used
         self._strays = StrayStamps()
 
     def add(self, stamp_ns: int, pose: FloatArray) -> VelocityEvent | None:
@@ -98,11 +102,15 @@ class PoseDifferences:
     def _refuse_stamp(self, stamp_ns: int, duration_ns: int) -> None:
         """Refuse a stamp that is not clearly later than that of the last pose used."""
         stamps_ns = self._stamps_ns
-        stamps_ns.append(max(stamp_ns, stamps_ns[-1]))
-        usual_ns = (stamps_ns[-1] - stamps_ns[0]) / (len(stamps_ns) - 1)
-        if duration_ns > 0 and duration_ns >= SHORT * usual_ns:
+        if stamp_ns > stamps_ns[-1] + PAUSE_NS:
+            stamps_ns.clear()
+        stamps_ns.append(max(stamp_ns, stamps_ns[-1]) if stamps_ns else stamp_ns)
+        usual_ns = (stamps_ns[-1] - stamps_ns[0]) / max(len(stamps_ns) - 1, 1)
+        if duration_ns > 0 and duration_ns >= SHORT * (self._skipped + 1) * usual_ns:
+            self._skipped = 0
             self._strays.clear()
             return
+        self._skipped += 1
         raise InvalidEventError(
             SKIPPED,
             f'its stamp is {to_s(duration_ns):.4f} s after that of the last pose used, where '

@@ -67,11 +67,13 @@ class _Search:
         self.found: list[Place] = []
         self.looks_left, self.places_left = MAX_LOOKS, MAX_PLACES
         self.sides = _Sides(known, seen)
-        known.reach(self.sides.longest_m)
+        self._is_within_reach = known.reach(self.sides.longest_m) >= self.sides.longest_m
 
     def run(self) -> bool:
         """Find the places; return whether none is missing that could matter."""
         m, k = len(self.seen), self.known.axes.point
+        if not self._is_within_reach:
+            return False
         for matches in range(m, k, -1):
             if not self._could_matter(matches):
                 return True

@@ -54,6 +54,11 @@ class MappedLandmarks:
             self._sort_pairs()
         return self.reach_m
 
+    def within_reach(self, points: FloatArray) -> IntArray:
+        """Return which points (m, 3) are so near the first one that all pairs are in reach."""
+        from_first_m = np.linalg.norm(points - points[0], axis=1)
+        return np.flatnonzero(from_first_m <= 0.4 * self.reach(2.5 * float(from_first_m.max())))
+
     def pairs(self, distance_m: float, tolerance_m: float) -> IntArray:
         """Return landmarks (h, 2) that are about so far from each other, in either order."""
         limits = [distance_m - tolerance_m, distance_m + tolerance_m]

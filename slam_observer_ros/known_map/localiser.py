@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 import logging
+import math
 
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.known_map.finder import Finder
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.merging import enter_map, start_in_map
+from slam_observer_ros.known_map.places import Place
+from slam_observer_ros.known_map.tag_pose import pose_by_tag, TagPose
+from slam_observer_ros.known_map.unexplained import Unexplained
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import Outcome
 
@@ -23,6 +29,16 @@ with many of them that takes long, and a single further observation seldom decid
 CONFIRMING_VOTES = 10
 """Observations that confirm a pose that was given."""
 
+LEAST_SHARE = 0.01
+"""Probability from which a place is named to a person."""
+
+MAX_NAMED = 3
+
+ROUGH_STD = np.repeat([0.5, 1.0], 3)
+"""Standard deviations of a given pose, rad and m, beyond which points can't be matched by where
+they are: the map is then searched as if the pose was not known at all.
+"""
+
 
 class Localiser:
     """Follows whether the estimate is in the frame of a map that was loaded."""
@@ -33,6 +49,12 @@ class Localiser:
         self.counts: Counter[str] = Counter()  # 'not_localised' observations, poses 'lost'
         self._trial: PoseTrial | None = None
         self._comparisons = Comparisons()
+        self._finder: Finder | None = None
+        self._rough: tuple[FloatArray, FloatArray] | None = None
+        self._unexplained = Unexplained()
+        self._said_problem = False
+        self._tag: int | None = None  # which the pose was taken from that is on trial
+        self._refused: set[int] = set()  # tags whose poses were wrong
 
     def load(self, landmark_map: LandmarkMap, two_d_mode: bool) -> None:
         """Take a map instead of one loaded before; the pose in it is yet to be found."""
@@ -42,18 +64,16 @@ class Localiser:
                 'The map was made with two_d_mode, which is off: in space its heights of zero are '
                 'taken for exact (use two_d_mode: true for a robot on a floor).'
             )
-        self.is_localised = False
-        self._trial = None
-        self._comparisons = Comparisons()
+        self._refused = set()
+        self._search_again()
 
     def start(self, state: State, pose_is_given: bool, covariance: FloatArray | None) -> None:
         """Take a state at its start, in the loaded map if its pose there is given.
 
         ``covariance`` (6, 6) is that of the given pose; None for an exact one.
         """
-        self._comparisons = Comparisons()
+        self._search_again()
         self.is_localised = self.loaded is None or pose_is_given
-        self._trial = None
         if self.loaded is not None and pose_is_given:
             start_in_map(state, self.loaded, covariance)
             self._trial = PoseTrial(self.loaded)
@@ -62,15 +82,42 @@ class Localiser:
         """Put a pose that was given on trial."""
         self._trial = None if self.loaded is None else PoseTrial(self.loaded)
 
-    def reason_to_reset(self, state: State, outcome: Outcome) -> str | None:
-        """Return why the pose in the map must be wrong after an observation, or None."""
+    def _search_again(self) -> None:
+        """Take the pose in the map for unknown, and forget what was seen."""
+        self.is_localised = False
+        self._trial = self._finder = self._rough = self._tag = None
+        self._said_problem = False
+        self._comparisons, self._unexplained = Comparisons(), Unexplained()
+
+    def may_be_rough(self, event: ObservationEvent) -> bool:
+        """Return whether points without ids are to be matched by a pose just given."""
+        is_untried = self._trial is not None and self._trial.is_untried
+        return is_untried and bool((event.ids == UNKNOWN_ID).any())
+
+    def search_near(self, pose: FloatArray, covariance: FloatArray) -> None:
+        """Search about a pose (4, 4) of the state at its start, with a covariance (6, 6)."""
+        self._rough = pose, covariance
+        logger.info('The pose that was given is rough: searching the map about it.')
+
+    def reason_to_reset(
+        self, state: State, event: ObservationEvent, outcome: Outcome, missed: float
+    ) -> str | None:
+        """Return why the pose in the map must be wrong after an observation, or None.
+
+        ``missed`` landmarks should have been among its points without ids, and were not.
+        """
         if self.loaded is None:
             return None
         reason = None
         if self._trial is not None and self._trial.vote(outcome, state.settings.max_rejections):
             reason = 'Most landmarks contradict the pose that was given'
+            if self._tag is not None:
+                reason = f'Most landmarks contradict the pose that tag {self._tag} gave'
+                self._refused.add(self._tag)
         elif self.is_localised and is_lost(state):
             reason = 'All landmarks are far from where they should be'
+        elif self.is_localised and self._unexplained.is_too_much(state, event, missed):
+            reason = 'Most of what is seen is not in the map'
         self.counts['lost'] += reason is not None
         return reason
 
@@ -81,8 +128,63 @@ class Localiser:
         shared = int(np.sum(state.landmarks.rows_of(self.loaded.ids) >= 0))
         if self._comparisons.is_due(shared):
             self.enter(state)
+        if not self.is_localised:
+            self._find(state)
         self.counts['not_localised'] += not self.is_localised
         return self.is_localised
+
+    def pose_by_tag(self, state: State) -> TagPose | None:
+        """Return the pose in the map by a single tag, where it is not known; None if none is."""
+        if self.loaded is None or self.is_localised:
+            return None
+        return pose_by_tag(state, self.loaded, self._refused)
+
+    def try_tag(self, tag_id: int) -> None:
+        """Note that the pose on trial was given by a tag."""
+        self._tag = tag_id
+        logger.info('Found the pose in the map by tag %d.', tag_id)
+
+    @property
+    def places(self) -> list[Place]:
+        """Where in the map the robot's own frame may be, the most likely place first."""
+        finder = self._finder
+        return [] if finder is None or finder.places is None else finder.places.all
+
+    def problem(self, A: FloatArray) -> str:
+        """Return why the pose in the map is not known, by Â (4, 4); empty if it is."""
+        if self.is_localised:
+            return ''
+        places = [place for place in self.places if place.share > LEAST_SHARE]
+        if not places:
+            return 'what was seen fits no place in the map yet: drive on, or give the pose'
+        fits = ' and '.join(_name(place.transform @ A) for place in places[:MAX_NAMED])
+        if len(places) > MAX_NAMED:
+            fits += f' and {len(places) - MAX_NAMED} more'
+        elif len(places) == 1:
+            fits += f', right with a probability of {places[0].share:.2f}'
+        number = f'{len(places)} places' if len(places) > 1 else 'one place'
+        return f'what was seen fits {number} in the map, {fits}: drive on, or give the pose'
+
+    def _find(self, state: State) -> None:
+        """Find the pose by landmarks without ids."""
+        if self.loaded is None or state.filter.joint is None:
+            return
+        if self._finder is None:
+            self._finder = Finder(self.loaded, state, self._rough)
+        found, places = self._finder.find(state), self._finder.places
+        if found is not None and places is not None and enter_map(state, self.loaded, found):
+            self.is_localised = True
+            logger.info(
+                'Found the pose in the map by %d of %d landmarks (wrong with a probability of '
+                '%.0e).',
+                len(found[0]),
+                len(places.all[0].rows),
+                places.error_probability,
+            )
+        elif not self._said_problem and len([p for p in self.places if p.share > LEAST_SHARE]) > 1:
+            self._said_problem = True
+            problem = self.problem(state.observer.A)
+            logger.warning('%s%s.', problem[0].upper(), problem[1:])
 
     def enter(self, state: State) -> bool:
         """Move an estimate into the frame of the loaded map, if the landmarks suffice."""
@@ -102,6 +204,11 @@ def is_lost(state: State) -> bool:
     moved = np.sum(state.landmarks.rejections >= often)
     needed = state.axes.point
     return bool(not state.is_mapping and state.rejected_in_a_row >= often and moved >= needed)
+
+
+def is_rough(covariance: FloatArray) -> bool:
+    """Return whether points without ids can't be matched by a pose with a covariance (6, 6)."""
+    return bool((np.diagonal(covariance) > ROUGH_STD**2).any())
 
 
 class Comparisons:
@@ -131,6 +238,11 @@ class PoseTrial:
         self._ids = known.ids
         self._for = self._against = 0
 
+    @property
+    def is_untried(self) -> bool:
+        """Whether no observation has voted yet."""
+        return self._for == self._against == 0
+
     def vote(self, outcome: Outcome, often: int) -> bool:
         """Count the vote of an observation; return whether ``often`` ones say it is wrong."""
         if self._for >= CONFIRMING_VOTES and self._for > self._against:
@@ -140,3 +252,9 @@ class PoseTrial:
         self._for += int(accepted > 0 and accepted >= rejected)
         self._against += int(rejected > accepted)
         return self._against >= often and self._against > self._for
+
+
+def _name(pose: FloatArray) -> str:
+    """Return a pose (4, 4) in words."""
+    x, y = pose[:2, 3]
+    return f'({x:.1f} m, {y:.1f} m, {math.atan2(pose[1, 0], pose[0, 0]):.2f} rad)'

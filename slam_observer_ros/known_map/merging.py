@@ -43,27 +43,33 @@ def start_in_map(state: State, known: LandmarkMap, pose_covariance: FloatArray |
     _complete(state, known, known)
 
 
-def enter_map(state: State, known: LandmarkMap) -> bool:
+def enter_map(
+    state: State, known: LandmarkMap, pairs: tuple[IntArray, IntArray] | None = None
+) -> bool:
     """Move an estimate into the frame of a map, if enough of its landmarks have been seen.
 
-    Return whether it is in that frame now. Landmarks that both have are merged. Those that
+    ``pairs`` are landmarks (q,) of the estimate, and which of the map's (q,) they are; by default
+    those with the same ids. Return whether it is in that frame now. These are merged. Those that
     contradict the others are taken as the map has them, and those that only the estimate has are
     kept where mapping goes on.
     """
     # The transform, by the landmarks that both have.
-    rows = state.landmarks.rows_of(known.ids)
-    shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
-    found = _find_frame(state, rows[shared], known.select(shared))
+    rows, shared = _with_same_ids(state, known) if pairs is None else pairs
+    found = _find_frame(state, rows, known.select(shared))
     if found is None:
         return False
     state.observer.reference_pose, agree = found
+    named = np.flatnonzero(
+        np.isin(state.landmarks.ids, known.ids) & ~is_automatic(state.landmarks.ids)
+    )
+    wrong = np.setdiff1d(np.append(rows, named), rows[agree])
+    _renumber(state, known, rows[agree], known.ids[shared[agree]])
     # Landmarks that agree are merged, others removed, as are all that the map does not have where
     # it does not grow, …
     if state.settings.localization_mode == 'off':
-        state.remove(rows[shared[~agree]])
+        state.remove(wrong)
     else:
-        state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[shared[agree]]))
-    _renumber(state, known)
+        state.remove(np.setdiff1d(np.arange(len(state.landmarks)), rows[agree]))
     # … and those that only the map has are added.
     _merge(state, known)
     return True
@@ -148,12 +154,24 @@ def _counts(known: LandmarkMap, state: State) -> IntArray:
     return np.asarray(np.maximum(known.counts, state.settings.confirmations))
 
 
-def _renumber(state: State, known: LandmarkMap) -> None:
-    """Give landmarks new numbers where the map's have the same, though no sensor gave these."""
+def _with_same_ids(state: State, known: LandmarkMap) -> tuple[IntArray, IntArray]:
+    """Return landmarks of an estimate, and which of a map's have the same ids of a sensor."""
+    rows = state.landmarks.rows_of(known.ids)
+    shared = np.flatnonzero((rows >= 0) & ~is_automatic(known.ids))
+    return rows[shared], shared
+
+
+def _renumber(state: State, known: LandmarkMap, rows: IntArray, known_ids: IntArray) -> None:
+    """Give ``rows`` the ids that a map has for them.
+
+    Others get new numbers where the map's have the same, though no sensor gave these.
+    """
     ids = state.landmarks.ids
     own = np.flatnonzero(is_automatic(ids) & np.isin(ids, known.ids))
     taken = np.append(ids[is_automatic(ids)], known.ids[is_automatic(known.ids)])
     state.landmarks.renumber(own, np.max(taken, initial=0) + 1 + np.arange(len(own)))
+    state.landmarks.renumber(rows, known_ids)
+    state.landmarks.tentative[rows] = False
 
 
 def _complete(state: State, known: LandmarkMap, added: LandmarkMap) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
-from slam_observer_ros.events import MAX_ID, ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.messages.cdr import Buffer, CdrReader
 from slam_observer_ros.messages.cloud_fields import (
     CloudField,
@@ -43,8 +43,8 @@ Records: TypeAlias = NDArray[np.void]
 def decode_point_cloud(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[ObservationEvent]:
     """Decode a sensor_msgs/PointCloud whose ids, if any, are in the channel ``id``.
 
-    They are ``UNKNOWN_ID`` where the channel holds -1 or is missing; a MessageError is raised if
-    they aren't whole numbers that float32 holds exactly.
+    They are ``UNKNOWN_ID`` where the channel holds -1 or is missing, and ``IMPOSSIBLE_ID`` where
+    it holds no whole number that float32 holds exactly; a MessageError is raised if none is one.
     """
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
@@ -199,17 +199,20 @@ def _ids(records: Records) -> IntArray:
             return _ids_from_floats(values.astype(np.float64), limit)
     ids = values.astype(np.int64)
     ids[ids == UNKNOWN_UINT32_ID] = UNKNOWN_ID
-    if np.any(ids < UNKNOWN_ID):
+    possible = ids >= UNKNOWN_ID
+    if ids.size and not possible.any():
         raise MessageError(f'negative landmark id {ids.min()}; only -1 is allowed, for unknown')
-    return ids
+    return np.where(possible, ids, IMPOSSIBLE_ID)
 
 
 def _ids_from_floats(values: FloatArray, limit: int) -> IntArray:
     # The comparison is written so that NaN fails it too.
     exact = (values >= UNKNOWN_ID) & (values < limit) & (values == np.floor(values))
-    if not exact.all():
+    if exact.all():
+        return values.astype(np.int64)
+    if not exact.any():  # it is no single mistake, but another quantity
         raise MessageError(
             f'landmark id {values[~exact][0]:.10g} in a float channel is not a whole number '
             f'from -1 to {limit - 1}'
         )
-    return values.astype(np.int64)
+    return np.where(exact, np.where(exact, values, 0.0).astype(np.int64), IMPOSSIBLE_ID)

@@ -103,12 +103,12 @@ def decode_twist_with_covariance_stamped(
 
 def decode_odometry_twist(raw: Buffer, _receive_stamp_ns: int = 0) -> Measurement[VelocityEvent]:
     """Decode the twist of a nav_msgs/Odometry, which is in its child frame."""
-    return _read_odometry(raw)[1]
+    return decode_odometry(raw)[1]
 
 
 def decode_odometry_pose(raw: Buffer, _receive_stamp_ns: int = 0) -> PoseMessage:
     """Decode the pose of a nav_msgs/Odometry."""
-    return _checked(_read_odometry(raw)[0])
+    return _checked(decode_odometry(raw)[0])
 
 
 def decode_pose_stamped(raw: Buffer) -> PoseMessage:
@@ -189,7 +189,8 @@ def _read_pose(reader: CdrReader) -> tuple[FloatArray, FloatArray]:
     return values[:3], values[3:]
 
 
-def _read_odometry(raw: Buffer) -> tuple[PoseMessage, Measurement[VelocityEvent]]:
+def decode_odometry(raw: Buffer) -> tuple[PoseMessage, Measurement[VelocityEvent]]:
+    """Decode pose, which may be none (``problem``), and twist of a nav_msgs/Odometry."""
     reader = CdrReader(raw)
     stamp_ns, frame_id = reader.header()
     child_frame_id = reader.string()

@@ -22,6 +22,7 @@ from slam_observer_ros.nodes.intake.chosen_inputs import open_inputs
 from slam_observer_ros.nodes.intake.estimator_feed import EstimatorFeed
 from slam_observer_ros.nodes.intake.input_topic import InputTopic
 from slam_observer_ros.nodes.intake.transform_listener import open_transforms
+from slam_observer_ros.nodes.intake.transformed_odometry import TransformedOdometry
 from slam_observer_ros.nodes.publishing.diagnostics import DiagnosticsPublisher
 from slam_observer_ros.nodes.publishing.estimate_publisher import EstimatePublisher, TOPICS
 from slam_observer_ros.nodes.publishing.localisation_status import LocalisationStatus, NoiseFit
@@ -31,6 +32,7 @@ from slam_observer_ros.nodes.services.initial_pose import InitialPoseListener
 from slam_observer_ros.nodes.services.kept_pose import KeptPose
 from slam_observer_ros.nodes.services.map_services import MapServices
 from slam_observer_ros.nodes.services.named_map_services import NamedMapServices
+from slam_observer_ros.nodes.throttled_log import ThrottledLog
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -58,6 +60,7 @@ class ObserverCore:
     def __init__(self, node: GuardedNode) -> None:
         self._node = node
         self._entities = Entities(node)
+        self._log = ThrottledLog(node)
         settings = read_settings(node, ObserverNodeSettings).with_checked_frames()
         estimator_settings = read_settings(node, Settings)
         noise = NoiseFit()
@@ -92,12 +95,15 @@ class ObserverCore:
             hardware_id=settings.base_frame if namespace == '/' else namespace,
         )
         # What others may do to the estimate
-        self._maps = MapServices(node, settings, self._estimator, self._publisher.reset)
+        odometry = TransformedOdometry(settings, self._transforms)
+        controls = ControlServices(node, self._estimator, self._feed, self._publisher, odometry)
+        self._maps = MapServices(node, settings, self._estimator, controls.note_move)
         NamedMapServices(node, self._maps)
         self._kept_pose = KeptPose(node, settings, self._estimator)
         self._kept_pose.restore()
-        InitialPoseListener(node, settings.map_frame, self._estimator, self._publisher.reset)
-        ControlServices(node, self._estimator, self._feed, self._publisher)
+        InitialPoseListener(
+            node, settings.map_frame, self._estimator, odometry, controls.note_move
+        )
         node.add_post_set_parameters_callback(self._apply_parameters)
         # The times at which all that happens
         self._timers = self._create_timers(settings.publish_rate)
@@ -168,16 +174,25 @@ class ObserverCore:
         ]
 
     def _check(self) -> None:
-        if not np.isfinite(self._estimator.pose).all():
-            self._node.get_logger().error(
+        if not self._is_finite():
+            self._log.error(
+                'not finite',
                 'the estimate is not finite any more, as after numbers that are far too large: '
-                'starting again'
+                'starting again',
             )
             self._estimator.reset()
             self._publisher.reset()
         for source in self._inputs:
             source.check_publishers()
         self._localisation.publish()
+
+    def _is_finite(self) -> bool:
+        estimator = self._estimator
+        try:
+            known = (estimator.pose, estimator.pose_covariance, estimator.world_points)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return False
+        return all(each is None or bool(np.isfinite(each).all()) for each in known)
 
     def _publish_overview(self) -> None:
         self._publisher.publish_overview()

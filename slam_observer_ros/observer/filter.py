@@ -20,12 +20,16 @@ from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
-from slam_observer_ros.sensor_models.calibration import Calibration
+from slam_observer_ros.sensor_models.calibration import Calibration, without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.settings.estimator_settings import Settings
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 """Settings without effect on other filters; ``gain_k`` is in the Lyapunov value of all."""
+
+
+OF_SENSORS = ('sensor_rotation_stddev', 'sensor_translation_stddev', 'range_scale_stddev')
+"""Settings of what only a joint covariance can estimate."""
 
 
 class Filter:
@@ -43,7 +47,8 @@ class Filter:
         self._settings = settings
         self.axes = axes_of(settings.two_d_mode)  # what of pose and points is estimated
         self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
-        self.calibration = Calibration(settings, self.axes)  # scale, bias, delay of velocities
+        estimated = settings if self.has_joint_covariance else without_sensor_calibration(settings)
+        self.calibration = Calibration(estimated, self.axes)  # of velocities and sensors
 
     # The step (27)-(31)
 
@@ -53,19 +58,25 @@ class Filter:
         self.observer.move_landmarks(motion.duration_s)
 
     def residuals(
-        self, rows: IntArray, points: FloatArray, covariances: FloatArray, dt_s: FloatArray
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        dt_s: FloatArray,
+        D: FloatArray | None = None,
     ) -> Residuals:
         """Return what landmarks ``rows`` (m,) seen at ``points`` (m, 3) say against X̂ (29).
 
         Points and their ``covariances`` (m, 3, 3) are in the body frame, m and m²; ``dt_s`` (m,)
-        is the time since each was last seen.
+        is the time since each was last seen, and D (m, 3, c) how points change with the
+        calibration, reference frame, None where they don't.
         """
         # A filter that postpones moves of landmarks has made them for :meth:`expected_points`.
         observer, joint = self.observer, self.joint
         if joint is not None and not joint.is_dense:
             joint.activate(rows)
         e, r = observer.errors(rows, points)
-        return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s)
+        return Residuals(rows, e, r, observer.a[rows], observer.turned(covariances), dt_s, D)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
@@ -90,9 +101,15 @@ class Filter:
         """Return the standard deviations (m,) of orientations, rad."""
         raise NotImplementedError
 
-    # Landmarks
+    def add_sensor(self, frame: str) -> None:
+        """Let the calibration of the sensor of another frame be part of the state."""
+        self.calibration.add_sensor(frame)
 
-    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+    # Landmarks; D is as of residuals
+
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks seen for the first time at ``points``."""
         self.observer.add_landmarks(points)
 
@@ -100,7 +117,13 @@ class Filter:
         """Append landmarks that a map knows, reference frame; their errors may be correlated."""
         self.observer.add_reference_landmarks(known.points)
 
-    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones, seen for the first time at ``points``."""
         self.observer.relocate_landmarks(rows, points)
 

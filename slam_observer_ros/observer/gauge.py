@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.geometry.matrices import symmetric
+from slam_observer_ros.geometry.matrices import definite, symmetric
 
 JITTER_M2 = 1e-12
 """Added to variances, so that S can be inverted where both sides are exact."""
@@ -46,4 +46,8 @@ def anchor(
 
 
 def _solve(S: FloatArray, right: FloatArray) -> FloatArray:
-    return np.asarray(cho_solve(cho_factor(S), right), dtype=np.float64)
+    try:
+        factor = cho_factor(S)
+    except np.linalg.LinAlgError:
+        factor = cho_factor(definite(S))
+    return np.asarray(cho_solve(factor, right), dtype=np.float64)

@@ -28,6 +28,8 @@ class SeenOrientations:
     flipped: FloatArray  # (m, 3, 3) the other orientation that looks nearly the same
     covariances: FloatArray  # (m, 3, 3) of rotation vectors along the body's axes, rad²
     dt_s: FloatArray  # (m,) seconds since each was seen before, in this run; else infinite
+    # (3, c) how they turn with the calibration, reference frame; None where they don't
+    D: FloatArray | None = None
 
     def select(self, mask: BoolArray) -> SeenOrientations:
         """Return the part of it that ``mask`` (m,) picks."""
@@ -37,6 +39,7 @@ class SeenOrientations:
             self.flipped[mask],
             self.covariances[mask],
             self.dt_s[mask],
+            self.D,
         )
 
 

@@ -20,6 +20,8 @@ class Residuals:
     a: FloatArray  # (m, 3) â_i, metres
     covariances: FloatArray  # (m, 3, 3) of the points seen, m²
     dt_s: FloatArray  # (m,) seconds since each was seen before, in this run; else infinite
+    # (m, 3, c) how points change with the calibration, reference frame; None where they don't
+    D: FloatArray | None = None
 
     @property
     def landmarks(self) -> FloatArray:
@@ -43,4 +45,5 @@ class Residuals:
             a=self.a[mask],
             covariances=self.covariances[mask],
             dt_s=self.dt_s[mask],
+            D=None if self.D is None else self.D[mask],
         )

@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from slam_observer_ros.common.errors import MessageError
+from slam_observer_ros.inputs.odometry_check import OdometryCheck
 from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.message_types import (
@@ -20,6 +21,7 @@ from slam_observer_ros.messages.message_types import (
     POSE_ARRAY,
     TRANSFORMS,
 )
+from slam_observer_ros.messages.poses_and_velocities import decode_odometry
 from slam_observer_ros.recording.decoding import (
     Decode,
     decode_pose,
@@ -32,6 +34,9 @@ from slam_observer_ros.settings.input_settings import InputSettings
 
 MAX_EMPTY_CLOUDS = 1000
 """Most clouds of a topic that are looked at for one with points, which shows the ids."""
+
+MAX_COMPARED = 5000
+"""Most messages of an odometry whose twist is compared with its pose."""
 
 _Decoded = TypeVar('_Decoded')
 
@@ -111,6 +116,17 @@ class Contents:
             return False
         poses = (message.pose for message in self._decoded((topic,), decode_pose))
         return any(not np.array_equal(pose, after) for pose, after in pairwise(poses))
+
+    def twist_problem(self, topic: Topic, uses_turn: bool) -> str:
+        """Return what an odometry's twist is, if it is not that of its poses; else empty."""
+        check = OdometryCheck(uses_turn)
+        if topic.message_type == ODOMETRY:
+            decoded = self._decoded((topic,), lambda raw: decode_odometry(raw.data))
+            for pose, measured in islice(decoded, MAX_COMPARED):
+                check.add(pose, measured.event)
+                if check.is_decided:
+                    break
+        return check.problem
 
     def begins_at_zero(self, topic: Topic, decode: Decode) -> bool:
         """Return whether the stamps are of a simulated clock, of which zero is the first."""

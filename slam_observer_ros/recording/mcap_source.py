@@ -73,11 +73,12 @@ _MAX_NS: Final = 2**63 - 1
 _BARE_SIZE: Final = 1 << 20
 """Bytes of messages outside chunks that are read at once, about as many as a chunk has."""
 
-_CHUNK: Final = re.compile(
-    rb'\x06.{6}\x00\x00.{28}(?:\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)',
+_NEXT: Final = re.compile(
+    rb'\x06.{6}\x00\x00.{28}(?:\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)'
+    rb'|\x05.{4}\x00\x00\x00\x00',
     re.DOTALL,
 )
-"""How a chunk begins: opcode, length, times, size and sum, compression."""
+"""How a chunk begins: opcode, length, times, size and sum, compression; or how a message does."""
 
 _Take: TypeAlias = Callable[[int, bytes], None]
 """Is given the opcode and the content of a record that is no message."""
@@ -191,7 +192,7 @@ class McapSource:
             end = place + _HEADER.size + length
             is_known = 1 <= opcode <= max(Opcode) or opcode >= _PRIVATE
             if not is_known or end > size:
-                after = _next_chunk(data, place + 1)
+                after = _next_whole(data, place + 1, self._channels)
                 self._lose(after - place)
                 place = after
                 continue
@@ -281,16 +282,32 @@ class McapSource:
                     heapq.heappush(waiting, (first_ns, number, messages))
 
 
-def _next_chunk(data: mmap.mmap, place: int) -> int:
-    """Return where the next chunk begins that is whole; the end of the file if there is none."""
-    while (match := _CHUNK.search(data, place)) is not None:
+def _next_whole(data: mmap.mmap, place: int, channels: Collection[int]) -> int:
+    """Return where the next chunk or message begins that is whole; the end if there is none.
+
+    A message, which has no pattern, counts if it is of a known channel, and one follows it.
+    """
+    while (match := _NEXT.search(data, place)) is not None:
         place = match.start()
-        _, length = _HEADER.unpack_from(data, place)
+        opcode, length = _HEADER.unpack_from(data, place)
         end = place + _HEADER.size + length
-        if end <= len(data) and (end == len(data) or 1 <= data[end] <= max(Opcode)):
+        if opcode == Opcode.CHUNK:
+            is_whole = end == len(data) or (end < len(data) and 1 <= data[end] <= max(Opcode))
+        else:
+            is_whole = all(_is_message(data, begin, channels) for begin in (place, end))
+        if is_whole:
             return place
         place += 1
     return len(data)
+
+
+def _is_message(data: mmap.mmap, place: int, channels: Collection[int]) -> bool:
+    if place + _MESSAGE.itemsize > len(data):
+        return False
+    opcode, length = _HEADER.unpack_from(data, place)
+    channel = int.from_bytes(data[place + _HEADER.size : place + _HEADER.size + 2], 'little')
+    fits = _LEAST_LENGTH <= length <= len(data) - place - _HEADER.size
+    return opcode == Opcode.MESSAGE and channel in channels and fits
 
 
 def _end_of_messages(data: mmap.mmap, place: int) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from slam_observer_ros.common.errors import TransformError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.evaluation.truth import LandmarkTruth
-from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
+from slam_observer_ros.events import IMPOSSIBLE_ID, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.inputs.frames import TransformSource
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.pose_blocks import PoseBlock
@@ -126,7 +126,8 @@ def _positions_by_stamp(
         for event in together:
             points = map(tuple, event.points.tolist())
             positions |= zip(event.ids.tolist(), points, strict=True)
-        positions.pop(UNKNOWN_ID, None)
+        for no_id in (UNKNOWN_ID, IMPOSSIBLE_ID):
+            positions.pop(no_id, None)
         yield stamp_ns, positions
 
 

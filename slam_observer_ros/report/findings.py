@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.estimates import MAX_REJECTED
+from slam_observer_ros.estimates import calibration_problems, MAX_REJECTED
 from slam_observer_ros.evaluation.metrics import TrajectoryErrors
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.report.noise_advice import noise_advice
@@ -36,7 +36,8 @@ class Finding:
 def findings(run: ReportedRun) -> list[Finding]:
     """Return what is worth knowing of a run, the most important first."""
     advice = [Finding(text) for text in noise_advice(run)]
-    return [*_growths(run), *_consistency(run), *advice, *_calibration(run)]
+    unused = [Finding(run.nothing_used)] if run.nothing_used else []
+    return [*unused, *_growths(run), *_consistency(run), *advice, *_calibration(run)]
 
 
 def growth_windows(seconds: FloatArray, errors_m: FloatArray) -> list[tuple[int, int]]:
@@ -142,4 +143,4 @@ def _consistency(run: ReportedRun) -> list[Finding]:
 
 
 def _calibration(run: ReportedRun) -> list[Finding]:
-    return [Finding(part.problem) for part in run.calibration if part.problem]
+    return [Finding(problem) for problem in calibration_problems(run.calibration)]

@@ -26,11 +26,12 @@ class ReportedRun:
     """A replay with what was recorded of it, from ``start_ns`` on.
 
     ``trajectory`` is the online one and ``errors`` its errors; ``dead_reckoning`` is that of the
-    velocities alone; ``anees`` is that of the pose. Both
-    are None where there is no truth.
+    velocities alone; ``anees`` is that of the pose. Both are None where there is no truth.
+    ``nothing_used`` says if of velocities or observations none was of use, else it is empty.
     """
 
     title: str
+    nothing_used: str
     figures: Mapping[str, str]
     warnings: Sequence[str]
     settings: Settings

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.estimates import CalibrationEstimate, Update
+from slam_observer_ros.estimates import calibration_problems, CalibrationEstimate, Update
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 OK, WARN = 0, 1
@@ -51,7 +51,7 @@ def estimator_warnings(estimator: Diagnosed) -> list[str]:
     """Return what is wrong with the velocity, by the estimate alone."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
     warnings = ['no velocity in force: the pose is held'] if stale else []
-    return warnings + [part.problem for part in estimator.calibration if part.problem]
+    return warnings + calibration_problems(estimator.calibration)
 
 
 def diagnostics(

@@ -1,31 +1,35 @@
-"""Calibration of the velocity as part of the state: V_true(t) = (1 + s) ∘ V(t − τ) + b, by axis.
+"""Calibration as part of the state: of the velocity, by axis, and of each sensor of landmarks.
 
-The delay τ is how much later than its stamp a velocity shows in what is observed: a command takes
-a while to be obeyed, and an image a while to be stamped.
+V_true(t) = (1 + s) ∘ V(t − τ) + b. The delay τ is how much later than its stamp a velocity shows
+in what is observed: a command takes a while to be obeyed, and an image a while to be stamped. A
+sensor's part, which begins with the first observation from its frame, is in
+:mod:`.sensor_calibration`.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns
-from slam_observer_ros.estimates import CalibrationEstimate
+from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.sensor_models.held_velocities import HeldUntil, HeldVelocities
+from slam_observer_ros.sensor_models.sensor_calibration import SCALE, SensorCalibration
 from slam_observer_ros.settings.estimator_settings import MAX_DELAY_S, Settings
 
 NAMES = (
     *(f'{part}_scale_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
     *(f'{part}_bias_{axis}' for part in ('angular', 'linear') for axis in 'xyz'),
-    'velocity_delay',
+    DELAY_NAME,
 )
 """Names of six scales, six biases and the delay τ."""
 
-DELAY = NAMES.index('velocity_delay')
+DELAY = NAMES.index(DELAY_NAME)
 
 NOMINAL = np.repeat([1.0, 0.0], [6, 7])
 """(13,) what they are where the velocity is right; scales as factors 1 + s."""
@@ -40,14 +44,16 @@ UNITS = ('',) * 6 + ('rad/s',) * 3 + ('m/s',) * 3 + ('s',)
 
 
 class Calibration:
-    """Estimates of those c entries of scale s, bias b and delay τ whose uncertainty is not 0.
+    """Estimates of those c entries whose uncertainty is not 0: of s, b and τ, then of sensors.
 
     ``initial_variances`` (c,) grow by ``drift_covariance`` (c, c) a second, if one ``drifts``;
     ``delay_error_ns`` is the standard deviation of τ at the start, 0 where it is not estimated.
+    ``sensors`` are those seen so far, by their frames; ``corrects_points`` says whether what they
+    show is not taken as it comes.
     """
 
     def __init__(self, settings: Settings, axes: EstimatedAxes) -> None:
-        self.axes = axes
+        self.axes, self._settings = axes, settings
         scale = np.array([*settings.angular_scale_stddev, *settings.linear_scale_stddev])
         bias = np.array([*settings.angular_bias_stddev, *settings.linear_bias_stddev])
         errors = np.concatenate([scale, bias, [settings.velocity_delay_stddev]])
@@ -59,22 +65,65 @@ class Calibration:
         self._all: FloatArray = NOMINAL.copy()
         # τ; where it is negative the latest velocity is held for longer.
         self.delay_ns = 0
-        self.count = len(self._estimated)  # c
+        self.sensors: dict[str, SensorCalibration] = {}
+        stated, deviations = _of_a_sensor(settings)
+        of_sensor = np.append(pose, SCALE)
+        self._of_sensor: IntArray = of_sensor[deviations[of_sensor] > 0.0]
+        self._stated, self._sensor_variances = stated, deviations[self._of_sensor] ** 2
+        self.corrects_points = bool(
+            settings.range_is_depth or stated.any() or len(self._of_sensor)
+        )
+        self.count = self.of_velocity = len(self._estimated)  # c, and how many are no sensor's
         self.delay_error_ns = to_ns(settings.velocity_delay_stddev)
-        self.initial_variances = errors[self._estimated] ** 2
-        self.drift_covariance = np.diag(self.initial_variances * settings.calibration_drift**2)
+        self._set_variances(errors[self._estimated] ** 2)
+
+    def _set_variances(self, variances: FloatArray) -> None:
+        self.initial_variances = variances
+        self.drift_covariance = np.diag(variances * self._settings.calibration_drift**2)
         self.drifts = bool(self.drift_covariance.any())
+
+    def add_sensor(self, frame: str) -> SensorCalibration:
+        """Append what is estimated of the sensor of a new frame."""
+        number, variances = len(self.sensors), self._sensor_variances
+        sensor = SensorCalibration(frame, number, self._stated, self._of_sensor, variances)
+        self.sensors[frame] = sensor
+        self.count += len(sensor.estimated)
+        self._set_variances(np.append(self.initial_variances, sensor.variances))
+        return sensor
 
     @property
     def values(self) -> FloatArray:
-        """(c,) estimates: scale factors 1 + s, then biases b, then the delay τ in seconds."""
+        """(c,) estimates: scale factors 1 + s, biases b, the delay τ in seconds; then sensors'."""
         values: FloatArray = self._all[self._estimated]
-        return values
+        if not self.sensors:
+            return values
+        sensors = self.sensors.values()
+        return np.concatenate([values, *(part.values[part.estimated] for part in sensors)])
+
+    @property
+    def calibrates_sensors(self) -> bool:
+        """Whether some of the c entries are those of sensors."""
+        return self.count > self.of_velocity
+
+    def columns(self, sensor: SensorCalibration) -> slice:
+        """Return which of the c entries are those of a sensor."""
+        before = [other for other in self.sensors.values() if other.number < sensor.number]
+        first = self.of_velocity + sum(len(other.estimated) for other in before)
+        return slice(first, first + len(sensor.estimated))
+
+    def sensor_columns(self) -> tuple[FloatArray, IntArray]:
+        """Return ψ, d and s of all sensors (s, 7), and which of the c entries they are, or −1."""
+        columns = np.full((len(self.sensors), 7), -1)
+        for sensor in self.sensors.values():
+            entries = np.arange(self.count)[self.columns(sensor)]
+            columns[sensor.number, sensor.estimated] = entries
+        values = [sensor.values for sensor in self.sensors.values()]
+        return np.array(values).reshape(-1, 7), columns
 
     def estimates(self, variances: FloatArray) -> list[CalibrationEstimate]:
         """Return the estimates with ``variances`` (c,), what the filter knows of them."""
         stated = np.full(self.count, np.inf) if self.drifts else np.sqrt(self.initial_variances)
-        return [
+        of_velocity = [
             CalibrationEstimate(
                 NAMES[i],
                 float(self._all[i]),
@@ -83,7 +132,14 @@ class Calibration:
                 nominal=float(NOMINAL[i]),
                 stated=float(error),
             )
-            for i, variance, error in zip(self._estimated, variances, stated, strict=True)
+            for i, variance, error in zip(self._estimated, variances, stated, strict=False)
+        ]
+        return of_velocity + [
+            estimate
+            for sensor in self.sensors.values()
+            for estimate in sensor.estimates(
+                variances[self.columns(sensor)], stated[self.columns(sensor)]
+            )
         ]
 
     def apply(self, body_velocities: FloatArray) -> FloatArray:
@@ -100,7 +156,7 @@ class Calibration:
         ``variances`` (c,) are what the filter knows of the estimates.
         """
         of_all = np.zeros(len(NAMES))
-        of_all[self._estimated] = variances
+        of_all[self._estimated] = variances[: self.of_velocity]
         of_velocity = of_all[:6] * body_velocity**2 + of_all[6:DELAY] * _moves(body_velocity)
         scales = self._all[:6]
         return scales[:, None] * covariance * scales + np.diag(of_velocity)
@@ -124,9 +180,9 @@ class Calibration:
         of_rates = Ad.take(self._calibrated, axis=2) * shares[:, None, :]
         F = np.zeros((Ad.shape[1], self.count))
         F[:, : len(self._calibrated)] = of_rates.sum(axis=0)
-        if len(self._calibrated) < self.count and at_ends is not None:
+        if self.delay_error_ns and at_ends is not None:
             first, last = self.apply(at_ends)
-            F[:, -1] = Ad[0].dot(first) - Ad[-1].dot(last)
+            F[:, self.of_velocity - 1] = Ad[0].dot(first) - Ad[-1].dot(last)
         return F
 
     def sensitivity_until(
@@ -147,9 +203,11 @@ class Calibration:
         last = of_rates[counts] + Ad_at_ends[:, :, self._calibrated]
         F = np.zeros((len(counts), Ad.shape[1], self.count))
         F[:, :, :rates] = until + last * self._shares(held.last)
-        if rates < self.count and at_ends is not None:
+        if self.delay_error_ns and at_ends is not None:
             starts, ends = self.apply(at_ends)
-            F[:, :, -1] = starts @ Ad[0].T - (Ad_at_ends @ ends[:, :, None])[:, :, 0]
+            F[:, :, self.of_velocity - 1] = (
+                starts @ Ad[0].T - (Ad_at_ends @ ends[:, :, None])[:, :, 0]
+            )
         return F
 
     def _shares(self, held: HeldVelocities) -> FloatArray:
@@ -170,21 +228,44 @@ class Calibration:
 
     def shift(self, change: FloatArray) -> None:
         """Add ``change`` (c,) to the estimates."""
-        self._all[self._estimated] += change
+        self._all[self._estimated] += change[: self.of_velocity]
+        for sensor in self.sensors.values():
+            sensor.shift(change[self.columns(sensor)])
         self._all[DELAY] = min(max(self._all[DELAY], MIN_DELAY_S), MAX_DELAY_S)
         self.delay_ns = to_ns(float(self._all[DELAY]))
 
 
+def _of_a_sensor(settings: Settings) -> tuple[FloatArray, FloatArray]:
+    """Return ψ, d and s (7,) of a sensor as stated, and their standard deviations (7,)."""
+    deviations = [
+        *settings.sensor_rotation_stddev,
+        *settings.sensor_translation_stddev,
+        settings.range_scale_stddev / settings.range_scale,
+    ]
+    return np.append(np.zeros(6), math.log(settings.range_scale)), np.array(deviations)
+
+
 def without_calibration(settings: Settings) -> Settings:
-    """Return settings that estimate neither scale, bias nor delay of the velocity."""
+    """Return settings that estimate nothing of the calibration, as stated as it may be."""
     zero = (0.0, 0.0, 0.0)
     return replace(
-        settings,
+        without_sensor_calibration(settings),
         angular_scale_stddev=zero,
         linear_scale_stddev=zero,
         angular_bias_stddev=zero,
         linear_bias_stddev=zero,
         velocity_delay_stddev=0.0,
+    )
+
+
+def without_sensor_calibration(settings: Settings) -> Settings:
+    """Return settings that take sensors to be mounted, and to err, just as stated."""
+    zero = (0.0, 0.0, 0.0)
+    return replace(
+        settings,
+        sensor_rotation_stddev=zero,
+        sensor_translation_stddev=zero,
+        range_scale_stddev=0.0,
     )
 
 

@@ -76,17 +76,18 @@ def integrate_until(
     start_ns: int,
     stamps_ns: IntArray,
     at_start: FloatArray | None,
+    with_covariances: bool,
 ) -> Passage:
     """Return how Â, ``A`` (4, 4) at ``start_ns``, moves on to each of s stamps of velocities.
 
-    As :func:`integrate` would have had it at each stamp.
+    As :func:`integrate` would have had it at each stamp, maybe without what covariances take.
     """
     held = velocities.held_until(start_ns, stamps_ns, calibration.delay_ns)
     if calibration.delay_ns < 0:
         held = replace(held, usual_s=held.usual_s + to_s(-calibration.delay_ns))
     path, last = _path(A, held.whole, calibration), held.last
     at_ends = None
-    if reach_ns := calibration.delay_error_ns:
+    if with_covariances and (reach_ns := calibration.delay_error_ns):
         at_ends = np.zeros((2, len(stamps_ns), 6))
         starts_ns = np.full(len(stamps_ns), start_ns)
         for of_each, instants_ns in zip(at_ends, (starts_ns, stamps_ns), strict=True):

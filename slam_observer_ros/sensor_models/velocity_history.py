@@ -164,6 +164,15 @@ class VelocityHistory:
         means: FloatArray = motions / np.where(lengths_s > 0.0, lengths_s, np.inf)
         return means
 
+    def between(self, start_ns: int, end_ns: int) -> tuple[IntArray, FloatArray]:
+        """Return stamps and measured velocities (m, 6) of those in force between two stamps."""
+        rows = slice(
+            max(bisect_right(self._stamps_ns, start_ns) - 1, 1),
+            bisect_right(self._stamps_ns, end_ns),
+        )
+        stamps = np.array(self._stamps_ns[rows], dtype=np.int64)
+        return stamps, self._written().body_velocities[rows]
+
     def _known_at(self, stamps_ns: IntArray, start_ns: int) -> tuple[IntArray, int, IntArray]:
         """Return stamps of velocities, the row of the first, and which was the latest at each.
 
@@ -178,11 +187,16 @@ class VelocityHistory:
     def mean(self, start_ns: int, end_ns: int) -> FloatArray:
         """Return the mean velocity (6,) over an interval, as far as any is known; else zero."""
         pieces = self._pieces(start_ns, end_ns)
-        dt_s = to_s(pieces.stops_ns - pieces.begins_ns)
-        known_s = dt_s.sum()
-        if known_s == 0.0:
+        held_ns = (pieces.stops_ns - pieces.begins_ns).astype(np.float64)
+        known_ns = held_ns.sum()
+        if known_ns == 0.0:
             return np.zeros(6)
-        return self._counting(dt_s @ self._written().body_velocities[pieces.rows] / known_s)
+        return self._counting(held_ns.dot(self._written().body_velocities[pieces.rows]) / known_ns)
+
+    @property
+    def begins_ns(self) -> int | None:
+        """Stamp since which velocities are known, nanoseconds; None while there are none."""
+        return self._stamps_ns[1] if len(self._stamps_ns) > 1 else None
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop velocities that were no longer in force at ``stamp_ns``."""
@@ -195,13 +209,17 @@ class VelocityHistory:
     def _held(self, pieces: _Pieces) -> HeldVelocities:
         rows, begins_ns, stops_ns, ends_ns = pieces
         joined = self._written()
+        before_ns = begins_ns[:, None] - joined.since_ns[rows]
+        dt_s, gap_s, *before_s = to_s(
+            np.array([stops_ns - begins_ns, ends_ns - stops_ns, *before_ns.T])
+        )
         return HeldVelocities(
             body_velocities=self._counting(joined.body_velocities[rows]),
             covariances=joined.covariances[rows],
             is_stated=joined.is_stated[rows],
-            dt_s=to_s(stops_ns - begins_ns),
-            gap_s=to_s(ends_ns - stops_ns),
-            before_s=to_s(begins_ns[:, None] - joined.since_ns[rows]),
+            dt_s=dt_s,
+            gap_s=gap_s,
+            before_s=np.array(before_s).T,
             usual_s=np.array(self._usual_s()),
         )
 

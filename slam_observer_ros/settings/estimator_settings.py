@@ -60,6 +60,7 @@ class Settings(Immutable):
         'most this long',
         unit='s',
         minimum=1e-3,
+        maximum=3600.0,
         read_only=False,
     )
     velocity_timeout: float = parameter(
@@ -121,6 +122,7 @@ class Settings(Immutable):
         'White noise of the angular velocity x y z: standard deviation of the angle after 1 s',
         unit='rad/√s',
         minimum=0.0,
+        maximum=10.0,
         read_only=False,
         basic=True,
     )
@@ -129,6 +131,7 @@ class Settings(Immutable):
         'White noise of the linear velocity x y z: standard deviation of the distance after 1 s',
         unit='m/√s',
         minimum=0.0,
+        maximum=100.0,
         read_only=False,
         basic=True,
     )
@@ -137,12 +140,14 @@ class Settings(Immutable):
         'White noise of the angular velocity x y z in proportion to it, after 1 s',
         unit='√s',
         minimum=0.0,
+        maximum=10.0,
     )
     linear_scale_noise: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'White noise of the linear velocity x y z in proportion to it, after 1 s',
         unit='√s',
         minimum=0.0,
+        maximum=10.0,
     )
     unknown_angular_motion: float = parameter(
         0.5,
@@ -171,6 +176,7 @@ class Settings(Immutable):
         'Range and bearing: standard deviation of the range',
         unit='m',
         minimum=1e-4,
+        maximum=1000.0,
         read_only=False,
         basic=True,
     )
@@ -178,12 +184,14 @@ class Settings(Immutable):
         0.0,
         'Range and bearing: part of the standard deviation of the range in proportion to it',
         minimum=0.0,
+        maximum=10.0,
     )
     bearing_noise: float = parameter(
         0.03,
         'Range and bearing: standard deviation of each angle',
         unit='rad',
         minimum=1e-6,
+        maximum=3.2,
         read_only=False,
         basic=True,
     )
@@ -192,21 +200,29 @@ class Settings(Immutable):
         'Cartesian: standard deviation of each coordinate',
         unit='m',
         minimum=1e-4,
+        maximum=1000.0,
         read_only=False,
         basic=True,
     )
     focal_length: float = parameter(
-        500.0, 'Stereo and fiducial: focal length', unit='px', minimum=1.0
+        500.0, 'Stereo and fiducial: focal length', unit='px', minimum=1.0, maximum=1e5
     )
     tag_size: float = parameter(
-        0.16, 'Fiducial: edge of the square whose corners are detected', unit='m', minimum=1e-3
+        0.16,
+        'Fiducial: edge of the square whose corners are detected',
+        unit='m',
+        minimum=1e-3,
+        maximum=100.0,
     )
-    stereo_baseline: float = parameter(0.2, 'Stereo: baseline', unit='m', minimum=1e-3)
+    stereo_baseline: float = parameter(
+        0.2, 'Stereo: baseline', unit='m', minimum=1e-3, maximum=1000.0
+    )
     pixel_noise: float = parameter(
         1.0,
         'Stereo: standard deviation across the line of sight; fiducial: of each corner',
         unit='px',
         minimum=1e-6,
+        maximum=1e4,
         read_only=False,
     )
     disparity_noise: float = parameter(
@@ -214,6 +230,7 @@ class Settings(Immutable):
         'Stereo: standard deviation of the disparity',
         unit='px',
         minimum=1e-6,
+        maximum=1e4,
         read_only=False,
     )
     use_tag_orientation: bool = parameter(
@@ -245,12 +262,14 @@ class Settings(Immutable):
         'Scheduled and Riccati gains: scale error of the angular velocity x y z to be estimated: '
         'its standard deviation',
         minimum=0.0,
+        maximum=1.0,
     )
     linear_scale_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
         'Scheduled and Riccati gains: scale error of the linear velocity x y z to be estimated: '
         'its standard deviation',
         minimum=0.0,
+        maximum=1.0,
     )
     angular_bias_stddev: Vector3 = parameter(
         (0.005, 0.005, 0.005),
@@ -259,6 +278,7 @@ class Settings(Immutable):
         'differ by a few thousandths; 0 for none',
         unit='rad/s',
         minimum=0.0,
+        maximum=10.0,
     )
     linear_bias_stddev: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -266,33 +286,73 @@ class Settings(Immutable):
         'standard deviation',
         unit='m/s',
         minimum=0.0,
+        maximum=100.0,
     )
     velocity_delay_stddev: float = parameter(
-        0.0,
+        0.2,
         'Scheduled and Riccati gains: delay from the stamp of a velocity to its effect in '
-        'observations, to be estimated: its standard deviation',
+        'observations, to be estimated: its standard deviation; 0 for none',
         unit='s',
         minimum=0.0,
         maximum=MAX_DELAY_S,
     )
+    sensor_rotation_stddev: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Riccati gains: how far a sensor of landmarks may be turned against what /tf says, about '
+        'the body axes x y z, to be estimated for each sensor frame: its standard deviation',
+        unit='rad',
+        minimum=0.0,
+        maximum=1.0,
+    )
+    sensor_translation_stddev: Vector3 = parameter(
+        (0.0, 0.0, 0.0),
+        'Riccati gains: how far a sensor of landmarks may be from where /tf says, along the body '
+        'axes x y z, to be estimated: its standard deviation',
+        unit='m',
+        minimum=0.0,
+        maximum=10.0,
+    )
+    range_scale: float = parameter(
+        1.0,
+        "What a sensor's ranges are multiplied by, as for tags printed larger than the detector "
+        'knows, or a focal length that is off',
+        minimum=0.1,
+        maximum=10.0,
+    )
+    range_scale_stddev: float = parameter(
+        0.0,
+        'Riccati gains: how far range_scale may be off, to be estimated: its standard deviation; '
+        'without a surveyed map it can hardly be distinguished from the scale of velocities',
+        minimum=0.0,
+        maximum=1.0,
+    )
+    range_is_depth: bool = parameter(
+        False,
+        'Whether the sensor takes for range what is depth along its axis, as cameras do that '
+        "judge distance by apparent size; the axis is x of the sensor's frame, z of an optical "
+        'one',
+    )
     calibration_drift: float = parameter(
         0.0,
-        'Scheduled and Riccati gains: how fast scale, bias and delay of the velocity drift, as a '
-        'share of the standard deviation of each',
+        'Scheduled and Riccati gains: how fast the calibration of velocity and sensors drifts, as '
+        'a share of the standard deviation of each part',
         unit='1/√s',
         minimum=0.0,
+        maximum=10.0,
     )
     landmark_velocity_stddev: float = parameter(
         0.0,
         'Riccati gains: spread of unknown constant landmark velocities to be estimated; 0: static',
         unit='m/s',
         minimum=0.0,
+        maximum=100.0,
     )
     huber_threshold: float = parameter(
         1.345,
         'Scheduled and Riccati gains: standard deviations of noise beyond which an observation '
         'loses weight; 0 for never',
         minimum=0.0,
+        maximum=1e9,
         read_only=False,
     )
     rejection_threshold: float = parameter(
@@ -301,41 +361,48 @@ class Settings(Immutable):
         'observation is rejected',
         unit='σ',
         minimum=1.0,
+        maximum=1e9,
         read_only=False,
     )
     confirmations: int = parameter(
         3,
         'Observations after which a landmark is in the map',
         minimum=1,
+        maximum=1_000_000,
     )
     max_rejections: int = parameter(
         5,
         'Scheduled and Riccati gains: rejections in a row, all at one position, after which a '
         'landmark is taken to have moved; one more than it was seen, if that is fewer',
         minimum=1,
+        maximum=1_000_000,
     )
     max_landmarks: int = parameter(
         2000,
         'Most landmarks kept; a new one then replaces the one seen least often; 0 for any number',
         minimum=0,
+        maximum=1_000_000,
     )
     min_support: int = parameter(
         5,
         'Riccati gains, points without id: how often a landmark must be seen to be in the map; it '
         'is deleted if still not after four times as long in view as a typical one needs',
         minimum=1,
+        maximum=1_000_000,
     )
     max_hypotheses: int = parameter(
         8,
         'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
         'have slipped: most hypotheses that are followed until it is clear which one is right',
         minimum=1,
+        maximum=1000,
     )
     relinearization_interval: int = parameter(
         20,
         'Riccati gains: fewest new observations before relinearising; a tenth of all so far if '
         'that is more, but at most 300; 0 for never',
         minimum=0,
+        maximum=1_000_000_000,
     )
     relinearization_angle: float = parameter(
         0.2,
@@ -343,12 +410,14 @@ class Settings(Immutable):
         'square; after a single one of this size a tenth of the interval is enough',
         unit='rad',
         minimum=0.0,
+        maximum=1e9,
     )
     smoothing_window: int = parameter(
         3000,
         'Riccati gains: most observations that are smoothed together; the next ones go on from '
         'the estimate then; 0 for all together, the default of replay --smooth',
         minimum=0,
+        maximum=1_000_000_000,
     )
     localization_mode: str = parameter(
         'off',
@@ -358,10 +427,18 @@ class Settings(Immutable):
         choices=('off', 'uncertain', 'fixed'),
         basic=True,
     )
+    localization_error_probability: float = parameter(
+        1e-3,
+        'Riccati gains, points without id in a loaded map: how likely the place where they fit '
+        'may be wrong',
+        minimum=1e-9,
+        maximum=0.1,
+    )
     set_initial_pose: bool = parameter(
         False,
         'Whether the robot starts at initial_position and initial_yaw: exactly, or in a loaded '
-        'map within 0.5 m and 0.26 rad, instead of localising there by landmarks',
+        'map within initial_position_stddev and initial_angle_stddev, instead of localising there '
+        'by landmarks',
     )
     initial_position: Vector3 = parameter(
         (0.0, 0.0, 0.0),
@@ -377,9 +454,38 @@ class Settings(Immutable):
         minimum=-6.3,
         maximum=6.3,
     )
+    initial_roll: float = parameter(
+        0.0,
+        'Its roll then, where it does not stand upright',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
+    )
+    initial_pitch: float = parameter(
+        0.0,
+        'Its pitch then',
+        unit='rad',
+        minimum=-6.3,
+        maximum=6.3,
+    )
+    initial_position_stddev: float = parameter(
+        0.5,
+        'In a loaded map: standard deviation of each coordinate of initial_position',
+        unit='m',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    initial_angle_stddev: float = parameter(
+        0.26,
+        'In a loaded map: standard deviation of how the robot is turned, about each axis',
+        unit='rad',
+        minimum=0.0,
+        maximum=3.2,
+    )
     map_noise: float = parameter(
         0.05,
         'Standard deviation of each coordinate of loaded landmarks whose file gives none',
         unit='m',
         minimum=0.0,
+        maximum=1000.0,
     )

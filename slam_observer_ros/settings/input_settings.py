@@ -75,6 +75,8 @@ class InputSettings:
         "Pose of the landmarks' sensor in base_frame, x y z and roll pitch yaw, in place of /tf; "
         'all zeros: from /tf',
         unit='m, rad',
+        minimum=-1e4,
+        maximum=1e4,
     )
     transform_timeout: float = parameter(
         0.5, 'How long a message waits for a transform', unit='s', minimum=0.0, maximum=60.0

@@ -53,6 +53,7 @@ class ObserverNodeSettings(InputSettings):
         'Stamps that are further than this from the time of reception come from another clock',
         unit='s',
         minimum=1e-3,
+        maximum=1e9,
     )
     correct_clock_offset: bool = parameter(
         False, "Whether stamps from another clock are moved to this machine's time"
@@ -79,24 +80,28 @@ class ObserverNodeSettings(InputSettings):
         'warns',
         unit='m',
         minimum=0.0,
+        maximum=1e6,
     )
     position_error: float = parameter(
         2.0,
         'The same, from which on it is an error, and ~/is_localised is false',
         unit='m',
         minimum=0.0,
+        maximum=1e6,
     )
     heading_warn: float = parameter(
         0.2,
         'Standard deviation of the heading from which on /diagnostics warns',
         unit='rad',
         minimum=0.0,
+        maximum=1e6,
     )
     heading_error: float = parameter(
         0.5,
         'The same, from which on it is an error, and ~/is_localised is false',
         unit='rad',
         minimum=0.0,
+        maximum=1e6,
     )
     map_file: str = parameter(
         '',
@@ -116,6 +121,7 @@ class ObserverNodeSettings(InputSettings):
         'Age of that file, by the clock of the system, up to which it is used',
         unit='s',
         minimum=0.0,
+        maximum=1e9,
     )
     autosave_map: bool = parameter(False, 'Whether the map is saved to map_path at the end')
 
@@ -170,6 +176,7 @@ class SimulatorNodeSettings:
         1,
         'Subscribers that twist and landmarks must have before the robot starts',
         minimum=0,
+        maximum=1000,
     )
     truth_frame: str = parameter('world', 'Frame of the true pose and landmarks')
     map_frame: str = parameter(

@@ -1,7 +1,7 @@
 """The smoothed trajectory and map: Gauss–Newton on the group over all that was seen.
 
 The unknowns are a first pose and the S poses at which landmarks were observed, the n landmarks
-and the velocity's calibration c. They are moved by Â_s ← Â_s exp(η_s), p_i ← p_i + dp_i and
+and the calibration c. They are moved by Â_s ← Â_s exp(η_s), p_i ← p_i + dp_i and
 c ← c + dc. Of a landmark with an orientation dp_i ends in its turn, B̂_i ← exp(ω_i) B̂_i.
 Landmarks and calibration together are called the border. The normal equations
 
@@ -22,12 +22,14 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes
+from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.orientations import UNKNOWN_RAD
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.bordered_chain import Equations, Factors, landmark_columns, sum_by
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 from slam_observer_ros.smoothing.observations import normal, Observations
-from slam_observer_ros.smoothing.prior import EXACT_M, Prior
+from slam_observer_ros.smoothing.prior import inverse, Prior
+from slam_observer_ros.smoothing.sensed_points import SensedPoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +51,21 @@ class Smoother:
     ``axes`` are the d of the pose and k of a point that are estimated; of the settings,
     ``huber_threshold`` and ``rejection_threshold`` weigh outliers, and ``calibration_drift`` says
     whether there is one calibration, of the border, or one at each of the chain's poses.
+    ``sensed`` are the points where their sensors are calibrated.
     """
 
     def __init__(
-        self, axes: EstimatedAxes, prior: Prior, keyframes: Keyframes, settings: Settings
+        self,
+        axes: EstimatedAxes,
+        prior: Prior,
+        keyframes: Keyframes,
+        settings: Settings,
+        sensed: SensedPoints | None = None,
     ) -> None:
         self._axes = axes
         self._prior = prior
         self._keyframes = keyframes
-        self._observations = Observations(axes, keyframes, settings)
+        self._observations = Observations(axes, keyframes, settings, sensed)
         # Unknowns of a landmark: its position, then its turn if that is estimated.
         self._unknowns = axes.point + (axes.turn if keyframes.turns is not None else 0)
         drifts, c = settings.calibration_drift > 0.0, len(prior.calibration)
@@ -120,23 +128,39 @@ class Smoother:
         poses, landmarks, n = keyframes.keyframes + 1, keyframes.landmarks, len(solution.points)
         columns = landmark_columns(np.arange(n), c, k)
         corner, border_gradient = np.zeros((b, b)), np.zeros(b)
-        corner[columns[:, :, None], columns[:, None]] = sum_by(landmarks, n, H[:, d:, d:])
-        border_gradient[columns] = sum_by(landmarks, n, gradient[:, d:])
+        end = d + k  # beyond are sensors
+        corner[columns[:, :, None], columns[:, None]] = sum_by(landmarks, n, H[:, d:end, d:end])
+        border_gradient[columns] = sum_by(landmarks, n, gradient[:, d:end])
         equations = Equations(
             diagonal=sum_by(poses, S, H[:, :d, :d]),
             above=np.zeros((S - 1, d, d)),
             shared=np.zeros((S, d, c)),
             poses=poses,
             landmarks=landmarks,
-            seen=H[:, :d, d:],
+            seen=H[:, :d, d:end],
             first=np.zeros((d, b)),
             corner=corner,
             gradient=sum_by(poses, S, gradient[:, :d]),
             border_gradient=border_gradient,
         )
+        if H.shape[1] > end:
+            self._add_sensors(equations, H[:, end:], gradient[:, end:])
         self._add_prior(equations, solution)
         self._add_motions(equations, solution)
         return equations
+
+    def _add_sensors(self, equations: Equations, H: FloatArray, gradient: FloatArray) -> None:
+        """Add what observations say of sensors, the last c_s entries of c: H (M, c_s, q)."""
+        c, k, (S, d) = self._shared, self._unknowns, equations.gradient.shape
+        n = (len(equations.corner) - c) // k
+        sensors, columns = slice(c - H.shape[1], c), landmark_columns(np.arange(n), c, k).ravel()
+        of_landmarks = sum_by(equations.landmarks, n, transpose(H[:, :, d : d + k]))
+        of_landmarks = of_landmarks.reshape(-1, H.shape[1])
+        equations.shared[:, :, sensors] += sum_by(equations.poses, S, transpose(H[:, :, :d]))
+        equations.corner[columns, sensors] += of_landmarks
+        equations.corner[sensors, columns] += of_landmarks.T
+        equations.corner[sensors, sensors] += np.sum(H[:, :, d + k :], axis=0)
+        equations.border_gradient[sensors] += np.sum(gradient, axis=0)
 
     def _add_prior(self, equations: Equations, solution: Solution) -> None:
         information, gradient = self._prior.normal_equations(
@@ -225,9 +249,3 @@ def _link_information(keyframes: Keyframes, drifts: bool) -> FloatArray:
     information[:, :d, :d] = of_motions
     information[:, d:, d:] = inverse(keyframes.drift_covariances)
     return information
-
-
-def inverse(covariances: FloatArray) -> FloatArray:
-    """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
-    jitter = EXACT_M**2 * np.eye(covariances.shape[-1])
-    return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)

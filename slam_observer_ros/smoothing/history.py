@@ -12,6 +12,7 @@ from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import EstimatedAxes
 from slam_observer_ros.geometry.matrices import transpose
+from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.sensor_models.motion import Motion
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
@@ -39,6 +40,7 @@ class Keyframe:
     dt_s: FloatArray  # (m,) seconds since each was seen before; infinite if it was not
     # (m,) how their tags are turned, zero for none; None if that is not estimated
     orientations: SeenOrientations | None = None
+    sensed: Sensed | None = None  # (m,) as the sensor showed them, where it is calibrated
 
 
 def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:
@@ -49,6 +51,12 @@ def _seen_turns(keyframe: Keyframe, axes: EstimatedAxes) -> SeenTurns:
     information = np.linalg.inv(axes.turn_covariances(seen.covariances)).astype(np.float64)
     are_none = np.logical_not(seen.Z.any(axis=(1, 2)))
     return SeenTurns(seen.Z, seen.flipped, information).without(are_none)
+
+
+def _all_sensed(seen: list[Keyframe]) -> Sensed | None:
+    """Return what sensors showed in keyframes, if any of them is calibrated."""
+    sensed = [part.sensed for part in seen if part.sensed is not None]
+    return joined_sensed(sensed) if sensed else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +141,21 @@ class History:
         self._new.append(_Step(start, self._end, *motion, keyframe, self._slip))
         self._start = self._slip = None
         self._motion_noise, self._sensitivity, self._drift = self._at_rest()
+
+    def add_calibration(self, values: FloatArray, variances: FloatArray) -> None:
+        """Append what is estimated of a calibration (c,) from now on; nothing was seen of it."""
+        self._summarised = [part.with_calibration(values) for part in self._summarised]
+        self._latest = self._gathered().with_calibration(values)
+        self._none = self._none.with_calibration(values)
+        self.prior = self.prior.with_calibration(self._axes, values, variances)
+        self.summary = self.summary.with_calibration(self._axes, values, variances)
+        self.calibrations = [np.append(known, values) for known in self.calibrations]
+        self._calibration = np.append(self._calibration, values)
+        # Of the motion since the last keyframe.
+        _, no_effect, no_drift = self._at_rest()
+        c = self._sensitivity.shape[1]
+        no_effect[:, :c], no_drift[:c, :c] = self._sensitivity, self._drift
+        self._sensitivity, self._drift = no_effect, no_drift
 
     def summarise(self, known: Prior) -> None:
         """Let ``known`` stand for all that the keyframes up to now say."""
@@ -225,6 +248,7 @@ class History:
             information=np.linalg.inv(self._covariances(seen)[:, :k, :k]).astype(np.float64),
             shares=1.0 / repetition_factors(dt_s, self._observation_noise.error_time_s),
             turns=self._turns(seen),
+            sensed=_all_sensed(seen),
         )
 
     def _links(self, steps: list[_Step]) -> Links:

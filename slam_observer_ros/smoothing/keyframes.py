@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.geometry.sensor_mounting import joined_sensed, Sensed
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,12 @@ class Links:
             getattr(changed, field.name)[rows] = getattr(others, field.name)
         return changed
 
+    def with_calibration(self, more: int) -> Links:
+        """Return the links with so many more entries of a calibration, of no effect on them."""
+        S, d, _ = self.sensitivities.shape
+        sensitivities = np.concatenate([self.sensitivities, np.zeros((S, d, more))], axis=2)
+        return replace(self, sensitivities=sensitivities)
+
     def only(self, kept: BoolArray) -> Links:
         """Return some of the links (S,)."""
         return Links(self.motions[kept], self.covariances[kept], self.sensitivities[kept])
@@ -64,6 +71,7 @@ class Keyframes:
     # (M,) how much of it counts: less than 1 where its error is partly that of a point before
     shares: FloatArray
     turns: SeenTurns | None = None  # where orientations of landmarks are estimated
+    sensed: Sensed | None = None  # (M,) as the sensors showed them, where these are calibrated
 
     def with_slips(self, are_slips: BoolArray | None = None) -> Keyframes:
         """Return the keyframes with some of the slips (s,) in place of the links, or with all."""
@@ -82,6 +90,20 @@ class Keyframes:
             information=self.information[kept],
             shares=self.shares[kept],
             turns=None if self.turns is None else self.turns.only(kept),
+            sensed=None if self.sensed is None else self.sensed.select(kept),
+        )
+
+    def with_calibration(self, values: FloatArray) -> Keyframes:
+        """Return the same with more of a calibration (c,), which was of no effect before."""
+        (S, c), more = self.calibrations.shape, len(values)
+        drifts = np.zeros((S, c + more, c + more))
+        drifts[:, :c, :c] = self.drift_covariances
+        return replace(
+            self,
+            links=self.links.with_calibration(more),
+            slipped=self.slipped.with_calibration(more),
+            calibrations=np.hstack([self.calibrations, np.tile(values, (S, 1))]),
+            drift_covariances=drifts,
         )
 
 
@@ -90,7 +112,7 @@ class Solution:
     """Smoothed estimates."""
 
     poses: FloatArray  # (S + 1, 4, 4) of the prior, then of each keyframe
-    calibrations: FloatArray  # (S + 1, c) of the velocity; all the same unless it drifts
+    calibrations: FloatArray  # (S + 1, c); all the same unless it drifts
     points: FloatArray  # (n, 3) landmarks, metres
     # (n, 3, 3) how they are turned, zero where that is not known; None if it is not estimated
     orientations: FloatArray | None = None
@@ -101,16 +123,18 @@ def joined(parts: list[Keyframes]) -> Keyframes:
     own = [field.name for field in fields(Keyframes) if field.name not in _OF_PARTS]
     together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in own}
     turns = [part.turns for part in parts if part.turns is not None]
+    sensed = [part.sensed for part in parts if part.sensed is not None]
     return replace(
         parts[0],
         **together,
         links=_joined_links([part.links for part in parts]),
         slipped=_joined_links([part.slipped for part in parts]),
         turns=joined_turns(turns) if turns else None,
+        sensed=joined_sensed(sensed) if sensed else None,
     )
 
 
-_OF_PARTS = 'links', 'slipped', 'turns'
+_OF_PARTS = 'links', 'slipped', 'turns', 'sensed'
 
 
 def _joined_links(parts: list[Links]) -> Links:

@@ -2,6 +2,7 @@
 
 Errors are along the axes of the pose from which a landmark was seen: R_Âᵀ (p_i − x_Â) − y of its
 position, and log(R_Âᵀ B̂_i Zᵀ) of its orientation B̂_i, which is moved by B̂_i ← exp(ω_i) B̂_i.
+What a calibrated sensor shows, y and Z, depends on its calibration, too.
 """
 
 from __future__ import annotations
@@ -15,34 +16,49 @@ from slam_observer_ros.geometry.matrices import transpose
 from slam_observer_ros.observer.orientations import flip_verdicts
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.keyframes import Keyframes, SeenTurns, Solution
+from slam_observer_ros.smoothing.sensed_points import SensedPoints
 
 
 class Observations:
-    """M observations of landmarks; ``huber_threshold`` and ``rejection_threshold`` weigh them."""
+    """M observations of landmarks; ``huber_threshold`` and ``rejection_threshold`` weigh them.
 
-    def __init__(self, axes: EstimatedAxes, keyframes: Keyframes, settings: Settings) -> None:
+    ``sensed`` are the points where their sensors are calibrated.
+    """
+
+    def __init__(
+        self,
+        axes: EstimatedAxes,
+        keyframes: Keyframes,
+        settings: Settings,
+        sensed: SensedPoints | None = None,
+    ) -> None:
         self._axes, self._keyframes, self._settings = axes, keyframes, settings
+        self._sensed = sensed
 
     def normal_equations(
         self, solution: Solution, chained: int, gated: bool = True
     ) -> tuple[FloatArray, FloatArray]:
         """Return the equations (M, q, q) and their gradients (M, q), with Huber's weights.
 
-        q unknowns are those of the chain's pose, the last ``chained`` of which no observation
-        depends on, and of the landmark: its position, then its turn if that is estimated. If
-        ``gated``, what a filter would reject at the solution has less weight.
+        q unknowns are those of the chain's pose, the last ``chained`` of which are a calibration,
+        and of the landmark: its position, then its turn if that is estimated; without a chained
+        calibration then those of sensors. If ``gated``, what a filter would reject at the
+        solution has less weight.
         """
         keyframes, k = self._keyframes, self._axes.point
         R, predicted, error = self._of_points(solution)
         J_point = transpose(R)[:, :k, :k]
-        C, unseen = self._axes.output_matrix(predicted), np.zeros((len(error), k, chained))
+        C = self._axes.output_matrix(predicted)
         squared = _squared_distances(error, keyframes.information)
         counted = keyframes.shares * self._weights(squared, gated)
         information = keyframes.information * counted[:, None, None]
+        D = np.empty((len(error), k, 0))
+        if self._sensed is not None:
+            D = self._sensed.sensitivity(self._calibrations(solution), predicted)[:, :k]
         if keyframes.turns is None:
-            return normal(np.concatenate([-C, unseen, J_point], axis=2), information, error)
+            return normal(_joined(-C, chained, J_point, -D), information, error)
         unturned = np.zeros((len(error), k, self._axes.turn))
-        J = np.concatenate([-C, unseen, J_point, unturned], axis=2)
+        J = _joined(-C, chained, np.concatenate([J_point, unturned], axis=2), -D)
         H, gradient = normal(J, information, error)
         # An orientation counts for as little as the point it was seen with.
         counted = keyframes.shares * self._falloff(squared, gated)
@@ -63,7 +79,15 @@ class Observations:
         R = poses[:, :3, :3]
         arms = solution.points[keyframes.landmarks] - poses[:, :3, 3]
         predicted = (transpose(R) @ arms[:, :, None])[:, :, 0]
-        return R, predicted, (predicted - keyframes.points)[:, : self._axes.point]
+        shown = keyframes.points
+        if self._sensed is not None:
+            shown = self._sensed.shown(self._calibrations(solution))
+        return R, predicted, (predicted - shown)[:, : self._axes.point]
+
+    def _calibrations(self, solution: Solution) -> FloatArray:
+        """Return the calibration (M, c) with which each point was seen."""
+        calibrations: FloatArray = solution.calibrations[self._keyframes.keyframes + 1]
+        return calibrations
 
     def _of_turns(
         self,
@@ -83,16 +107,24 @@ class Observations:
             raise TypeError('orientations were seen that are not estimated')
         B = solution.orientations[self._keyframes.landmarks]
         predicted = transpose(R) @ B
-        error = so3.log(predicted @ transpose(turns.Z))
+        Z, flipped, D = turns.Z, turns.flipped, np.empty((len(B), q, 0))
+        if self._sensed is not None:
+            calibrations = self._calibrations(solution)
+            Z, flipped = (self._sensed.turned(calibrations, turned) for turned in (Z, flipped))
+            D = self._sensed.turning(calibrations)
+        error = so3.log(predicted @ transpose(Z))
         J_turn = axes.turn_covariances(so3.left_jacobian_inverse(error))
+        if D.shape[2]:
+            D = (so3.left_jacobian_inverse(-error) @ D)[:, axes.turned]
         error = axes.turns(error)
-        # Derivatives by pose and turn.
-        J = np.zeros((len(error), q, axes.p + chained + axes.point + q))
-        J[:, :, :q] = -J_turn
-        J[:, :, -q:] = J_turn @ axes.turn_covariances(transpose(R))
+        # Derivatives by pose, turn and calibration.
+        by_pose = np.concatenate([-J_turn, np.zeros((len(error), q, axes.p - q))], axis=2)
+        by_turn = np.zeros((len(error), q, axes.point + q))
+        by_turn[:, :, -q:] = J_turn @ axes.turn_covariances(transpose(R))
+        J = _joined(by_pose, chained, by_turn, -D)
         # Of the two that look alike it is the likelier one; then Huber's weights.
-        twin = axes.turns(so3.log(predicted @ transpose(turns.flipped)))
-        apart = axes.turns(so3.log(turns.Z @ transpose(turns.flipped)))
+        twin = axes.turns(so3.log(predicted @ transpose(flipped)))
+        apart = axes.turns(so3.log(Z @ transpose(flipped)))
         squared = _squared_distances(error, turns.information)
         evidence = _squared_distances(twin, turns.information) - squared
         distances = np.sqrt(_squared_distances(apart, turns.information))
@@ -114,6 +146,17 @@ class Observations:
         if huber > 0.0:
             weights = weights * huber / np.sqrt(np.maximum(squared, huber**2))
         return weights
+
+
+def _joined(
+    by_pose: FloatArray, chained: int, by_landmark: FloatArray, by_sensors: FloatArray
+) -> FloatArray:
+    """Return J (M, k, q) by the unknowns of :meth:`Observations.normal_equations`."""
+    M, k, sensors = by_sensors.shape
+    if not chained:
+        return np.concatenate([by_pose, by_landmark, by_sensors], axis=2)
+    unseen = np.zeros((M, k, chained - sensors))
+    return np.concatenate([by_pose, unseen, by_sensors, by_landmark], axis=2)
 
 
 def normal(J: FloatArray, W: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:

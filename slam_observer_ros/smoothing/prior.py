@@ -87,6 +87,19 @@ class Prior:
             ),
         )
 
+    def with_calibration(
+        self, axes: EstimatedAxes, values: FloatArray, variances: FloatArray
+    ) -> Prior:
+        """Return the prior with more of a calibration (c,), independent of all else."""
+        first, more = self._first_point(axes), len(values)
+        at = np.append(np.arange(first), np.arange(first, len(self.covariance)) + more)
+        covariance = np.zeros((len(self.covariance) + more,) * 2)
+        covariance[np.ix_(at, at)] = self.covariance
+        new = np.arange(first, first + more)
+        covariance[new, new] = variances
+        calibration = np.append(self.calibration, values)
+        return replace(self, calibration=calibration, covariance=covariance)
+
     def with_unknown(self, axes: EstimatedAxes, rows: IntArray) -> Prior:
         """Return the prior with landmarks at ``rows`` that may be anywhere."""
         _, columns = self._known(axes, rows)
@@ -204,6 +217,12 @@ class Prior:
         """Return those of landmarks (m,) that were known, and their columns."""
         known, k = rows[rows < len(self.points)], self._unknowns(axes)
         return known, (self._first_point(axes) + k * known[:, None] + np.arange(k)).ravel()
+
+
+def inverse(covariances: FloatArray) -> FloatArray:
+    """Return inverses of covariances (…, d, d), taking what is exact to be known to EXACT_M."""
+    jitter = EXACT_M**2 * np.eye(covariances.shape[-1])
+    return np.asarray(np.linalg.inv(covariances + jitter), dtype=np.float64)
 
 
 def _with_unknown(covariance: FloatArray, columns: IntArray, sigma: float) -> FloatArray:

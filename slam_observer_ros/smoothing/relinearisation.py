@@ -36,8 +36,9 @@ from slam_observer_ros.sensor_models.observation_noise import ObservationNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.smoothing.gauss_newton import Smoother, Step
 from slam_observer_ros.smoothing.history import History, Keyframe
-from slam_observer_ros.smoothing.keyframes import Solution
+from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
 from slam_observer_ros.smoothing.prior import Prior
+from slam_observer_ros.smoothing.sensed_points import SensedPoints
 from slam_observer_ros.smoothing.slips import confirmed_slips
 
 logger = logging.getLogger(__name__)
@@ -70,6 +71,9 @@ ITERATIONS, TOLERANCE = 2, 2e-2
 
 SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE = 50, 1e-6
 """The same for smoothing everything."""
+
+SLIP_TOLERANCE = 1e-4
+"""Change below which a solution will do to judge slips by."""
 
 
 class JointFilter(Protocol):
@@ -153,6 +157,13 @@ class Relinearisation:
         elif self._window_is_full or self._is_due:
             self._sum_up(self._relinearise())
 
+    def add_calibration(self) -> None:
+        """Note what is estimated of the calibration from now on, beside what was so far."""
+        known = len(self.history.calibrations[-1])
+        values, variances = self._calibration.values, self._calibration.initial_variances
+        if len(values) > known:
+            self.history.add_calibration(values[known:], variances[known:])
+
     def relocate(self, rows: IntArray) -> None:
         """Forget all about landmarks (m,) but their latest observation."""
         self.history.relocate(rows)
@@ -182,12 +193,20 @@ class Relinearisation:
             ) from error
 
     def _smoothed(self) -> tuple[Solution, int]:
-        known, keyframes = (self._axes, self.history.prior), self.history.keyframes()
+        prior, keyframes = self.history.prior, self.history.keyframes()
         start, slips = self._solution_from(0), 0
+
+        def solve(links: Keyframes, before: Solution) -> Solution:
+            smoother = self._smoother(prior, links)
+            return smoother.smooth(before, SMOOTHING_ITERATIONS, SLIP_TOLERANCE, gated=False).end
+
+        def motion_errors(links: Keyframes, solution: Solution) -> FloatArray:
+            return self._smoother(prior, links).motion_errors(solution)
+
         if len(keyframes.slips):
-            are_slips, start = confirmed_slips(*known, keyframes, self._settings, start)
+            are_slips, start = confirmed_slips(solve, motion_errors, keyframes, start)
             keyframes, slips = keyframes.with_slips(are_slips), int(np.sum(are_slips))
-        smoother = Smoother(*known, keyframes, self._settings)
+        smoother = self._smoother(prior, keyframes)
         start = self._without_outliers_of_then(smoother, start)
         smoothed = smoother.smooth(start, SMOOTHING_ITERATIONS, SMOOTHING_TOLERANCE)
         return smoothed.end, slips
@@ -260,9 +279,7 @@ class Relinearisation:
         # Smooth them, after the summary of those before, …
         history, first = self.history, self.history.summarised
         try:
-            smoother = Smoother(
-                self._axes, history.summary, history.latest_keyframes(), self._settings
-            )
+            smoother = self._smoother(history.summary, history.latest_keyframes())
             start = self._without_outliers_of_then(smoother, self._solution_from(first))
             step = smoother.smooth(start, ITERATIONS, TOLERANCE)
             covariance = step.marginal()
@@ -294,6 +311,13 @@ class Relinearisation:
         tags = self._filter.orientations
         if tags is not None and end.orientations is not None:
             tags.B = end.orientations
+
+    def _smoother(self, prior: Prior, keyframes: Keyframes) -> Smoother:
+        calibration, sensed = self._calibration, None
+        if keyframes.sensed is not None:
+            stated, columns = calibration.sensor_columns()
+            sensed = SensedPoints(keyframes.sensed, stated, columns, calibration.count)
+        return Smoother(self._axes, prior, keyframes, self._settings, sensed)
 
     def _without_outliers_of_then(self, smoother: Smoother, start: Solution) -> Solution:
         """Return where iterations begin among tags, given the present estimates."""

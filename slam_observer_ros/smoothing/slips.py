@@ -13,35 +13,34 @@ with S the covariance that odometry states and S_s that with the slip.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray
-from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.smoothing.gauss_newton import inverse, Smoother
 from slam_observer_ros.smoothing.keyframes import Keyframes, Solution
-from slam_observer_ros.smoothing.prior import Prior
+from slam_observer_ros.smoothing.prior import inverse
 
 ROUNDS = 10
 """Times, at most, that it is asked which slips pay; the answer hardly changes after the third."""
 
-ITERATIONS, TOLERANCE = 50, 1e-4
-"""Gauss–Newton steps before each time; change of pose and map, rad and m, that ends them."""
-
 
 def confirmed_slips(
-    axes: EstimatedAxes, prior: Prior, keyframes: Keyframes, settings: Settings, start: Solution
+    solve: Callable[[Keyframes, Solution], Solution],
+    motion_errors: Callable[[Keyframes, Solution], FloatArray],
+    keyframes: Keyframes,
+    start: Solution,
 ) -> tuple[BoolArray, Solution]:
     """Return which of the keyframes' slips (s,) pay, and a solution with these, not gated.
 
-    Iterations begin at ``start``. Raise LinAlgError as :meth:`.Smoother.smooth` does.
+    ``solve`` smooths keyframes from a start, not gated, and raises LinAlgError as
+    :meth:`.Smoother.smooth` does; ``motion_errors`` are the errors of links in a solution.
     """
     are_slips = np.zeros(len(keyframes.slips), dtype=np.bool_)
     solution = start
     for _ in range(ROUNDS):
-        smoother = Smoother(axes, prior, keyframes.with_slips(are_slips), settings)
-        solution = smoother.smooth(solution, ITERATIONS, TOLERANCE, gated=False).end
-        as_stated = Smoother(axes, prior, keyframes, settings).motion_errors(solution)
+        solution = solve(keyframes.with_slips(are_slips), solution)
+        as_stated = motion_errors(keyframes, solution)
         pay = _pay(keyframes, as_stated[keyframes.slips])
         if np.array_equal(pay, are_slips):
             break

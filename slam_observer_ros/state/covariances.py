@@ -45,6 +45,23 @@ def of_pose_error(observer: Observer, world: FloatArray) -> FloatArray:
     return covariance
 
 
+def of_moved_pose(
+    world: FloatArray, pose: FloatArray, motion: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """Return the covariance (6, 6) of ``pose`` @ ``motion`` (4, 4), given ``world``, the pose's.
+
+    Both are :func:`of_pose`'s; ``noise`` (6, 6) is that of w in exp(w) ``motion``, along the
+    pose's axes.
+    """
+    R = pose[:3, :3]
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R
+    lever = np.eye(6)
+    lever[3:, :3] = -so3.hat(R @ motion[:3, 3])
+    moved: FloatArray = lever @ (world + turn @ noise @ turn.T) @ lever.T
+    return moved
+
+
 def _turn_to_world(observer: Observer, A: FloatArray) -> FloatArray:
     """Return the matrix (…, 6, 6) from ε to rotation and shift of the pose along world axes."""
     R = observer.reference_pose[:3, :3]

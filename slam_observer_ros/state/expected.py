@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.estimates import NormalisedInnovation
-from slam_observer_ros.geometry.matrices import diagonal_blocks, mahalanobis
+from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
@@ -43,7 +43,7 @@ class Expected:
         nis, log_densities = None, np.full(m, -np.inf)
         if self.S is not None and used.any():
             rows = np.flatnonzero(np.repeat(used, k))
-            L = np.linalg.cholesky(self.S[np.ix_(rows, rows)])
+            L = cholesky(self.S[np.ix_(rows, rows)])
             # One after the other, each as those before it have it: the product is that of all.
             white = np.linalg.solve(L, self.r.ravel()[rows])
             nis = float(white @ white)

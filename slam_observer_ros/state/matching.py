@@ -11,6 +11,7 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.observer.orientations import SeenOrientations
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.sensor_models import sensing
 from slam_observer_ros.sensor_models.observation_noise import RESOLUTION_M
 from slam_observer_ros.smoothing.history import Keyframe
 from slam_observer_ros.state.state import State
@@ -33,6 +34,7 @@ class MatchedObservation:
 
 def match(state: State, event: ObservationEvent) -> MatchedObservation:
     """Match an observation made at the state's instant with landmarks by their ids."""
+    event = corrected(state, event)
     m, rows = len(event.ids), state.landmarks.rows_of(event.ids)
     if not state.is_mapping:
         event, rows = mapped(state, event)
@@ -44,6 +46,33 @@ def match(state: State, event: ObservationEvent) -> MatchedObservation:
     known = event.select(is_known)
     residuals = residuals_of(state, known, rows[is_known], covariances[is_known])
     return MatchedObservation(event, rows, covariances, known, residuals, left_out)
+
+
+def corrected(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation as it is by the calibration of its sensor, unless it is already."""
+    calibration = state.filter.calibration
+    if not calibration.corrects_points or event.sensed is not None:
+        return event
+    if event.sensor_frame not in calibration.sensors:
+        state.add_sensor(event.sensor_frame)
+    return sensing.corrected(calibration, state.settings, event)
+
+
+def corrected_again(state: State, event: ObservationEvent) -> ObservationEvent:
+    """Return an observation as it is by what a correction has made of the calibration."""
+    return sensing.corrected_again(state.filter.calibration, event)
+
+
+def sensitivity(
+    state: State, event: ObservationEvent, points: FloatArray | None = None
+) -> FloatArray | None:
+    """Return R̂ D_i (m, 3, c) at ``points`` (m, 3), body frame, or where an observation has them.
+
+    None where nothing of a sensor is estimated.
+    """
+    points = event.points if points is None else points
+    D = sensing.point_sensitivity(state.filter.calibration, event, points)
+    return None if D is None else state.observer.A[:3, :3] @ D
 
 
 def mapped(state: State, event: ObservationEvent) -> tuple[ObservationEvent, IntArray]:
@@ -58,7 +87,10 @@ def residuals_of(
 ) -> Residuals:
     """Return the residuals (29) of landmarks ``rows`` (m,) seen with ``covariances``, m²."""
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    return state.filter.residuals(rows, event.points, covariances, dt_s)
+    D = None
+    if event.sensed is not None:
+        D = sensitivity(state, event, state.filter.expected_points(rows))
+    return state.filter.residuals(rows, event.points, covariances, dt_s, D)
 
 
 def keyframe_of(
@@ -72,7 +104,16 @@ def keyframe_of(
     is_stated = event.covariances is not None
     stated = noise.covariances(event, lines_of_sight) if is_stated else None
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    return Keyframe(event.stamp_ns, rows, event.points, lines_of_sight, stated, dt_s, orientations)
+    return Keyframe(
+        event.stamp_ns,
+        rows,
+        event.points,
+        lines_of_sight,
+        stated,
+        dt_s,
+        orientations,
+        event.sensed,
+    )
 
 
 def positions(state: State, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:

@@ -92,11 +92,17 @@ class State:
         self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return :meth:`pose_after` at stamps (s,) of velocities, as it was known then."""
-        passage = self.passage(velocities, start_ns, stamps_ns)
+        passage = self.passage(velocities, start_ns, stamps_ns, with_covariances=True)
         covariance, A = self.filter.pose_covariance(passage), passage.poses
         return self.observer.reference_pose @ A, covariances.of_pose(self.observer, covariance, A)
 
-    def passage(self, velocities: VelocityHistory, start_ns: int, stamps_ns: IntArray) -> Passage:
+    def passage(
+        self,
+        velocities: VelocityHistory,
+        start_ns: int,
+        stamps_ns: IntArray,
+        with_covariances: bool,
+    ) -> Passage:
         """Return how the robot moves from the state's stamp through ``stamps_ns`` (s,)."""
         return integrate_until(
             velocities,
@@ -106,6 +112,7 @@ class State:
             start_ns,
             stamps_ns,
             self._end_velocity,
+            with_covariances,
         )
 
     def motion(self, velocities: VelocityHistory, start_ns: int, end_ns: int) -> Motion:
@@ -157,9 +164,21 @@ class State:
         if self.relinearisation is not None:
             self.relinearisation.reset(since)
 
-    def relocate(self, rows: IntArray, points: FloatArray, noise: FloatArray) -> None:
+    def add_sensor(self, frame: str) -> None:
+        """Begin to calibrate the sensor of another frame."""
+        self.filter.add_sensor(frame)
+        if self.relinearisation is not None:
+            self.relinearisation.add_calibration()
+
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        noise: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks (m,) for new ones seen at ``points`` (m, 3), body frame."""
-        self.filter.relocate(rows, points, noise)
+        self.filter.relocate(rows, points, noise, D)
         if self.relinearisation is not None:
             self.relinearisation.relocate(rows)
 

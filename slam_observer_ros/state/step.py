@@ -12,12 +12,14 @@ from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.state.expected import Expected
 from slam_observer_ros.state.matching import (
+    corrected_again,
     is_contradiction,
     keyframe_of,
     mapped,
     MatchedObservation,
     positions,
     residuals_of,
+    sensitivity,
 )
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.tag_orientations import (
@@ -122,22 +124,25 @@ def _initialise(state: State, event: ObservationEvent, noise: FloatArray) -> Non
     m = min(new, max(limit - len(state.landmarks), 0)) if limit else new
     state.counts['unmapped_landmark'] += new - m
     if m:
-        event = event.select(np.arange(new) < m)
-        state.filter.add(event.points, noise[:m])
+        event = corrected_again(state, event.select(np.arange(new) < m))
+        state.filter.add(event.points, noise[:m], sensitivity(state, event))
         state.landmarks.add(event.ids, event.stamp_ns)
 
 
 def _relocate_moved(state: State, event: ObservationEvent, rows: IntArray) -> IntArray:
     """Relocate landmarks in doubt that are still far off; return ids of those that have moved."""
+    event = corrected_again(state, event)
     noise = state.observation_noise.covariances(event)
     residuals = residuals_of(state, event, rows, noise)
     far = state.filter.distances(residuals) > state.settings.rejection_threshold
     moved = far & (state.landmarks.counts[rows] >= state.settings.confirmations)
     state.counts['moved_landmark'] += int(np.sum(moved))
     if far.any():
-        state.relocate(rows[far], event.points[far], noise[far])
+        moved_to = event.select(far)
+        D = sensitivity(state, moved_to)
+        state.relocate(rows[far], moved_to.points, noise[far], D)
         state.landmarks.take_for_new(rows[far], event.stamp_ns)
-        take_over_orientations(state, event.select(far), rows[far])
+        take_over_orientations(state, moved_to, rows[far])
     return event.ids[moved]
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import ObservationEvent
 from slam_observer_ros.observer.orientations import SeenOrientations
-from slam_observer_ros.state.matching import MatchedObservation, residuals_of
+from slam_observer_ros.sensor_models.sensing import turn_sensitivity
+from slam_observer_ros.state.matching import corrected_again, MatchedObservation, residuals_of
 from slam_observer_ros.state.state import State
 
 _NORMAL_TURNED = np.diag([1.0, 1.0, -1.0])
@@ -41,7 +42,9 @@ def correct_by_orientations(state: State, matched: MatchedObservation) -> Matche
     tags.count(seen.rows[judged], weights[judged] > 0.0)
     state.counts['rejected_orientation'] += int(np.sum(weights[judged] == 0.0))
     covariances = matched.covariances[matched.rows >= 0]
-    return replace(matched, residuals=residuals_of(state, event, rows, covariances))
+    event = corrected_again(state, event)
+    residuals = residuals_of(state, event, rows, covariances)
+    return replace(matched, known=event, residuals=residuals)
 
 
 def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray) -> None:
@@ -55,6 +58,8 @@ def take_over_orientations(state: State, event: ObservationEvent, rows: IntArray
         return
     in_doubt = tags.in_doubt(rows, state.settings.max_rejections) & state.is_mapping
     is_used = state.landmarks.rejections[rows] == 0
+    event = corrected_again(state, event)
+    Z = Z if event.orientations is None else event.orientations
     seen = _seen(state, event, rows, Z, is_used & (in_doubt | ~tags.are_known[rows]))
     if not len(seen.rows):
         return
@@ -70,7 +75,12 @@ def seen_orientations(
     """Return how tags of landmarks ``rows`` (m,) are turned, zero for none; None of points."""
     if state.filter.orientations is None or event.orientations is None:
         return None
-    return _all_seen(state, event, rows, event.orientations)
+    seen = _all_seen(state, event, rows, event.orientations)
+    if event.sensed is None or event.sensed.orientations is None:
+        return seen
+    # As the sensor showed them: what is known of it will have changed.
+    Z = event.sensed.orientations
+    return replace(seen, Z=Z, flipped=flipped(Z, event.sensed.arms))
 
 
 def flipped(Z: FloatArray, lines_of_sight: FloatArray) -> FloatArray:
@@ -99,7 +109,10 @@ def _all_seen(
     """Return the orientations (m, 3, 3) in an observation, with their noise."""
     noise = state.observation_noise.orientation_covariances(event, _expected(state, rows, Z))
     dt_s = state.landmarks.unseen_s(rows, event.stamp_ns)
-    return SeenOrientations(rows, Z, flipped(Z, event.lines_of_sight), noise, dt_s)
+    twins, D = flipped(Z, event.lines_of_sight), turn_sensitivity(state.filter.calibration, event)
+    if D is not None:
+        D = state.observer.A[:3, :3] @ D
+    return SeenOrientations(rows, Z, twins, noise, dt_s, D)
 
 
 def _expected(state: State, rows: IntArray, Z: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import json
 import math
 import os
@@ -14,14 +15,18 @@ import time
 
 from browser import open_page
 from command_line import CommandLine
+import numpy as np
 import pytest
-from recordings import write_mcap, write_rosbag1
+from recordings import events, write_mcap, write_rosbag1
 
 from slam_observer_ros.cli.batch.index import write_index
 from slam_observer_ros.cli.batch.jobs import grid_points, part_of
 from slam_observer_ros.cli.batch.pool import local_pool
 from slam_observer_ros.cli.batch.run_log import opened_log, read_logs
+from slam_observer_ros.cli.figures import FIGURES
 from slam_observer_ros.common.errors import OutputError
+from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.recording.writer import RecordingWriter
 
 SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 PATIENCE_S = 60.0
@@ -373,3 +378,68 @@ def test_the_index_links_reports_and_sorts(slam_observer, tmp_path):
     html = open_page(page).html
     assert html.index('<td>constant</td>') < html.index('<td>riccati</td>')
     assert 'aria-sort="ascending"' in html
+
+
+def test_the_index_fits_into_a_window_whatever_is_warned_of(tmp_path):
+    figures = dict.fromkeys(FIGURES, 1.2345)
+    long = (
+        'Stamps of /landmarks are 1.2 s behind those of /twist, by when both were received. ' * 5
+    )
+    lines = {
+        str(n): {
+            **RUN,
+            **figures,
+            'run': f'{n:016x}',
+            'recording': f'/data/monday/a_recording_of_robot_{n}_in_the_hall.mcap',
+            'recording_sha256': str(n),
+            'grid': {'range_noise': 0.1 * n},
+            'warnings': [long, long],
+            'report': f'reports/{n}.html',
+            'trajectory': f'trajectories/{n}.tum',
+        }
+        for n in (1, 2)
+    }
+    write_index(tmp_path, lines, 'ate_rmse_m')
+    page = tmp_path / 'index.html'
+    script = """<script>
+        const rows = [...document.querySelectorAll('tbody tr')], links = [...document.links];
+        document.title = [Math.max(...rows.map((row) => row.clientHeight)), links.length,
+          Math.max(...links.map((link) => link.getBoundingClientRect().right))].join();
+    </script></body>"""
+    page.write_text(script.join(page.read_text().rsplit('</body>', 1)))
+    html = open_page(page, '', '--window-size=1440,900').html
+    height, links, right = map(float, re.search('<title>([0-9.,]*)', html)[1].split(','))
+    assert height < 70.0
+    assert (links, right < 720.0) == (4, True)
+    assert long.strip() in html
+
+
+def test_no_mean_hides_how_far_from_1_the_consistency_is(tmp_path):
+    lines = {
+        str(n): {
+            **RUN,
+            'run': str(n),
+            'recording_sha256': str(n),
+            'anees': anees,
+            'ate_rmse_m': 1.0,
+        }
+        for n, anees in enumerate((0.27, 2.28))
+    }
+    write_index(tmp_path, lines, 'ate_rmse_m')
+    page = (tmp_path / 'index.html').read_text()
+    assert '0.270 – 2.28' in page
+    assert '1.28' not in page
+
+
+def test_a_run_that_used_nothing_is_seen_in_the_index(slam_observer, tmp_path):
+    out, blind = tmp_path / 'results', tmp_path / 'blind.mcap'
+    with RecordingWriter(blind) as writer:
+        for event in events():
+            if isinstance(event, ObservationEvent):
+                event = replace(event, points=np.full_like(event.points, np.nan))
+            writer.write_event(event)
+    assert slam_observer('batch', blind, '--out', out, '--workers', 1).code == 0
+    page = (out / 'index.html').read_text()
+    assert '>points used<' in page
+    assert '<td class="number" data-value="0">0</td>' in page
+    assert 'No observation was used' in page

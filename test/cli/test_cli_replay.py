@@ -87,6 +87,44 @@ def blinded(events, which):
     ]
 
 
+def without(kind):
+    """Return events of which those of a kind can't be used."""
+    nowhere = {VelocityEvent: 'body_velocity', ObservationEvent: 'points'}
+    return [
+        replace(
+            event,
+            **{nowhere[type(event)]: np.full_like(getattr(event, nowhere[type(event)]), np.nan)},
+        )
+        if isinstance(event, kind)
+        else event
+        for event in recordings.events()
+    ]
+
+
+@pytest.mark.parametrize(
+    ('kind', 'sentence'),
+    [
+        (ObservationEvent, 'No observation was used: the trajectory is that of the velocities'),
+        (VelocityEvent, 'No velocity was used: the landmarks alone move the robot.'),
+        ((VelocityEvent, ObservationEvent), 'Nothing was used, neither a velocity nor'),
+    ],
+)
+def test_a_replay_of_which_nothing_was_used_says_so_first(
+    slam_observer, tmp_path, monkeypatch, kind, sentence
+):
+    monkeypatch.setenv('COLUMNS', '200')
+    recording = write_events(tmp_path / 'blind.mcap', without(kind))
+    ended = slam_observer('replay', recording)
+    assert ended.code == 0
+    first_row = ended.output.splitlines()[2]
+    assert sentence in first_row
+    ended = slam_observer('replay', recording, '--strict')
+    assert ended.code == 3
+    assert sentence in ended.errors.splitlines()[-1]
+    whole = recordings.write_mcap(tmp_path / 'whole.mcap')
+    assert 'was used' not in slam_observer.succeed('replay', whole, '--strict').output
+
+
 class TestReport:
     def test_what_is_not_finite_is_null_in_json(self, slam_observer, simulated):
         options = ('--set', 'calibration_drift=0.01', '--json')

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+import re
+
 from command_line import CommandLine
 import pytest
 from recordings import write_mcap
+
+from slam_observer_ros.cli.main import main
+
+SAMPLE = Path(__file__).resolve().parents[2] / 'samples' / 'sample.mcap'
 
 
 @pytest.fixture(name='slam_observer')
@@ -30,6 +38,53 @@ def test_gains_files_and_trajectories_are_compared(slam_observer, tmp_path):
     assert 'exists already' in slam_observer.fail('compare', recording, *what, '--plot', picture)
     table = slam_observer.succeed('compare', recording, 'riccati', 'scheduled').output
     assert 'scheduled' in table
+
+
+@pytest.fixture(name='trajectories', scope='module')
+def fixture_trajectories(tmp_path_factory):
+    """A trajectory of the sample, and its first tenth."""
+    folder = tmp_path_factory.mktemp('trajectories')
+    whole, short = folder / 'whole.tum', folder / 'first_tenth_of_the_trajectory.tum'
+    assert main(['replay', str(SAMPLE), '--gains', 'scheduled', '--tum', str(whole)]) == 0
+    lines = whole.read_text().splitlines(keepends=True)
+    short.write_text(''.join(lines[: len(lines) // 10]))
+    return whole, short
+
+
+def test_a_part_of_a_trajectory_is_said_to_be_one(slam_observer, trajectories):
+    whole, short = trajectories
+    ended = slam_observer('compare', SAMPLE, whole, short, '--json')
+    assert ended.code == 0
+    assert f'{short} covers 9.9 % of the time of the truth' in ended.errors
+    figures = ended.json['compared']
+    assert figures[str(short)]['ate_rmse_m'] < figures[str(whole)]['ate_rmse_m']
+    assert figures[str(short)]['poses_compared'] == 239
+    assert figures[str(short)]['time_compared'] == pytest.approx(0.099, abs=1e-3)
+    assert figures[str(whole)]['time_compared'] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_gap_counts_as_no_time(slam_observer, trajectories, tmp_path):
+    lines = trajectories[0].read_text().splitlines(keepends=True)
+    gap = tmp_path / 'gap.tum'
+    gap.write_text(''.join(lines[:600] + lines[1800:]))
+    figures = slam_observer.succeed('compare', SAMPLE, gap, '--json').json['compared'][str(gap)]
+    assert figures['time_compared'] == pytest.approx(0.5, abs=1e-2)
+
+
+@pytest.mark.parametrize('width', [60, 80, 200])
+def test_names_and_numbers_are_whole_in_any_window(
+    slam_observer, trajectories, monkeypatch, width
+):
+    monkeypatch.setenv('COLUMNS', str(width))
+    whole, short = trajectories
+    shown = slam_observer('compare', SAMPLE, 'riccati', 'constant', whole, short).output
+    assert max(map(len, shown.splitlines())) <= width
+    for name in ('riccati', 'constant', 'whole.tum', short.name[:20]):
+        assert name in shown
+    found = re.findall(r'heading error, RMS \[°\] *│(.*)│', shown)
+    degrees = [float(cell) for line in found for cell in line.split('│')]
+    figures = slam_observer('compare', SAMPLE, whole, '--json').json['compared'][str(whole)]
+    assert degrees[2] == pytest.approx(math.degrees(figures['heading_rmse_rad']), abs=0.01)
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,7 @@ STAMPS = {
     'of a coarse clock': lambda k: k // 2 * 2,
     'of a very coarse clock': lambda k: k // 7 * 7,
     'in bursts': lambda k: k // BURST * BURST + k % BURST * 0.03,
+    'in long bursts': lambda k: k // 10 * 10 + k % 10 * 0.05,
     'in bursts of one stamp': lambda k: k // BURST * BURST,
     'one too late': lambda k: k + 1.2 * (k % 10 == 4),
     'one far ahead': lambda k: k + 10_000 * (k == 57),

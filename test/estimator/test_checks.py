@@ -11,8 +11,11 @@ import pytest
 from strategies import generators
 
 from slam_observer_ros.common.errors import MapError, ParameterError
+from slam_observer_ros.estimates import used_points
+from slam_observer_ros.estimator.checks import MAX_WEIGHED
 from slam_observer_ros.estimator.estimator import Estimator
-from slam_observer_ros.events import ObservationEvent, VelocityBlock, VelocityEvent
+from slam_observer_ros.estimator.event_warnings import MANY_POINTS
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityBlock, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import are_covariances
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
@@ -174,3 +177,50 @@ def test_rotations_that_are_exact_keep_their_bits():
     np.testing.assert_array_equal(so3.exact(R), R)
     np.testing.assert_array_equal(so3.exact(R[0]), R[0])
     np.testing.assert_array_equal(so3.exact(np.zeros((2, 3, 3))), 0.0)
+
+
+def cloud(m, ids, stamp_ns=0):
+    points = np.random.default_rng(0).uniform(-30.0, 30.0, (m, 3))
+    return ObservationEvent(stamp_ns, ids, points)
+
+
+def test_of_a_large_cloud_without_ids_those_nearest_are_weighed_and_the_others_counted(caplog):
+    estimator, m = Estimator(Settings(reorder_window=0.0)), 1000
+    ids = np.full(m, UNKNOWN_ID)
+    ids[-3:] = [1, 2, 3]  # which are used wherever they are
+    for k in range(2):
+        assert estimator.add(cloud(m, ids, k * 10**8))
+    known = estimator._state.landmarks.ids
+    assert len(known) == MAX_WEIGHED
+    assert set(known[known < 10]) == {1, 2, 3}
+    own = np.linalg.norm(estimator._state.world_points[known > 10], axis=1)
+    all_of_them = np.linalg.norm(cloud(m, ids).points[:-3], axis=1)
+    np.testing.assert_allclose(np.sort(own), np.sort(all_of_them)[: len(own)], atol=1e-6)
+    assert estimator.counts['unweighed_point'] == 2 * (m - MAX_WEIGHED)
+    assert used_points(estimator.counts) == 2 * MAX_WEIGHED
+    assert '1000 points in one message' in caplog.text
+    # With ids alone no point is weighed against others, unless landmarks have none.
+    estimator.add(cloud(m, np.arange(m), 2 * 10**8))
+    assert estimator.counts['unweighed_point'] == 3 * (m - MAX_WEIGHED)
+
+
+@pytest.mark.parametrize('gains', ['constant', 'riccati'])
+def test_of_points_with_ids_all_are_used_and_it_is_said_where_that_takes_long(caplog, gains):
+    m = MANY_POINTS + 1
+    estimator = Estimator(Settings(gains=gains, reorder_window=0.0))
+    estimator.add(cloud(m, np.arange(m)))
+    assert len(estimator._state.landmarks) == m
+    assert estimator.counts['unweighed_point'] == 0
+    assert (f'An observation has {m} points' in caplog.text) == (gains == 'riccati')
+
+
+def test_an_estimate_that_settings_lead_out_of_all_bounds_starts_again_and_says_so(caplog):
+    estimator = Estimator(Settings(reorder_window=0.0, max_linear_velocity=1e6))
+    estimator.add(ObservationEvent(0, IDS, POINTS))
+    for k in range(1200):
+        estimator.add(VelocityEvent(k * 10**9, np.array([0.0, 0.0, 0.0, 1e6, 0.0, 0.0])))
+    for k in range(2):
+        assert estimator.add(ObservationEvent(1200 * 10**9 + k, IDS, POINTS))
+    assert estimator.counts['diverged'] == 1
+    assert 'The estimate has diverged: the pose is 1.2e+09 m from its origin' in caplog.text
+    np.testing.assert_allclose(estimator._state.world_points, POINTS)

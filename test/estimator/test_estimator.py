@@ -27,6 +27,7 @@ from slam_observer_ros.evaluation.truth import PoseTruth
 from slam_observer_ros.events import (
     AngularVelocityEvent,
     FIRST_AUTOMATIC_ID,
+    IMPOSSIBLE_ID,
     LAST_AUTOMATIC_ID,
     ObservationEvent,
     UNKNOWN_ID,
@@ -452,6 +453,7 @@ def test_what_is_unknown_of_a_gap_begins_where_it_leaves_the_robot():
         unknown_angular_motion=np.sqrt(turn_variance),
         unknown_linear_motion=density,
         angular_bias_stddev=(0.0, 0.0, 0.0),
+        velocity_delay_stddev=0.0,
     )
     estimator = Estimator(settings)
     for event in (velocity(0.0, [0, 0, 0, 4, 0, 0]), observation(2.0, [])):  # a second is unknown
@@ -677,6 +679,15 @@ def test_points_with_ids_that_are_kept_for_others_are_left_out_counted_and_named
     assert used_points(estimator.counts) == 10
     assert 'points with the ids 10000000, 16777215;' in caplog.text
     assert len(caplog.records) == 1
+
+
+def test_points_whose_message_has_no_possible_id_are_left_out_and_the_others_used():
+    estimator = Estimator(Settings(reorder_window=0.0, confirmations=1))
+    ids = np.array([7, IMPOSSIBLE_ID, 8, IMPOSSIBLE_ID])
+    assert estimator.add(ObservationEvent(1, ids, np.ones((4, 3)) * np.arange(4)[:, None]))
+    estimator.flush()
+    assert estimator.landmark_ids.tolist() == [7, 8]
+    assert estimator.counts['impossible_id'] == 2
 
 
 def test_of_settings_without_effect_on_the_gains_there_is_one_warning(caplog):

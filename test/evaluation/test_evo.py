@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import re
 import subprocess
 import sys
 import zipfile
@@ -58,6 +59,35 @@ def test_evo_finds_the_same_error_in_a_recording(run_evo, figures, tmp_path):
     topics = ('/aligned_truth/pose', '/pose')
     found = rmse_m(run_evo, tmp_path, 'mcap', 'run.mcap', *topics)
     assert found == pytest.approx(figures['ate_rmse_m'], abs=1e-9)
+
+
+def stats(run_evo, tmp_path, program, *arguments):
+    """Return what evo finds of the run, beside the truth."""
+    results = tmp_path / 'results.zip'
+    results.unlink(missing_ok=True)
+    files = ('tum', 'ground_truth_pose.tum', 'run.tum')
+    run_evo(program, *files, *arguments, *SAME_STAMPS, '--save_results', results)
+    with zipfile.ZipFile(results) as opened:
+        return json.loads(opened.read('stats.json'))
+
+
+def test_evo_finds_what_trajectories_are_compared_by(run_evo, figures, capsys, tmp_path):
+    run_evo('evo_traj', 'mcap', SAMPLE, '/ground_truth/pose', '--save_as_tum')
+    tum = tmp_path / 'run.tum'
+    ours = CommandLine(capsys).succeed('compare', SAMPLE, tum, '--json').json['compared'][str(tum)]
+    errors = stats(run_evo, tmp_path, 'evo_ape', '--align')
+    for name in ('max', 'median', 'std'):
+        assert errors[name] == pytest.approx(ours[f'ate_{name}_m'], abs=1e-8), name
+    length_m = ours['drift_length_m']
+    assert length_m == 10.0
+    pieces = ('--delta', length_m, '--delta_unit', 'm', '--all_pairs', '--pairs_from_reference')
+    positions = stats(run_evo, tmp_path, 'evo_rpe', *pieces, '-r', 'trans_part')
+    assert positions['mean'] / length_m == pytest.approx(ours['drift'], rel=1e-7)
+    turns = stats(run_evo, tmp_path, 'evo_rpe', *pieces, '-r', 'angle_rad')
+    assert turns['mean'] / length_m == pytest.approx(ours['drift_rad_per_m'], rel=1e-6)
+    lengths = run_evo('evo_traj', 'tum', 'run.tum', 'ground_truth_pose.tum', '--full_check')
+    found = [float(text) for text in re.findall(r'path length \(m\)\s+([0-9.]+)', lengths)]
+    assert ours['path_length_m'] == pytest.approx(found[0], rel=1e-6)
 
 
 @pytest.mark.parametrize('topic', ['/pose', '/observer_node/odometry', '/aligned_truth/pose'])

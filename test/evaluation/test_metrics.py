@@ -333,3 +333,23 @@ def test_three_poses_that_the_truth_covers_are_enough() -> None:
     estimate, truth = random_pair(np.random.default_rng(0))
     three = Trajectory(estimate.stamps_ns[:3], estimate.poses[:3])
     assert metrics.trajectory_errors(three, truth).ate_rmse_m > 0.0
+
+
+@pytest.mark.parametrize('period_s', [0.6, 5.0])
+def test_an_estimate_is_interpolated_where_the_truth_is_sparse(period_s: float) -> None:
+    """A total station's or a survey's: none of its poses is thrown away."""
+    seconds = np.arange(0.0, 60.0, 0.05)
+    V = np.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0])
+    estimate = Trajectory(np.rint(seconds * 1e9).astype(np.int64), se3.exp(seconds[:, None] * V))
+    true_s = np.arange(0.013, 58.0, period_s)
+    offset_m = np.where(np.arange(len(true_s)) % 2, 0.1, -0.1)
+    poses = se3.exp(true_s[:, None] * V)
+    poses[:, 2, 3] = offset_m
+    truth = Trajectory(np.rint(true_s * 1e9).astype(np.int64), poses)
+    errors = metrics.trajectory_errors(estimate, truth)
+    assert len(errors.estimate) == len(truth) == errors.covered.sum()
+    assert errors.ate_rmse_m == pytest.approx(0.1, rel=0.05)
+    assert errors.covered_share == pytest.approx(true_s[-1] / 60.0, abs=0.01)
+    P = np.broadcast_to(np.eye(6) * 0.01, (len(estimate), 6, 6)).copy()
+    P[0] = 0.0
+    assert consistency.anchored_average_nees(estimate, P, truth) is not None

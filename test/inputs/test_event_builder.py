@@ -169,6 +169,25 @@ def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used()
     assert_allclose(placed.points, [[1.0, 1.0, 2.0]])
 
 
+@pytest.mark.parametrize(
+    ('base', 'frame', 'meant'),
+    [
+        ('base_link', 'robot1/camera', "set that to 'robot1/base_link'"),
+        ('base_link', '/a/b/camera', "set that to 'a/b/base_link'"),
+        ('robot1/base_link', 'camera', "set that to 'base_link'"),
+        ('robot1/base_link', 'robot1/camera', None),
+        ('base_link', 'camera', None),
+    ],
+)
+def test_frames_of_another_prefix_point_at_the_base_frame(base, frame, meant):
+    frames = BaseFrame(InputSettings(base_frame=base), TransformBuffer())
+    event = ObservationEvent(1, np.array([1]), np.ones((1, 3)))
+    with pytest.raises(TransformError, match='not connected') as raised:
+        frames.observation(event, frame)
+    assert ('base_frame' in str(raised.value)) == (meant is not None)
+    assert (meant or '') in str(raised.value)
+
+
 def test_without_an_odometry_frame_velocities_may_name_none():
     event = VelocityEvent(0, V)
     assert BaseFrame(InputSettings(odom_frame=''), TransformBuffer()).velocity(event, '')

@@ -104,6 +104,154 @@ def test_orientations_may_be_left_out(load):
     assert found.orientation_sigmas is None
 
 
+TABLE = 'id,x,y,z\n1,1.5,2.0,0.3\n2,3.25,4.5,0.3\n'
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        TABLE,
+        TABLE.replace(',', ';'),
+        'id;x;y;z\n1;1,5;2,0;0,3\n2;3,25;4,5;0,3\n',
+        'id\tx\ty\tz\n1\t1,5\t2,0\t0,3\n2\t3,25\t4,5\t0,3\n',
+        TABLE.replace(',', '\t'),
+        TABLE.replace(',', ' '),
+        TABLE.replace(',', '   ').replace('\n', '  \r\n'),
+        'id x y z\n1 1,5 2,0 0,3\n2 3,25 4,5 0,3\n',
+        TABLE.replace(',', ', '),
+        '1 1.5 2.0 0.3\n2 3.25 4.5 0.3\n',
+        '# id x y z\n1 1.5 2.0 0.3\n2 3.25 4.5 0.3\n',
+        '#z,id,x,y\n0.3,1,1.5,2.0\n0.3,2,3.25,4.5\n',
+        'sep=;\n' + TABLE.replace(',', ';'),
+        TABLE + ',,,\n\n,,,\n',
+        'Tag_ID,X [m],Y(m),z\n1.0,1.5,2.0,0.3\n2.0,3.25,4.5,0.3\n',
+        'marker,x_m,pos_y,z_cm\n1,1.5,2.0,30\n2,3.25,4.5,30\n',
+        'id,x [mm],y [cm],z\n1,1500,200,0.3\n2,3250,450,0.3\n',
+        '"id","x","y","z"\n"1","1,5","2,0","0,3"\n"2","3,25","4,5","0,3"\n',
+        TABLE.encode('utf-16'),
+        TABLE.encode('utf-8-sig'),
+    ],
+)
+def test_tables_are_read_however_they_are_separated_and_encoded(tmp_path, content):
+    path = tmp_path / 'tags.csv'
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    found = import_map(path, 'map', 0.02, 0.03)
+    assert found.ids.tolist() == [1, 2]
+    assert_allclose(found.world_points, [[1.5, 2.0, 0.3], [3.25, 4.5, 0.3]])
+
+
+def test_columns_of_words_are_left_out_by_name(tmp_path, caplog):
+    path = tmp_path / 'tags.csv'
+    path.write_bytes('id,x,y,Ort,size\n1,1.5,2.0,Tür,0.1\n'.encode('latin-1'))
+    assert import_map(path, 'map', 0.02, 0.03).ids.tolist() == [1]
+    assert "left out: column 'ort', column 'size'" in caplog.text
+
+
+def test_deviations_of_each_axis_and_angles_in_degrees_are_used(load):
+    names = 'id,x,y,z,sigma,sigma_x,sigma_z,roll,yaw [deg],orientation_sigma [deg]'
+    found = load(f'{names}\n1,1,2,3,0.1,0.2,,0,90,2\n', 'tags.csv')
+    assert_allclose(found.covariances[0], np.diag([0.04, 0.01, 0.01]))
+    assert_allclose(found.orientations[0][:, 2], [0.0, 1.0, 0.0], atol=1e-12)
+    assert_allclose(found.orientation_sigmas, np.radians([2.0]))
+
+
+def test_a_map_of_fiducial_slam(load):
+    text = '7 1.0 2.0 0.5 0 0 0 0 0\n8 1 2 3 90.0 0.0 0.0 0.04 12 7\n'
+    found = load(text, 'map.txt')
+    assert found.ids.tolist() == [7, 8]
+    turned = so3.exp(np.array([np.pi / 2.0, 0.0, 0.0]))
+    assert_allclose(found.orientations, [np.eye(3), turned], atol=1e-12)
+    assert_allclose(found.covariances[:, 0, 0], [0.02**2, 0.04])
+
+
+FIELD = """{
+\t"tags": [
+\t\t{"ID": 3, "pose": {"translation": {"x": 16.5, "y": 4.0, "z": 0.5},
+\t\t\t"rotation": {"quaternion": {"W": 0.0, "X": 0.0, "Y": 0.0, "Z": 1.0}}}}],
+\t"field": {"length": 16.54, "width": 8.21}
+}"""
+
+
+def test_a_field_of_frc_whose_tags_look_along_their_x_axis(load):
+    found = load(FIELD, 'field.json')
+    assert found.ids.tolist() == [3]
+    assert_allclose(found.world_points, [[16.5, 4.0, 0.5]])
+    right, up, out = [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]
+    assert_allclose(found.orientations[0].T, [right, up, out], atol=1e-12)
+
+
+NOISE = """
+body_defaults: {position_noise: 0.05, rotation_noise: 0.01}
+bodies:
+ - wall:
+     is_static: true
+     pose:
+       position: {x: 1.0, y: 0.0, z: 0.0}
+       rotation: {x: 0.0, y: 0.0, z: 1.5707963267948966}
+       position_noise: {x: 0.0, y: 0.0, z: 0.3}
+       rotation_noise: {x: 0.0, y: 0.0, z: 0.02}
+     tags:
+     - id: 3
+       pose:
+         position: {x: 5.0, y: 0, z: 0.0}
+         rotation: {x: 0.0, y: 0.0, z: 0.0}
+         position_noise: {x: 0.1, y: 0.2, z: 0.0}
+         rotation_noise: {x: 0.0, y: 0.0, z: 0.0}
+     - {id: 4, pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
+     - {id: 5, size: 0.1}
+ - shelf:
+     is_static: true
+     tags:
+     - {id: 6, pose: {position: {x: 0, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}}
+ - rig: {is_static: false, tags: [{id: 9}]}
+ - board:
+     is_static: true
+     type: board
+     pose: {position: {x: 0, y: 0, z: 2}, rotation: {x: 0, y: 0, z: 0}}
+     board: {tag_start_id: 20, tag_size: 0.4, tag_spacing: 0.25, tag_rows: 2, tag_columns: 3}
+"""
+
+
+def test_noise_that_tagslam_states_is_used_and_what_has_no_place_is_named(load, caplog):
+    found = load(NOISE, 'tagslam.yaml')
+    assert found.ids.tolist() == [3, 4, *range(20, 26)]
+    of_turn_m2 = (5.0 * 0.02) ** 2  # the tag is 5 m ahead of the body that may be turned
+    expected = np.diag([0.2**2 + of_turn_m2, 0.1**2, 0.3**2])
+    assert_allclose(found.covariances[0], expected, atol=1e-12)
+    assert_allclose(found.orientation_sigmas[0], 0.02 / 3.0**0.5)
+    assert_allclose(
+        found.covariances[1], np.diag([0.05**2, 0.05**2, 0.05**2 + 0.3**2]), atol=1e-12
+    )
+    assert_allclose(found.world_points[-1], [1.0, 0.5, 2.0])
+    for named in ('tag 5, which has no', "body 'shelf', which has no", "body 'rig', which moves"):
+        assert named in caplog.text
+
+
+ROS2_BUNDLE = """
+tag_bundles:
+  bundle_names: [wall]
+  wall:
+    ids: [0, 1]
+    0: {size: 0.1, transform: [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]}
+    1: {size: 0.1, transform: [0.5, 0.0, 0.0, 0.8, 0.6, 0.0, 0.0]}
+"""
+
+
+def test_a_bundle_of_ros_2(load):
+    found = load(ROS2_BUNDLE, 'tags.yaml')
+    assert found.ids.tolist() == [0, 1]
+    assert_allclose(found.world_points, [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    assert_allclose(found.orientations[1], so3.from_quaternion(np.array([0.6, 0.0, 0.0, 0.8])))
+
+
+def test_many_landmarks_take_no_longer_each(load):
+    """How often each id is there was counted for each of them: a minute for these."""
+    count = 60_000
+    assert (
+        len(load('id,x,y\n' + ''.join(f'{i},1,2\n' for i in range(count)), 'a.csv').ids) == count
+    )
+
+
 @pytest.mark.parametrize('text', [TAGSLAM, TAGSLAM.replace('bodies:', '')])
 def test_tags_of_tagslam_that_stand_still(load, text):
     found = load(text, 'tagslam.yaml')
@@ -135,8 +283,24 @@ def test_what_was_imported_can_be_saved_and_loaded(load, tmp_path):
     [
         ('', 'tags.csv', 'there are no landmarks in it'),
         ('id,y\n7,1\n', 'tags.csv', "there is no column 'x'; it needs id, x and y"),
-        ('id;x;y\n7;1;2\n', 'tags.csv', 'it needs id, x and y, with commas'),
-        ('7 1 2\n', 'tags.csv', 'there is no column|line 1: it needs id, x and y, with commas'),
+        ('7\n', 'tags.csv', 'line 1: it needs id, x and y'),
+        (
+            'id,x,y,z,roll,pitch,yaw\n1,1,2,0,0,0.5,1\n',
+            'tags.csv',
+            "line 2: column 'pitch' is 0.5, and is not known here .a tag that is not upright",
+        ),
+        ('id,x,y,weight\n1,1,2,\n2,3,4,7\n', 'tags.csv', "line 3: column 'weight' is 7"),
+        ('id,x,y,x\n1,1,2,3\n', 'tags.csv', "column 'x' is there twice"),
+        ('id,x [ft],y\n1,1,2\n', 'tags.csv', "column 'x .ft.' is of a unit that is not known"),
+        ('1 1 2 3 0 0 0 0.1 5\n2 1 2 3\n', 'map.txt', 'line 2: it is not laid out as the others'),
+        ('1 1 2 3 0 0 0 -0.1 5\n', 'map.txt', 'line 1: the variance is negative'),
+        ('{"field": {}}', 'f.json', "it is no AprilTag field layout of FRC, which has 'tags'"),
+        (
+            '{"tags": [{"ID": 1, "pose": {"translation": {"x": 1, "y": 2}}}]}',
+            'f.json',
+            "tag 1: 'z' is missing",
+        ),
+        ('[', 'f.json', 'f.json: Expecting value'),
         ('id,x,y\n7,1,two\n', 'tags.csv', "line 2: y is 'two', which is not a finite number"),
         ('7.5,1,2\n', 'tags.csv', "line 1: the id '7.5' is no whole number"),
         ('7,1,2\n7,1,2\n', 'tags.csv', 'landmark 7 is there more than once'),

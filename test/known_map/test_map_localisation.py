@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import (
     AngularVelocityEvent,
+    FIRST_AUTOMATIC_ID,
     ObservationEvent,
     UNKNOWN_ID,
     VelocityEvent,
@@ -1037,3 +1038,113 @@ def test_a_map_made_in_the_plane_says_so_in_space(two_d_mode, caplog):
     known = LandmarkMap(np.arange(3), points, np.tile(planar, (3, 1, 1)), np.full(3, 9))
     Estimator(Settings(two_d_mode=two_d_mode)).load_map(known)
     assert ('two_d_mode, which is off' in caplog.text) == (not two_d_mode)
+
+
+def without_ids(event):
+    if isinstance(event, ObservationEvent):
+        return replace(event, ids=np.full(len(event.ids), UNKNOWN_ID))
+    return event
+
+
+class TestWithoutIds:
+    """Points without ids, in a map of landmarks with ids or without."""
+
+    @pytest.mark.parametrize('mode', MODES)
+    @pytest.mark.parametrize('is_planar', [False, True])
+    def test_a_robot_is_found_wherever_it_starts_and_is_as_sure_as_it_may_be(
+        self, mode, is_planar
+    ):
+        nees = []
+        for seed in range(4):
+            world = World(seed, is_planar)
+            known = world.map()
+            if seed % 2:  # one that was mapped without ids
+                known = replace(known, ids=known.ids + FIRST_AUTOMATIC_ID)
+            estimator = Estimator(world.settings(localization_mode=mode))
+            estimator.load_map(known)
+            for event in world.drive(0.0, 3.0, count=8):
+                estimator.add(without_ids(event))
+            assert estimator.is_localised
+            assert set(known.ids) <= set(estimator.landmark_ids)
+            nees.append(world.nees(estimator, 2.9))
+        assert np.mean(nees) / (3 if is_planar else 6) < 3.0
+
+    def test_it_is_said_by_how_many_landmarks_and_how_sure(self, caplog):
+        world = World(0, is_planar=True)
+        estimator = Estimator(world.settings(localization_mode='uncertain'))
+        estimator.load_map(world.map())
+        with caplog.at_level(logging.INFO):
+            for event in world.drive(0.0, 1.0, count=8):
+                estimator.add(without_ids(event))
+        assert 'Found the pose in the map by 8 of 8 landmarks (wrong with a prob' in caplog.text
+
+    def test_two_places_that_fit_are_named_and_a_rough_pose_decides(self, caplog):
+        world = World(0, is_planar=True)
+        world.points[25:] = -world.points[:25]
+        estimator = Estimator(world.settings(localization_mode='uncertain'))
+        estimator.load_map(world.map(sigma_m=0.001))
+        events = [without_ids(event) for event in world.drive(0.0, 3.0, count=8)]
+        add(estimator, events)
+        assert not estimator.is_localised
+        assert len(estimator.possible_poses) == 2
+        assert 'fits 2 places in the map, (' in estimator.localisation_problem
+        assert caplog.text.count('hat was seen fits 2 places') == 1
+        # Within 3 m and 40 degrees.
+        rough = np.diag([0.0, 0.0, 0.7, 3.0, 3.0, 0.0]) ** 2
+        estimator.reset()
+        estimator.set_pose(world.start @ se3.exp(np.array([0, 0, 0.4, 1.0, 2.0, 0])), rough)
+        add(estimator, events)
+        assert estimator.is_localised
+        assert np.linalg.norm(world.error(estimator, 2.9)) < 0.2
+
+    def test_some_ids_among_others_and_a_wrong_one_do_not_hide_the_place(self):
+        world = World(1, is_planar=True)
+        estimator = Estimator(world.settings(localization_mode='off'))
+        estimator.load_map(world.map())
+        ids = np.full(50, UNKNOWN_ID)
+        ids[world.near(0.0, 3)[:2]] = world.near(0.0, 3)[0], 49 - world.near(0.0, 3)[1]
+        for event in world.drive(0.0, 3.0, count=8):
+            if isinstance(event, ObservationEvent):
+                event = replace(event, ids=ids[event.ids])
+            estimator.add(event)
+        assert estimator.is_localised
+        assert np.linalg.norm(world.error(estimator, 2.9)) < 0.3
+        assert len(np.unique(estimator.landmark_ids)) == len(estimator.landmark_ids)
+
+    @pytest.mark.parametrize('mode', MODES)
+    def test_a_carried_robot_is_noticed_and_found_again(self, mode, caplog):
+        world = World(2, is_planar=True)
+        estimator = Estimator(world.settings(localization_mode=mode))
+        estimator.load_map(world.map(), world.start, np.diag([1e-4] * 6))
+        add(estimator, [without_ids(event) for event in world.drive(0.0, 5.0)])
+        assert estimator.counts['lost'] == 0
+        world.start = se3.exp(np.array([0, 0, 1.5, 4.0, -5.0, 0])) @ world.start
+        add(estimator, [without_ids(event) for event in world.drive(5.0, 12.0, count=8)])
+        assert estimator.counts['lost'] >= 1
+        assert estimator.is_localised
+        assert np.linalg.norm(world.error(estimator, 11.9)) < 0.3
+
+    @pytest.mark.parametrize('mode', MODES)
+    def test_false_points_do_not_make_a_robot_lost(self, mode):
+        world = World(3, is_planar=True)
+        estimator = Estimator(world.settings(localization_mode=mode))
+        estimator.load_map(world.map(), world.start, np.diag([1e-4] * 6))
+        for event in world.drive(0.0, 30.0):
+            event = without_ids(event)
+            if isinstance(event, ObservationEvent):
+                is_false = world.random.random(len(event.ids)) < 0.1
+                shifts = world.random.uniform(-4, 4, event.points.shape) * [1, 1, 0]
+                event = replace(event, points=event.points + is_false[:, None] * shifts)
+            estimator.add(event)
+        assert estimator.counts['lost'] == 0
+
+    def test_a_robot_that_leaves_a_map_which_grows_is_not_lost(self):
+        world = World(4, is_planar=True)
+        settings = world.settings(localization_mode='off')
+        estimator = Estimator(settings)
+        near = np.flatnonzero(np.linalg.norm(world.points - world.start[:3, 3], axis=1) < 8.0)
+        estimator.load_map(world.map(near), world.start, np.diag([1e-4] * 6))
+        add(estimator, [without_ids(event) for event in world.drive(0.0, 30.0)])
+        assert len(estimator.landmark_ids) > len(near)
+        assert estimator.counts['lost'] == 0
+        assert np.linalg.norm(world.error(estimator, 29.9)) < 0.3

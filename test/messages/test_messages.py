@@ -13,7 +13,7 @@ import pytest
 import ros_messages as ros
 
 from slam_observer_ros.common.errors import MessageError
-from slam_observer_ros.events import MAX_ID
+from slam_observer_ros.events import IMPOSSIBLE_ID, MAX_ID
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.messages import cloud_fields, point_clouds
 from slam_observer_ros.messages import poses_and_velocities as messages
@@ -208,8 +208,10 @@ class TestPointCloud:
         assert 'id' not in cloud_fields.read_fields(raw, 'sensor_msgs/msg/PointCloud').names
 
     @pytest.mark.parametrize('bad_id', [0.5, -2.0, np.nan, np.inf, 2.0**24])
-    def test_id_that_float32_cannot_hold_is_refused(self, bad_id):
+    def test_a_point_whose_id_float32_cannot_hold_is_marked_and_the_others_are_taken(self, bad_id):
         raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.array([1, bad_id])}))
+        assert point_clouds.decode_point_cloud(raw).event.ids.tolist() == [1, IMPOSSIBLE_ID]
+        raw = ros.serialise(ros.point_cloud(np.ones((2, 3)), {'id': np.array([bad_id, bad_id])}))
         with pytest.raises(MessageError, match='not a whole number'):
             point_clouds.decode_point_cloud(raw)
 
@@ -400,13 +402,19 @@ class TestPointCloud2:
         event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
         assert event.ids.tolist() == [-1, largest - 1, largest]
         cloud['id'][0, 2] = largest + 1
+        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        assert event.ids.tolist() == [-1, largest - 1, IMPOSSIBLE_ID]
+        cloud['id'][0] = largest + 1
         reason = f'landmark id {largest + 1} .* whole number from -1 to {largest}$'
         with pytest.raises(MessageError, match=reason):
             point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
 
-    def test_negative_id_is_refused(self):
+    def test_a_point_with_a_negative_id_is_marked_and_clouds_of_them_are_refused(self):
         cloud = records(np.dtype([('x', 'f4'), ('y', 'f4'), ('z', 'f4'), ('id', 'i4')]))
         cloud['id'][0, 2] = -5
+        event = point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud))).event
+        assert (event.ids == IMPOSSIBLE_ID).tolist() == [False, False, True]
+        cloud['id'][0] = -5
         with pytest.raises(MessageError, match='negative landmark id -5'):
             point_clouds.decode_point_cloud2(ros.serialise(ros.point_cloud2(cloud)))
 

@@ -34,9 +34,20 @@ from slam_observer_ros.nodes.services.control_services import ControlServices
 def fail(*_):
     raise np.linalg.LinAlgError('singular matrix')
 
-def break_filter(self, _message):
-    self._estimator._hypotheses.best.filter.observer.A = np.full((4, 4), np.nan)
+def break_filter(self, message):
+    broken = self._estimator._hypotheses.best.filter
+    if message.data == 1:
+        broken.observer.A = np.full((4, 4), np.nan)
+    else:
+        broken.joint.P = np.full_like(broken.joint.P, np.nan)
 
+reset = Estimator.reset
+
+def told_reset(self, *pose):
+    print('was reset', flush=True)
+    reset(self, *pose)
+
+Estimator.reset = told_reset
 Hypotheses.observe = fail
 Estimator.load_map = fail
 Estimator.change_settings = fail
@@ -120,8 +131,11 @@ def test_messages_and_timers_that_fail_are_said_and_the_node_goes_on(ros, node):
 def test_an_estimate_that_is_not_finite_any_more_is_started_again(ros, node):
     broken = ros.node.create_publisher(Int64, '/observer_node/forget_landmark', 10)
     ros.wait_for_subscriber(broken)
-    broken.publish(Int64(data=1))
-    node.wait_for_output('not finite any more.*starting again')
+    for number in (1, 2):  # the pose, or its covariance
+        before = node.output.count('was reset')
+        broken.publish(Int64(data=number))
+        ros.spin_until(lambda count=before: node.output.count('was reset') > count, 'a new start')
+    assert node.output.count('not finite any more') == 1  # in ten seconds
     assert ros.call(Trigger, '/observer_node/pause', Trigger.Request()).success
     assert node.stop() == 0
 

@@ -161,6 +161,17 @@ def test_alone_the_observer_activates_itself(nodes):
     }
 
 
+def test_a_map_that_is_given_is_not_added_to_unless_the_parameter_file_says_so(nodes):
+    """Both files have the section /**, of which the later one wins."""
+    with_map = nodes('localization.launch.py', map_file='/hall.yaml')
+    without = nodes('localization.launch.py')
+    counts = [len(each['lifecycle_observer_node']['parameters']) for each in (with_map, without)]
+    assert counts == [3, 2]
+    defaults = LAUNCH_FOLDER.parent / 'config' / 'localization.yaml'
+    assert '/**:' in defaults.read_text()
+    assert 'localization_mode: uncertain' in defaults.read_text()
+
+
 def test_it_waits_for_transitions_where_it_must_not_start_by_itself(nodes):
     started = nodes('localization.launch.py', autostart='false')
     assert parameters(started['lifecycle_observer_node'])['autostart_node'] is False

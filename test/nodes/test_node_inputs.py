@@ -613,3 +613,21 @@ def test_a_callback_gets_what_dds_knows_of_a_message_from_every_executor():
     assert received == [(b'1', {'received_timestamp': 1}), (b'2', {'received_timestamp': 2})]
     with pytest.raises(TypeError):  # rclpy would take it for one that wants the message alone
         inspect.signature(callback).bind(b'')
+
+
+def test_a_twist_along_the_axes_of_the_odometrys_frame_is_reported_once():
+    node = Mock()
+    node.resolve_topic_name.side_effect = lambda topic: f'/robot/{topic}'
+    decode = warning_decoders.OdometryDecoder(node)
+    for step in range(500):  # ahead, but along y of its frame
+        angle, stamp_ns = np.pi / 2, step * SECOND // 50
+        message = Odometry(header=MESSAGES.header(stamp_ns, 'odom'), child_frame_id='base_link')
+        message.pose.pose.position.y = 0.01 * step
+        message.pose.pose.orientation.z = float(np.sin(angle / 2))
+        message.pose.pose.orientation.w = float(np.cos(angle / 2))
+        message.twist.twist.linear.y = 0.5
+        decode(serialize_message(message), 0)
+    (text,) = (call.args[0] for call in node.get_logger().warning.call_args_list)
+    assert text == decode.problem
+    assert text.startswith("the twist on '/robot/twist' is along the axes of 'odom'")
+    assert text.endswith("set velocity_source to 'pose_differences'")

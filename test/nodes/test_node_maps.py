@@ -25,12 +25,15 @@ from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.matrices import diagonal_blocks
+from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.known_map.map_file import read_map
 from slam_observer_ros.messages.poses_and_velocities import pose_matrices
 from slam_observer_ros.messages.state_messages import StateMessages, uncertain_pose
+from slam_observer_ros.nodes.intake.transformed_odometry import TransformedOdometry
 from slam_observer_ros.nodes.message_classes import MESSAGES
 from slam_observer_ros.nodes.services.initial_pose import filled_in, InitialPoseListener
 from slam_observer_ros.settings.estimator_settings import Settings
+from slam_observer_ros.settings.node_settings import ObserverNodeSettings
 
 pytestmark = pytest.mark.ros
 
@@ -128,9 +131,9 @@ def name_file(ros, path, must_succeed=True):
     return result
 
 
-def initial_pose(pose, frame_id='map', variances=(0.01,) * 6):
+def initial_pose(pose, frame_id='map', variances=(0.01,) * 6, stamp_ns=None):
     uncertain = uncertain_pose(pose, np.diag(variances))
-    raw = StateMessages(frame_id, '').pose(time.time_ns(), uncertain)
+    raw = StateMessages(frame_id, '').pose(stamp_ns or time.time_ns(), uncertain)
     return deserialize_message(raw, PoseWithCovarianceStamped)
 
 
@@ -272,14 +275,28 @@ class GivenPose:
 
     def __init__(self, reorder_window=0.0):
         self.estimator = Estimator(Settings(reorder_window=reorder_window))
+        self.odometry = np.eye(4)
         self.stamp_ns = 0
         self.node, self.on_move = Mock(), Mock()
-        InitialPoseListener(self.node, 'map', self.estimator, self.on_move)
+        self.node.get_clock().now().nanoseconds = 2**62
+        self.transforms = TransformBuffer()
+        odometry = TransformedOdometry(ObserverNodeSettings(), self.transforms)
+        InitialPoseListener(self.node, 'map', self.estimator, odometry, self.on_move)
         self.receive = self.node.create_subscription.call_args.args[2]
         self.see()
 
     def give(self, *arguments, **options):
         self.receive(serialize_message(initial_pose(*arguments, **options)))
+
+    def drive(self, seconds, V):
+        """Drive on, and let the odometry on /tf say so, too."""
+        for _ in range(round(10 * seconds)):
+            self.estimator.add(VelocityEvent(self.stamp_ns, V))
+            self.transforms.insert('odom', 'base_link', self.stamp_ns, self.odometry)
+            self.odometry = self.odometry @ se3.exp(0.1 * V)
+            self.stamp_ns += 100_000_000
+        self.transforms.insert('odom', 'base_link', self.stamp_ns, self.odometry)
+        self.estimator.add(VelocityEvent(self.stamp_ns, V))
 
     def see(self):
         points = np.random.default_rng(1).normal(size=(5, 3))
@@ -305,6 +322,44 @@ def test_an_initial_pose_may_have_a_frame_with_a_slash_or_none(frame_id):
     given.give(se3.pose(np.eye(3), np.array([3.0, 0.0, 0.0])), frame_id=frame_id)
     assert_allclose(given.estimator.pose[0, 3], 3.0)
     given.on_move.assert_called_once_with()
+
+
+CIRCLE = np.array([0.0, 0.0, 0.2, 0.5, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(('age_s', 'knows_velocities'), [(2, True), (8, False)])
+def test_the_motion_since_the_stamp_of_an_initial_pose_is_added(
+    age_s, knows_velocities, monkeypatch
+):
+    """By the velocities, which are known for seconds, or else by the odometry on /tf."""
+    given = GivenPose()
+    given.drive(30, CIRCLE)
+    pose = se3.from_rpy((1.0, -2.0, 0.0, 0.0, 0.0, 1.0))
+    old_ns = given.stamp_ns - age_s * 1_000_000_000
+    if not knows_velocities:
+        monkeypatch.setattr(given.estimator, 'knows_motion_since', lambda _stamp_ns: False)
+    given.give(pose, stamp_ns=old_ns, variances=(1e-8, 1e-8, 1e-4, 1e-8, 1e-8, 1e-8))
+    moved = pose @ se3.exp(age_s * CIRCLE)
+    assert_allclose(given.estimator.pose, moved, atol=1e-6)
+    # The error of the heading turns the way since, of several metres.
+    way = np.linalg.norm(moved[:2, 3] - pose[:2, 3])
+    sigma = np.sqrt(np.trace(given.estimator.pose_covariance[3:, 3:]))
+    assert sigma > 0.99 * way * 0.01
+    given.node.get_logger().warning.assert_not_called()
+
+
+@pytest.mark.parametrize(
+    ('age_s', 'said'), [(25.0, 'how the robot moved since is not known'), (-3.0, 'ahead of')]
+)
+def test_what_is_not_known_of_the_stamp_of_an_initial_pose_is_said(age_s, said):
+    given = GivenPose()
+    given.drive(30, CIRCLE)
+    given.node.get_clock().now().nanoseconds = given.stamp_ns
+    pose = se3.from_rpy((1.0, -2.0, 0.0, 0.0, 0.0, 1.0))
+    given.give(pose, stamp_ns=given.stamp_ns - round(age_s * 1e9))
+    assert_allclose(given.estimator.pose, pose, atol=1e-6)
+    (text,) = given.node.get_logger().warning.call_args.args
+    assert said in text
 
 
 def test_an_initial_pose_is_that_of_the_newest_message_even_if_that_waits_for_others():
@@ -459,21 +514,21 @@ def test_with_wrong_parameters_the_node_says_why_and_does_not_start(tmp_path, pa
     assert 'Traceback' not in node.output
 
 
-def test_without_ids_the_pose_in_a_map_is_asked_for(ros, robot, tmp_path):
+def test_points_without_ids_that_fit_nowhere_in_a_map_are_reported(ros, robot, tmp_path):
     diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
     surveyed = robot.surveyed_file(tmp_path / 'surveyed.yaml', range(5))
-    message = 'points have no ids: give the pose on initialpose'
+    message = 'fits no place in the map yet: drive on, or give the pose on initialpose'
 
     def is_reported():
         return diagnostics and message in diagnostics[-1].status[0].message
 
     def see_without_ids():
-        ids, points = np.full(3, UNKNOWN_ID), robot.points[2:5]
+        ids, points = np.full(3, UNKNOWN_ID), 1.5 * robot.points[2:5]  # not in the map
         robot.landmarks.publish(MESSAGES.point_cloud2(time.time_ns(), 'base_link', ids, points))
         ros.spin_for(0.1)
 
     with running('observer_node', tmp_path / 'log', map_file=surveyed, **PARAMETERS) as node:
-        node.wait_for_output('until three of them are recognised by their ids, or it is given on')
+        node.wait_for_output('until three of them are recognised by their ids, more without ids')
         robot.connect()
         robot.see(np.eye(4), [0, 1])
         diagnostics.clear()

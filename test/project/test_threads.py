@@ -24,6 +24,11 @@ main(['replay', 'nothing.mcap'])
 LIBRARY = """
 import slam_observer_ros.estimator.estimator
 """
+PROGRAM = """
+from slam_observer_ros.common.threads import use_one_thread
+use_one_thread()
+from slam_observer_ros import Estimator
+"""
 COUNT = """
 import json, threadpoolctl
 print(json.dumps([pool['num_threads'] for pool in threadpoolctl.threadpool_info()]))
@@ -43,7 +48,7 @@ def threads_of(program, **choice):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize('program', [COMMAND, pytest.param(NODE, marks=pytest.mark.ros)])
+@pytest.mark.parametrize('program', [COMMAND, PROGRAM, pytest.param(NODE, marks=pytest.mark.ros)])
 def test_programs_compute_in_one_thread(program):
     assert set(threads_of(program)) == {1}
 

@@ -201,6 +201,21 @@ def test_a_file_that_is_cut_off_is_read_up_to_there(tmp_path, compression, has_s
         assert 'cut off or damaged' in warning
 
 
+def test_behind_damage_among_messages_outside_chunks_it_goes_on_with_the_next_one(tmp_path):
+    path = write(tmp_path / 'run.mcap', use_chunking=False)
+    data = bytearray(path.read_bytes())
+    messages = [begin for opcode, begin, _ in records_of(data) if opcode == Opcode.MESSAGE]
+    data[messages[100] : messages[100] + 40] = bytes(40)
+    path.write_bytes(data)
+    found, loss, warning = contents(path)
+    rows = list(run())
+    assert found == rows[:100] + rows[101:]
+    assert loss.message_count == 1
+    assert loss.byte_count == messages[101] - messages[100]
+    assert not loss.is_cut_off
+    assert str(loss) in warning
+
+
 def test_a_message_of_the_beginning_in_the_last_chunk_does_not_keep_all_others_waiting(tmp_path):
     """They would all be held in memory until the end, and be copied with each chunk."""
     random = np.random.default_rng(0)  # which does not compress

@@ -215,3 +215,57 @@ def test_moving_the_slider_moves_the_robot(report):
     moved.write_text(script.join(report.read_text().rsplit('</body>', 1)))
     x = numbers_of(report)['instants']['xyz'][1][0]
     assert re.search('<title>([^<]*)', open_page(moved).html).group(1) == f'robot at {x}'
+
+
+PHONE = """<body><iframe src="{}" style="width:390px;height:800px;border:0"></iframe><script>
+addEventListener('message', (event) => {{ document.title = event.data; }});</script></body>"""
+
+
+def test_a_phone_shows_all_columns_and_scrolls_in_one_direction(slam_observer, tmp_path):
+    report = tmp_path / 'run.html'
+    slam_observer.succeed('replay', SAMPLE, '--report', report)
+    assert not numbers_of(report)['is_flat']
+    script = """<script>
+        const wide = document.getElementById('landmarks').parentElement;
+        const page = document.documentElement;
+        parent.postMessage([page.scrollWidth, page.clientWidth,
+          wide.scrollWidth - wide.clientWidth, document.querySelectorAll('#landmarks th').length,
+          document.querySelector('#side .main-svg').clientWidth].join(), '*');
+    </script></body>"""
+    report.write_text(script.join(report.read_text().rsplit('</body>', 1)))
+    phone = tmp_path / 'phone.html'
+    phone.write_text(PHONE.format(report.as_uri()))
+    html = open_page(phone, '', '--allow-file-access-from-files').html
+    width, window, hidden, columns, side = map(
+        int, re.search('<title>([0-9,]*)', html)[1].split(',')
+    )
+    assert width <= window <= 390
+    assert (hidden, columns) == (0, 9)
+    assert 300 < side <= window
+
+
+def test_the_side_view_is_as_wide_as_the_page_and_has_no_second_colour_bar(
+    slam_observer, tmp_path
+):
+    report = tmp_path / 'run.html'
+    slam_observer.succeed('replay', SAMPLE, '--report', report)
+    script = """
+        const width = (id) => document.querySelector(`#${id} .main-svg`).clientWidth;
+        const bars = (id) => document.querySelectorAll(`#${id} .colorbar`).length;
+        document.title = [width('side') === width('map'), bars('map'), bars('side')].join();
+    """
+    assert run_in_page(report, script) == 'true,1,0'
+
+
+def test_a_report_begins_with_that_nothing_was_used(slam_observer, tmp_path):
+    recording, report = tmp_path / 'run.mcap', tmp_path / 'run.html'
+    with RecordingWriter(recording) as writer:
+        for event in events():
+            if isinstance(event, ObservationEvent):
+                event = replace(event, ids=event.ids, points=np.full_like(event.points, np.nan))
+            writer.write_event(event)
+    assert slam_observer('replay', recording, '--report', report).code == 0
+    sentence = 'No observation was used: the trajectory is that of the velocities alone.'
+    assert numbers_of(report)['findings'][0]['text'] == sentence
+    shown = open_page(report).html
+    assert shown.index(sentence) < shown.index('id="time-bar"')

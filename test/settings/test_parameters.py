@@ -15,7 +15,11 @@ from slam_observer_ros.common.errors import ParameterError
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.settings import parameter_table
 from slam_observer_ros.settings.estimator_settings import Settings
-from slam_observer_ros.settings.node_settings import ObserverNodeSettings, SimulatorNodeSettings
+from slam_observer_ros.settings.node_settings import (
+    ManagedNodeSettings,
+    ObserverNodeSettings,
+    SimulatorNodeSettings,
+)
 from slam_observer_ros.settings.parameter_file import (
     misplaced_sections,
     mixed_lists,
@@ -26,7 +30,13 @@ from slam_observer_ros.settings.parameter_table import from_parameters, paramete
 from slam_observer_ros.simulation import Scenario
 
 CONFIG_FOLDER = Path(__file__).resolve().parents[2] / 'config'
-TABLES = [Settings, Scenario, ObserverNodeSettings, SimulatorNodeSettings]
+TABLES = [
+    Settings,
+    Scenario,
+    ObserverNodeSettings,
+    ManagedNodeSettings,
+    SimulatorNodeSettings,
+]
 
 
 @dataclass(frozen=True)
@@ -82,6 +92,19 @@ def test_each_row_is_described_by_one_line_without_a_full_stop(row):
     assert row.description[0].isupper() or row.description.startswith('p')
     assert not row.description.endswith('.')
     assert row.name == row.name.lower()
+
+
+@rows_of_all_tables
+def test_each_number_has_a_least_and_a_greatest_value_that_are_refused_when_exceeded(row):
+    if isinstance(row.default, bool | str):
+        return
+    assert math.isfinite(row.minimum)
+    assert math.isfinite(row.maximum)
+    for wrong in (2 * row.maximum + 1, row.minimum - 1):
+        number = int(wrong) if isinstance(row.default, int) else wrong
+        value = (number,) * len(row.default) if isinstance(row.default, tuple) else number
+        with pytest.raises(ParameterError, match=f"'{row.name}' takes a value ≥ .*, ≤ "):
+            row.check(value)
 
 
 def test_no_name_stands_for_two_things_in_one_node():

@@ -56,7 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--strict',
         action='store_true',
         help='end with exit code 3 if anything of the recording was lost: if it is damaged, cut '
-        'off, or has malformed messages',
+        'off, or has malformed messages; or if no velocity or no observation of it was used',
     )
     add_force_option(parser)
     add_settings_options(parser, InputSettings)
@@ -84,3 +84,5 @@ def _write_and_print(args: argparse.Namespace, outcome: ReplayOutcome, map_frame
         raise OutputError('; '.join(errors))
     if args.strict and any(outcome.lost.values()):
         raise LossError(f'{args.recording}: a part of it was lost, which --strict does not allow')
+    if args.strict and outcome.nothing_used:
+        raise LossError(f'{args.recording}: --strict does not allow this: {outcome.nothing_used}')

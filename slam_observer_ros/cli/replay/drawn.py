@@ -47,6 +47,7 @@ def _reported_run(title: str, outcome: ReplayOutcome, summary: Mapping[str, str]
         raise EvaluationError('nothing was recorded that could be shown')
     return ReportedRun(
         title=title,
+        nothing_used=outcome.nothing_used,
         figures=summary,
         warnings=outcome.warnings,
         settings=estimator.settings,

@@ -62,6 +62,17 @@ class ReplayOutcome:
         return dict(self.result.estimator.dropped + self.unused)
 
     @property
+    def nothing_used(self) -> str:
+        """Which kind of input was of no use at all, as a sentence; '' if something of each was."""
+        has_velocities = self.result.estimator.counts['velocity'] > 0
+        if self.result.observations:
+            consequence = 'the landmarks alone move the robot'
+            return '' if has_velocities else f'No velocity was used: {consequence}.'
+        if has_velocities:
+            return 'No observation was used: the trajectory is that of the velocities alone.'
+        return 'Nothing was used, neither a velocity nor an observation.'
+
+    @property
     def lost(self) -> dict[str, int | float | bool]:
         """What of the recording could not be read, as ``--json`` has it."""
         return {
@@ -88,7 +99,7 @@ class ReplayOutcome:
     def truth_covered(self) -> float | None:
         """Share of the trajectory that the truth covers; None without true poses."""
         errors = self.accuracy.pose_errors
-        return None if errors is None else float(errors.covered.mean())
+        return None if errors is None else errors.covered_share
 
     @property
     def localised_after_s(self) -> float | None:

@@ -12,6 +12,7 @@ import numpy as np
 from slam_observer_ros.cli.replay.dropped import list_dropped, unused_messages
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.estimates import (
+    calibration_problems,
     MAX_REJECTED,
     MAX_REJECTED_ORIENTATIONS,
     point_share,
@@ -24,7 +25,7 @@ from slam_observer_ros.observer.designs import DESIGNS
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics
 from slam_observer_ros.runs.replay import Replay
-from slam_observer_ros.settings.input_settings import InputSettings
+from slam_observer_ros.settings.input_settings import InputSettings, POSE_DIFFERENCES
 
 MAX_UNMAPPED = 0.5
 """Share of the points beyond which they are more than what a map has not got yet."""
@@ -131,6 +132,11 @@ def check_localised(args: argparse.Namespace, result: Replay, known: LandmarkMap
 def _never_found(path: Path, result: Replay, known: LandmarkMap) -> str:
     named = known.ids[~is_automatic(known.ids)]
     least = 'two' if result.estimator.settings.two_d_mode else 'three'
+    if is_automatic(result.estimator.landmark_ids).any():
+        return (
+            f'the pose in the map {path} was not found: '
+            f'{result.estimator.localisation_problem}{_advice(result)}'
+        )
     return (
         f'the pose in the map {path} was not found: that takes {least} of its landmarks or more, '
         'recognised by their ids, well apart, and seen where the map has them; '
@@ -154,7 +160,9 @@ def _advice(result: Replay) -> str:
     )
 
 
-def warn_of_input(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
+def warn_of_input(
+    recording: Recording, selected: SelectedTopics, inputs: InputSettings, result: Replay
+) -> None:
     """Say what of the recording, or of the settings, is likely to be wrong."""
     if recording.loss and not recording.warning:
         logger.warning('%s: damaged; %s.', recording.path, recording.loss)
@@ -162,7 +170,8 @@ def warn_of_input(recording: Recording, selected: SelectedTopics, result: Replay
     _warn_of_rejections(result)
     _warn_of_calibration(result)
     _warn_of_unmapped(result)
-    _warn_of_unused_poses(recording, selected, result)
+    if inputs.velocity_source != POSE_DIFFERENCES:
+        _warn_of_unused_poses(recording, selected, result)
 
 
 def _warn_of_missing_stamps(recording: Recording) -> None:
@@ -196,9 +205,8 @@ def _warn_of_rejections(result: Replay) -> None:
 
 def _warn_of_calibration(result: Replay) -> None:
     """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
-    for part in result.estimator.calibration:
-        if part.problem:
-            logger.warning('%s', part.problem)
+    for problem in calibration_problems(result.estimator.calibration):
+        logger.warning('%s', problem)
 
 
 def _warn_of_unmapped(result: Replay) -> None:
@@ -215,7 +223,7 @@ def _warn_of_unmapped(result: Replay) -> None:
 
 
 def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result: Replay) -> None:
-    """Say where the motion is, if an odometry's velocities are all zero and its poses are not."""
+    """Say where the motion is, if an odometry's velocities are not those of its poses."""
     poses = result.dead_reckoning.poses
     stands_still = len(poses) > 1 and bool((poses == poses[0]).all())
     if stands_still and recording.contents.poses_move(selected.velocity):
@@ -223,4 +231,12 @@ def _warn_of_unused_poses(recording: Recording, selected: SelectedTopics, result
             'All velocities on %s are zero, but its poses move; '
             'try --velocity-source pose_differences.',
             selected.velocity.name,
+        )
+        return
+    problem = recording.contents.twist_problem(selected.velocity, selected.imu is None)
+    if problem and not stands_still:
+        logger.warning(
+            'The twist on %s %s; try --velocity-source pose_differences.',
+            selected.velocity.name,
+            problem,
         )

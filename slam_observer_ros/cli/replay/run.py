@@ -85,7 +85,7 @@ def _replay(
             outcome = outcome_of(recording, selected, result, truth)
             if writer is not None:
                 writer.finish(result.estimator, outcome.accuracy.pose_errors, truth.landmarks)
-        warn_of_input(recording, selected, result)
+        warn_of_input(recording, selected, inputs, result)
         warn_of_timing(recording, selected)
     if recorder is not None:
         outcome = replace(outcome, recorder=recorder)

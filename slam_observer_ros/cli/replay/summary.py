@@ -74,7 +74,8 @@ def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
     selected = outcome.selected
     estimator = outcome.result.estimator
     note = f', {outcome.missing_ids}' if outcome.missing_ids else ''
-    rows = {
+    rows = {'used': outcome.nothing_used} if outcome.nothing_used else {}
+    rows |= {
         'velocity topic': str(selected.velocity),
         'landmarks topic': f'{selected.landmarks}{note}',
         **({} if selected.imu is None else {'Imu topic': str(selected.imu)}),

@@ -65,7 +65,8 @@ def _velocity_input(
         decoders: dict[str, Any] = {ODOMETRY: decode_odometry_pose}
     else:
         decoders = _chosen(
-            VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node)}, settings.velocity_type
+            VELOCITY_DECODERS | {ODOMETRY: OdometryDecoder(node, not settings.use_imu)},
+            settings.velocity_type,
         )
     return InputTopic(node, 'twist', decoders, partial(feed.add, 'twist'), qos)
 

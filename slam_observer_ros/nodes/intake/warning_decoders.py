@@ -7,18 +7,18 @@ import time
 import numpy as np
 from rclpy.node import Node
 
-from slam_observer_ros.common.errors import MessageError
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID, VelocityEvent
+from slam_observer_ros.inputs.odometry_check import OdometryCheck
 from slam_observer_ros.messages.cdr import Buffer
 from slam_observer_ros.messages.cloud_fields import ID_NAME, missing_ids, read_fields
 from slam_observer_ros.messages.detections import no_tags, observed_tags
 from slam_observer_ros.messages.measurement import Measurement
 from slam_observer_ros.messages.message_types import CLOUD_DECODERS
 from slam_observer_ros.messages.poses_and_velocities import (
-    decode_odometry_pose,
-    decode_odometry_twist,
+    decode_odometry,
     decode_transforms,
+    PoseMessage,
 )
 
 MOVED_M = 0.1  # how far an odometry's poses go before its velocities can't all be zero
@@ -57,46 +57,49 @@ class CloudDecoder:
 
 
 class OdometryDecoder:
-    """Decodes velocities of odometries; warns if all of these are zero though the poses move.
+    """Decodes velocities of odometries; warns once if these are not those of their poses.
 
     Attributes
     ----------
     problem : str
-        What is wrong with them; empty until it is seen, and once a velocity is not zero.
+        What is wrong with them; empty until it is seen, and, where all were zero, once one is not.
 
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, uses_turn: bool = True) -> None:
         self._node = node
-        self._is_checked = False
+        self._topic = node.resolve_topic_name('twist')
+        self._gives_velocities = False
+        self._check = OdometryCheck(uses_turn)
         self.problem = ''
         self._first: FloatArray | None = None
 
     def __call__(self, raw: Buffer, receive_ns: int) -> Measurement[VelocityEvent]:
         """Decode the velocity of a nav_msgs/Odometry."""
-        message = decode_odometry_twist(raw, receive_ns)
-        # One that has given a velocity will do so again.
-        if (self.problem or not self._is_checked) and message.event.body_velocity.any():
-            self._is_checked, self.problem = True, ''
-        if not self._is_checked:
-            self._check(raw)
+        pose, message = decode_odometry(raw)
+        if not self._gives_velocities:
+            self._look_for_velocities(pose, message.event)
+        elif not self._check.is_decided:
+            self._check.add(pose, message.event)
+            if self._check.problem:
+                self._warn(f"the twist on '{self._topic}' {self._check.problem}")
         return message
 
-    def _check(self, raw: Buffer) -> None:
-        try:
-            position = decode_odometry_pose(raw).position
-        except MessageError:  # with a quaternion of zeros, say: nobody asked for its pose
+    def _look_for_velocities(self, pose: PoseMessage, event: VelocityEvent) -> None:
+        # One that has given a velocity will do so again.
+        self._gives_velocities = bool(event.body_velocity.any())
+        if self._gives_velocities:
+            self.problem = ''
+        if self._gives_velocities or self.problem or pose.problem:  # nobody asked for its pose
             return
         if self._first is None:
-            self._first = position
-        if np.linalg.norm(position - self._first) > MOVED_M:
-            self._is_checked = True
-            topic = self._node.resolve_topic_name('twist')
-            self.problem = (
-                f"all velocities on '{topic}' are zero, but its poses move: set velocity_source "
-                "to 'pose_differences'"
-            )
-            self._node.get_logger().warning(self.problem)
+            self._first = pose.position
+        if np.linalg.norm(pose.position - self._first) > MOVED_M:
+            self._warn(f"all velocities on '{self._topic}' are zero, but its poses move")
+
+    def _warn(self, problem: str) -> None:
+        self.problem = f"{problem}: set velocity_source to 'pose_differences'"
+        self._node.get_logger().warning(self.problem)
 
 
 class TagDecoder:

@@ -33,7 +33,14 @@ MANY_UNUSED = 20  # messages, none of which was used, that are no transient of t
 USED_AS = {'twist': 'velocity', 'landmarks': 'observation'}
 """Inputs, and what their messages are counted as when they are used."""
 
-LEFT_OUT = ('rejected_landmark', 'unknown_id', 'repeated_id', 'reserved_id')
+LEFT_OUT = (
+    'rejected_landmark',
+    'unknown_id',
+    'repeated_id',
+    'reserved_id',
+    'impossible_id',
+    'unweighed_point',
+)
 """Points not used for something that is wrong; those that are not in a known map may be right."""
 
 
@@ -151,7 +158,7 @@ class DiagnosticsPublisher:
         warnings.append(self._node.last_failure)
         if not self._estimator.is_localised:
             warnings.append('the pose in the loaded map is not known yet: no pose is published')
-            warnings.append(self._ids_warning())
+            warnings.append(self._places_warning())
         return [warning for warning in warnings if warning]
 
     def _unused_warning(self, source: InputTopic[Any]) -> str:
@@ -176,13 +183,12 @@ class DiagnosticsPublisher:
             )
         return f'no landmark in {observations} messages so far'
 
-    def _ids_warning(self) -> str:
-        """Report that the pose in a map can't be found: nothing that is seen has an id."""
+    def _places_warning(self) -> str:
+        """Report where in a map points without ids fit."""
         # Landmarks that came without an id have one that was given here.
-        ids = self._estimator.landmark_ids
-        if not len(ids) or not is_automatic(ids).all():
+        if not is_automatic(self._estimator.landmark_ids).any():
             return ''
-        return 'points have no ids: give the pose on initialpose'
+        return f'{self._estimator.localisation_problem} on initialpose'
 
     def _rejection_warnings(self, new: Counter[str]) -> list[str]:
         """Report that more points or orientations were rejected of late than are outliers."""
@@ -207,7 +213,7 @@ class DiagnosticsPublisher:
     def _points_warning(new: Counter[str]) -> str:
         """Report points left out since the last time: most of them, or for their ids."""
         left_out = {name: new[name] for name in LEFT_OUT if new[name]}
-        of_wrong_ids = new['repeated_id'] + new['reserved_id']
+        of_wrong_ids = new['repeated_id'] + new['reserved_id'] + new['impossible_id']
         if not (of_wrong_ids or 2 * sum(left_out.values()) > new['observed_point']):
             return ''
         reasons = ', '.join(f'{count} {UNUSED_POINTS[name]}' for name, count in left_out.items())

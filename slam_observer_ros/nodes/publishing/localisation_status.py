@@ -151,7 +151,10 @@ class LocalisationStatus:
 def deviations(covariance: FloatArray) -> tuple[float, float]:
     """Return standard deviations of position, in its worst direction, m, and of heading, rad.
 
-    ``covariance`` (6, 6) is that of rotation vector and position along the map's axes.
+    ``covariance`` (6, 6) is that of rotation vector and position along the map's axes; both are
+    infinite if it is not finite.
     """
+    if not np.isfinite(covariance).all():
+        return np.inf, np.inf
     position_m2 = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
     return float(np.sqrt(max(position_m2, 0.0))), float(np.sqrt(max(covariance[2, 2], 0.0)))

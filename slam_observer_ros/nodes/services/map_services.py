@@ -225,8 +225,8 @@ class MapServices:
         if not estimator.is_localised:
             number = 'two' if estimator.settings.two_d_mode else 'three'
             return (
-                f'the pose is unknown until {number} of them are recognised by their ids, or it '
-                'is given on initialpose'
+                f'the pose is unknown until {number} of them are recognised by their ids, more '
+                'without ids by how they lie to each other, or it is given on initialpose'
             )
         if estimator.last_update is None:
             x, y, z = estimator.pose[:3, 3].tolist()

@@ -90,8 +90,8 @@ class CompressedCovariance(JointCovariance):
     def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
         """Update P and return the error x of pose, calibration and active landmarks."""
         HP, HPH = self.project(C, rows)
-        postponed, p = self._postponed, self._p
-        H_Phi = C.reshape(-1, p) @ postponed.Phi[:p] - postponed.Phi[self._columns(rows)]
+        postponed, p, q = self._postponed, self._p, C.shape[2]
+        H_Phi = C.reshape(-1, q) @ postponed.Phi[:q] - postponed.Phi[self._columns(rows)]
         # L⁻¹ of all that is multiplied by S⁻¹ = L⁻ᵀ L⁻¹.
         whitened = _whitened(with_blocks(HPH, R), np.column_stack([HP, H_Phi, r.ravel()]))
         W, W_Phi, z = np.split(whitened, [len(self.P), whitened.shape[1] - 1], axis=1)
@@ -137,26 +137,27 @@ class CompressedCovariance(JointCovariance):
 
     # Landmarks
 
-    def add_seen(self, covariances: FloatArray) -> None:
-        """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3)."""
+    def add_seen(self, covariances: FloatArray, D: FloatArray | None = None) -> None:
+        """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3), R̂ D_i."""
         for start in range(0, len(covariances), self._size.most):
             if len(self.active) > self._most:
                 self._switch(self._chosen(self.active[:0]))
-            super().add_seen(covariances[start : start + self._size.most])
+            part = slice(start, start + self._size.most)
+            super().add_seen(covariances[part], None if D is None else D[part])
 
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
+        """Return the covariances with ε (m, p, k) and own (m, k, k) of C_i (ε, c̃) − ξ_i alone."""
         is_active = self._places[rows] >= 0
         if is_active.all():
             return super().output(C, rows)
-        m, k, p = len(rows), self._axes.point, self._p
+        m, k, p, q = len(rows), self._axes.point, self._p, C.shape[2]
         with_pose, own = np.empty((m, p, k)), np.empty((m, k, k))
         with_pose[is_active], own[is_active] = super().output(C[is_active], rows[is_active])
-        to_pose, their_own = self._of_others(rows[~is_active])
+        to_state, their_own = self._of_others(rows[~is_active], q)
         C = C[~is_active]
-        PC = self.pose @ transpose(C) - transpose(to_pose)
-        with_pose[~is_active] = PC
-        own[~is_active] = C @ PC - to_pose @ transpose(C) + their_own
+        PC = self.P[:q, :q] @ transpose(C) - transpose(to_state)
+        with_pose[~is_active] = PC[:, :p]
+        own[~is_active] = C @ PC - to_state @ transpose(C) + their_own
         return with_pose, own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -333,20 +334,21 @@ class CompressedCovariance(JointCovariance):
         self.active, self._places = rows, np.full(n, -1)
         self._places[rows] = np.arange(len(rows))
 
-    def _of_others(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances with ε (m, k, p) and own (m, k, k) of ξ_i outside."""
+    def _of_others(self, rows: IntArray, q: int) -> tuple[FloatArray, FloatArray]:
+        """Return covariances with q first entries of x (m, k, q), own (m, k, k) of ξ_i outside."""
         slots, postponed = self._slots[rows], self._postponed
         X, T = self._outside.blocks(slots), self._turning(self._outside.references[slots])
-        to_pose = X @ postponed.Phi[: self._p].T
-        turned = T @ transpose(to_pose)
+        to_state, p = X @ postponed.Phi[:q].T, self._p
+        turned = T @ transpose(to_state[:, :, :p])
         own = self._outside.own[slots] - (X @ postponed.Psi) @ transpose(X)
         own = own + turned + transpose(turned) + T @ self.pose @ transpose(T)
-        return to_pose + T @ self.pose, own
+        return to_state + T @ self.P[:p, :q], own
 
     def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
         super()._insert(rows, C, noise)
         Phi = self._postponed.Phi
-        Phi[self._columns(rows)] = C.reshape(-1, self._p) @ Phi[: self._p]
+        q = C.shape[2]
+        Phi[self._columns(rows)] = C.reshape(-1, q) @ Phi[:q]
 
     def _make_room(self, m: int) -> IntArray:
         """Append rows and columns for m landmarks; return which landmarks they are."""

@@ -5,6 +5,10 @@ landmarks, ξ_i = ã_i + [ŷ_i]× ε_Ω with ã_i that of the estimate ŷ_i in t
 p axes of ε and k of a point are those that are estimated. A point that moves with the pose has
 ξ_i = ε_v, so residuals are r_i = ε_v − ξ_i whatever the map is (A. Barrau and
 S. Bonnabel, *The invariant extended Kalman filter as a stable observer*, 2017).
+
+Where the sensor is calibrated as well, r_i = ε_v − ξ_i + R̂ D_i c̃ (:mod:`.sensor_calibration`).
+The blocks C_i of all methods are of ε (m, k, p), or of (ε, c̃), the first entries of x
+(m, k, p + c).
 """
 
 from __future__ import annotations
@@ -62,6 +66,18 @@ class JointCovariance:
         """(c,) variances of the calibration."""
         variances: FloatArray = np.diagonal(self.P)[self._p : self.first]
         return variances
+
+    def add_calibration(self, variances: FloatArray) -> None:
+        """Append entries (c,) to c̃ that are independent of all else."""
+        before, count = self.P, len(variances)
+        at = np.append(np.arange(self.first), np.arange(self.first, len(before)) + count)
+        P = np.zeros((len(before) + count,) * 2)
+        P[np.ix_(at, at)] = before
+        new = np.arange(self.first, self.first + count)
+        P[new, new] = variances
+        self.first += count
+        self._first_columns = self._first_columns + count
+        self.P = P
 
     def landmarks(self, points: FloatArray, ahead_s: float = 0.0) -> FloatArray:
         """Return the covariances (n, 3, 3) of ã_i for ``points`` (n, 3), ``ahead_s`` from now."""
@@ -122,32 +138,38 @@ class JointCovariance:
         P[c, c] += motion.drift
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
-        """Return C_i (m, k, p) of r_i = C_i ε − ξ_i, at ``chord`` from ŷ_i to the point seen."""
+        """Return C_i of r_i = C_i (ε, c̃) − ξ_i, at ``chord`` from ŷ_i to the point seen."""
         # [0, I] at ŷ_i. Turning ŷ_i to the point seen, by however much, moves it at right angles
         # to the middle between them: judged by C at ŷ_i, a robot that has turned further than it
         # knows would reject what it sees.
-        return self._axes.output_matrix(chord * residuals.r)
+        return self._with_sensor(self._axes.output_matrix(chord * residuals.r), residuals.D)
+
+    def _with_sensor(self, C: FloatArray, D: FloatArray | None) -> FloatArray:
+        """Return C_i (m, k, p + c) of C_i (m, k, p) and R̂ D_i (m, 3, c), if there is one."""
+        return C if D is None else np.concatenate([C, D[:, : self._axes.point]], axis=2)
 
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return H P (m k, …) and H P Hᵀ (m k, m k) of H x = C_i ε − ξ_i, C_i (m, k, p)."""
-        C, columns = C.reshape(-1, self._p), self._columns(rows)
-        HP = C.dot(self.P[: self._p]) - self._matrix.rows(columns)
-        return HP, HP[:, : self._p].dot(C.T) - HP.take(columns, axis=1)
+        """Return H P (m k, …) and H P Hᵀ (m k, m k) of H x = C_i (ε, c̃) − ξ_i."""
+        q, columns = C.shape[2], self._columns(rows)
+        C = C.reshape(-1, q)
+        HP = C.dot(self.P[:q]) - self._matrix.rows(columns)
+        return HP, HP[:, :q].dot(C.T) - HP.take(columns, axis=1)
 
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε − ξ_i alone."""
-        P, columns = self.P, self._columns(rows).reshape(len(rows), self._axes.point)
-        to_pose, own = P[columns, : self._p], P[columns[..., :, None], columns[..., None, :]]
-        PC = self.pose @ transpose(C) - transpose(to_pose)
-        return PC, C @ PC - to_pose @ transpose(C) + own
+        """Return the covariances with ε (m, p, k) and own (m, k, k) of C_i (ε, c̃) − ξ_i alone."""
+        P, q = self.P, C.shape[2]
+        columns = self._columns(rows).reshape(len(rows), self._axes.point)
+        to_state, own = P[columns, :q], P[columns[..., :, None], columns[..., None, :]]
+        PC = P[:q, :q] @ transpose(C) - transpose(to_state)
+        return PC[:, : self._p], C @ PC - to_state @ transpose(C) + own
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the same of all together, (p, m k) and (m k, m k)."""
-        C, columns = C.reshape(-1, self._p), self._columns(rows)
-        seen = self._matrix.rows(columns)
-        to_pose = seen[:, : self._p]
-        PC = self.pose.dot(C.T) - to_pose.T
-        return PC, C.dot(PC) - to_pose.dot(C.T) + seen.take(columns, axis=1)
+        q, columns = C.shape[2], self._columns(rows)
+        C, seen = C.reshape(-1, q), self._matrix.rows(columns)
+        to_state = seen[:, :q]
+        PC = self.P[:q, :q].dot(C.T) - to_state.T
+        return PC[: self._p], C.dot(PC) - to_state.dot(C.T) + seen.take(columns, axis=1)
 
     def correct(self, C: FloatArray, rows: IntArray, R: FloatArray, r: FloatArray) -> FloatArray:
         """Return −K r of residuals r (m, k) of noise R (m, k, k), K = P Hᵀ S⁻¹, and update P."""
@@ -174,10 +196,10 @@ class JointCovariance:
 
     # Landmarks
 
-    def add_seen(self, covariances: FloatArray) -> None:
-        """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3)."""
+    def add_seen(self, covariances: FloatArray, D: FloatArray | None = None) -> None:
+        """Append landmarks (m,) seen for the first time, with covariances (m, 3, 3), R̂ D_i."""
         rows, noise = self._make_room(len(covariances)), self._noise(covariances)
-        self._insert(rows, self._moving(rows), noise)
+        self._insert(rows, self._with_sensor(self._moving(rows), D), noise)
 
     def add_known(self, points: FloatArray, covariances: FloatArray) -> None:
         """Append landmarks at ``points`` (m, 3) whose errors ã_i are independent of all else."""
@@ -188,9 +210,12 @@ class JointCovariance:
         rows, covariance = self._make_room(len(known)), known.covariance_on(self._axes)
         self._insert(rows, self._turning(known.points), covariance)
 
-    def relocate(self, rows: IntArray, covariances: FloatArray) -> None:
-        """Take landmarks (m,) for newly seen ones, with covariances (m, 3, 3)."""
-        self._insert(rows, self._moving(covariances), self._noise(covariances))
+    def relocate(
+        self, rows: IntArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
+        """Take landmarks (m,) for newly seen ones, with covariances (m, 3, 3), R̂ D_i."""
+        C = self._with_sensor(self._moving(covariances), D)
+        self._insert(rows, C, self._noise(covariances))
 
     def remove(self, rows: IntArray) -> None:
         """Delete the rows and columns of landmarks."""
@@ -244,11 +269,12 @@ class JointCovariance:
         return block_diagonal(covariances[:, :k, :k])
 
     def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
-        # ξ_i = C_i ε + noise of this covariance (m k, m k)
-        columns, C = self._columns(rows), C.reshape(-1, self._p)
-        CP = C @ self.P[: self._p]
+        # ξ_i = C_i (ε, c̃) + noise of this covariance (m k, m k)
+        q, columns = C.shape[2], self._columns(rows)
+        C = C.reshape(-1, q)
+        CP = C @ self.P[:q]
         self.P[columns], self.P[:, columns] = CP, CP.T
-        own = CP[:, : self._p] @ C.T + noise
+        own = CP[:, :q] @ C.T + noise
         self.P[np.ix_(columns, columns)] = 0.5 * (own + own.T)
 
     def _make_room(self, m: int) -> IntArray:
@@ -297,23 +323,26 @@ class ExactMapCovariance(JointCovariance):
         motion.predict(self.P)
 
     def output_matrix(self, residuals: Residuals, chord: float = 0.0) -> FloatArray:
-        """Return C_i (m, k, p) of r_i = C_i ε: [−[ŷ_i]×, I]."""
-        return self._axes.output_matrix(residuals.landmarks + chord * residuals.r)
+        """Return C_i of r_i = C_i (ε, c̃): [−[ŷ_i]×, I] of ε."""
+        C = self._axes.output_matrix(residuals.landmarks + chord * residuals.r)
+        return self._with_sensor(C, residuals.D)
 
     def project(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return H P and H P Hᵀ of H x = C_i ε."""
-        C = C.reshape(-1, self._p)
-        HP = C @ self.P[: self._p]
-        return HP, HP[:, : self._p] @ C.T
+        """Return H P and H P Hᵀ of H x = C_i (ε, c̃)."""
+        q = C.shape[2]
+        C = C.reshape(-1, q)
+        HP = C @ self.P[:q]
+        return HP, HP[:, :q] @ C.T
 
     def output(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i ε alone."""
-        PC = self.pose @ transpose(C)
-        return PC, C @ PC
+        """Return the covariances with ε (m, p, k) and own (m, k, k) of each C_i (ε, c̃) alone."""
+        q = C.shape[-1]
+        PC = self.P[:q, :q] @ transpose(C)
+        return PC[..., : self._p, :], C @ PC
 
     def outputs(self, C: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the same of all together, (p, m k) and (m k, m k)."""
-        return self.output(C.reshape(-1, self._p), rows)
+        return self.output(C.reshape(-1, C.shape[2]), rows)
 
     def remove(self, rows: IntArray) -> None:
         """Forget landmarks."""

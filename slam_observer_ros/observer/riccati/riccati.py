@@ -5,8 +5,9 @@ of :mod:`.joint_covariance` the residual (33) is r_i = H_i x with the same H_i f
 
     H_i = [ 0  I  0 … −I … 0 ],
 
-and what no observation can determine, the choice of the world's frame, is exactly in its null
-space: the covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
+or with R̂ D_i at the calibration of the sensor that saw it (:mod:`.sensor_calibration`), and what
+no observation can determine, the choice of the world's frame, is exactly in its null space: the
+covariance stays honest. This is the right-invariant EKF on SE_{n+1}(3), which acts on
 X̂ ∈ SLAM_n(3) by X̂ ← exp(−K r) · X̂. An observation of m of n landmarks costs O(m n²),
 in large maps less: :mod:`.compressed_covariance`.
 """
@@ -37,7 +38,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 
 class RiccatiFilter(Filter):
-    """Gains from the full covariance P, ``joint``, of pose, velocity calibration and landmarks."""
+    """Gains from the full covariance P, ``joint``, of pose, calibration and landmarks."""
 
     joint: JointCovariance
     has_joint_covariance: ClassVar[bool] = True
@@ -90,11 +91,21 @@ class RiccatiFilter(Filter):
         C = self.joint.output_matrix(residuals, chord=0.5)
         return self.joint.outputs(C, residuals.rows)
 
-    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+    def add_sensor(self, frame: str) -> None:
+        """Let the calibration of the sensor of another frame be part of the state, and of P."""
+        sensor = self.calibration.add_sensor(frame)
+        if len(sensor.variances):
+            self.joint = self.joint.dense()
+            self.joint.add_calibration(sensor.variances)
+            self._compress_if_large(0)
+
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
         self._compress_if_large(len(points))
         super().add(points, covariances)
-        self.joint.add_seen(self.observer.turned(covariances))
+        self.joint.add_seen(self.observer.turned(covariances), D)
 
     def add_known(self, known: KnownLandmarks) -> None:
         """Append landmarks whose errors are independent of all else, or only of all others."""
@@ -108,11 +119,17 @@ class RiccatiFilter(Filter):
         super().add_known(known)
         self._compress_if_large(0)
 
-    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones; what was known of them is forgotten."""
         self.joint.activate(rows)
         super().relocate(rows, points, covariances)
-        self.joint.relocate(rows, self.observer.turned(covariances))
+        self.joint.relocate(rows, self.observer.turned(covariances), D)
 
     def remove(self, rows: IntArray) -> None:
         """Forget the landmarks at ``rows``."""

@@ -11,7 +11,7 @@ class SharedArray:
     """An array that is copied when it is to be changed while others have it."""
 
     def __init__(self, array: FloatArray, owner: object) -> None:
-        self.array = array  # to be read; :meth:`writable` has it to be changed
+        self.array = array  # to be changed only by the owner of :meth:`owned_by`
         self._owners = WeakSet([owner])
 
     def share(self, owner: object) -> SharedArray:

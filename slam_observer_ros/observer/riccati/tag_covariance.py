@@ -2,8 +2,9 @@
 
 The errors are x = (ε, c̃, (ξ_1, ω_1) … ), with B̂_i = exp(ω_i) B_i of the tag's orientation in the
 reference frame. No motion changes ω_i, and what is seen of it, R_Â Z_i B̂_iᵀ = exp(φ_i), says
-φ_i = ε_Ω − ω_i, whatever the map is: the group is :mod:`slam_observer_ros.geometry.tag_group`.
-A landmark that has no orientation may have any, and its columns say so.
+φ_i = ε_Ω − ω_i, with D c̃ of a calibrated sensor, whatever the map is: the group is
+:mod:`slam_observer_ros.geometry.tag_group`. A landmark that has no orientation may have any, and
+its columns say so.
 """
 
 from __future__ import annotations
@@ -90,12 +91,14 @@ class TagCovariance(JointCovariance):
         q = self._axes.turn
         self.add_known_turns(rows, np.tile(UNKNOWN_RAD**2 * np.eye(q), (len(rows), 1, 1)))
 
-    def add_turns(self, rows: IntArray, covariances: FloatArray) -> None:
-        """Take over orientations (m,) seen for the first time: ω_i = ε_Ω + noise (m, q, q)."""
-        columns, q = self._turn_columns(rows), self._axes.turn
-        of_pose = np.tile(self.P[:q], (len(rows), 1))
-        self.P[columns], self.P[:, columns] = of_pose, of_pose.T
-        own = np.tile(of_pose[:, :q], len(rows)) + block_diagonal(covariances)
+    def add_turns(
+        self, rows: IntArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
+        """Take over orientations (m,) seen for the first time: ω_i = φ_i + noise (m, q, q)."""
+        columns, (HP, HPH) = self._turn_columns(rows), self._project_turn(D)
+        of_state = np.tile(HP, (len(rows), 1))
+        self.P[columns], self.P[:, columns] = of_state, of_state.T
+        own = np.tile(HPH, (len(rows), len(rows))) + block_diagonal(covariances)
         self.P[np.ix_(columns, columns)] = 0.5 * (own + own.T)
 
     def add_known_turns(self, rows: IntArray, covariances: FloatArray) -> None:
@@ -104,16 +107,29 @@ class TagCovariance(JointCovariance):
         self.P[columns] = self.P[:, columns] = 0.0
         self.P[np.ix_(columns, columns)] = block_diagonal(covariances)
 
-    def project_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω − ω_i."""
-        columns, q = self._turn_columns(rows), self._axes.turn
-        HP = np.tile(self.P[:q], (len(rows), 1)) - self.P[columns]
-        return HP, np.tile(HP[:, :q], len(rows)) - HP[:, columns]
+    def project_turns(
+        self, rows: IntArray, D: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω − ω_i + D c̃, D (3, c)."""
+        columns, C = self._turn_columns(rows), self._turn_output(D)
+        HP = np.tile(self._project_turn(D)[0], (len(rows), 1)) - self.P[columns]
+        return HP, np.tile(HP[:, : C.shape[1]] @ C.T, len(rows)) - HP[:, columns]
 
     def project_own_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the same of ω_i alone."""
         columns = self._turn_columns(rows)
         return self.P[columns], self.P[np.ix_(columns, columns)]
+
+    def _project_turn(self, D: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """Return H P (q, …) and H P Hᵀ (q, q) of ε_Ω + D c̃."""
+        C = self._turn_output(D)
+        HP = C @ self.P[: C.shape[1]]
+        return HP, HP[:, : C.shape[1]] @ C.T
+
+    def _turn_output(self, D: FloatArray | None) -> FloatArray:
+        """Return C (q, p), or (q, p + c), of ε_Ω + D c̃ = C (ε, c̃)."""
+        C = np.eye(self._axes.turn, self._p)
+        return C if D is None else np.hstack([C, D[self._axes.turned]])
 
     def _insert(self, rows: IntArray, C: FloatArray, noise: FloatArray) -> None:
         super()._insert(rows, C, noise)
@@ -136,8 +152,9 @@ class ExactTagMapCovariance(ExactMapCovariance, TagCovariance):
         """Return ξ_i (0, 3) of no landmark."""
         return np.empty((0, 3)), None
 
-    def project_turns(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω."""
-        q = self._axes.turn
-        HP = np.tile(self.P[:q], (len(rows), 1))
-        return HP, np.tile(HP[:, :q], len(rows))
+    def project_turns(
+        self, rows: IntArray, D: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return H P (m q, …) and H P Hᵀ (m q, m q) of φ_i = ε_Ω + D c̃."""
+        m, (HP, HPH) = len(rows), self._project_turn(D)
+        return np.tile(HP, (m, 1)), np.tile(HPH, (m, m))

@@ -45,7 +45,7 @@ class RiccatiTagFilter(RiccatiFilter):
         twins, are both likely.
         """
         phi, R = self._turns(seen.rows, seen.Z), self._noise(seen.covariances)
-        _, predicted = self.joint.project_turns(seen.rows)
+        _, predicted = self.joint.project_turns(seen.rows, seen.D)
         # Which of the two that look alike it is; a gate; then Huber's weights.
         are_flipped, are_unclear = self._judge_flips(seen, phi, predicted, R)
         kept = ~(are_flipped | are_unclear)
@@ -60,7 +60,7 @@ class RiccatiTagFilter(RiccatiFilter):
             repeated = repetition_factors(
                 seen.dt_s[used], self._settings.observation_correlation_time
             )
-            HP, HPH = self.joint.project_turns(seen.rows[used])
+            HP, HPH = self.joint.project_turns(seen.rows[used], seen.D)
             S = with_blocks(HPH, R[used] / (weights[used] / repeated)[:, None, None])
             self._move(-self.joint.update(HP, S, phi[used].ravel()))
         return weights, are_unclear
@@ -68,7 +68,7 @@ class RiccatiTagFilter(RiccatiFilter):
     def add_orientations(self, seen: SeenOrientations) -> None:
         """Take over orientations as they are seen, for those of which nothing is known."""
         self.orientations.put(seen.rows, self.observer.A[:3, :3] @ seen.Z)
-        self.joint.add_turns(seen.rows, self._noise(seen.covariances))
+        self.joint.add_turns(seen.rows, self._noise(seen.covariances), seen.D)
 
     def know_orientations(self, rows: IntArray, B: FloatArray, sigmas: FloatArray) -> None:
         """Take in orientations of a map, whose errors are independent of all else."""
@@ -119,9 +119,11 @@ class RiccatiTagFilter(RiccatiFilter):
 
     # Landmarks
 
-    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks seen for the first time, as yet without orientation."""
-        super().add(points, covariances)
+        super().add(points, covariances, D)
         self.orientations.add(len(points))
 
     def add_known(self, known: KnownLandmarks) -> None:
@@ -167,9 +169,15 @@ class RiccatiTagFilter(RiccatiFilter):
             S = with_blocks(HPH, R[agree])
             self._move(-self.joint.update(HP, S, omega[agree].ravel()))
 
-    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones, without orientation."""
-        super().relocate(rows, points, covariances)
+        super().relocate(rows, points, covariances, D)
         self.orientations.clear(rows)
 
     def remove(self, rows: IntArray) -> None:

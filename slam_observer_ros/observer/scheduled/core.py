@@ -15,7 +15,7 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry.axes import EstimatedAxes
-from slam_observer_ros.geometry.matrices import kalman_update, symmetric, transpose
+from slam_observer_ros.geometry.matrices import cholesky, kalman_update, symmetric, transpose
 from slam_observer_ros.observer.scheduled.postponed_landmarks import PostponedLandmarks
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.sensor_models.motion import Motion
@@ -73,7 +73,7 @@ class Core:
 
     def measurement_update(self, H: FloatArray, gain_k: FloatArray) -> None:
         """Update P by m observations with H (m, k, q) and k_i (m, k, k)."""
-        root = transpose(np.linalg.cholesky(gain_k).astype(np.float64)) @ H
+        root = transpose(cholesky(gain_k)) @ H
         W = np.asarray(np.linalg.qr(root.reshape(-1, len(self.P)), mode='r'))  # WᵀW = Σ Hᵀ k H
         WP = W @ self.P
         kalman_update(self.P, WP, WP @ W.T + np.eye(len(W)))

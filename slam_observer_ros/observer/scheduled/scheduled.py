@@ -35,7 +35,7 @@ from slam_observer_ros.geometry.matrices import (
     symmetric,
     transpose,
 )
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
+from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, OF_SENSORS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
@@ -62,6 +62,7 @@ class ScheduledFilter(Filter):
 
     ignores = (
         *OF_CONSTANT_GAINS,
+        *OF_SENSORS,
         'landmark_velocity_stddev',
         'use_tag_orientation',
         'orientation_noise',
@@ -106,7 +107,9 @@ class ScheduledFilter(Filter):
         F, N, _ = self._postponed.now(residuals.rows)
         return self._distances(residuals, F, N)
 
-    def add(self, points: FloatArray, covariances: FloatArray) -> None:
+    def add(
+        self, points: FloatArray, covariances: FloatArray, D: FloatArray | None = None
+    ) -> None:
         """Append landmarks (m,): their error is that of the pose and of the observation."""
         super().add(points, covariances)
         y_ref, noise = self.observer.y_ref[-len(points) :], self.observer.turned(covariances)
@@ -118,7 +121,13 @@ class ScheduledFilter(Filter):
         N = self._noise(known.covariances)
         self._postponed.add(np.zeros((*N.shape[:2], len(self._core.P))), N)
 
-    def relocate(self, rows: IntArray, points: FloatArray, covariances: FloatArray) -> None:
+    def relocate(
+        self,
+        rows: IntArray,
+        points: FloatArray,
+        covariances: FloatArray,
+        D: FloatArray | None = None,
+    ) -> None:
         """Take landmarks for new ones."""
         super().relocate(rows, points, covariances)
         y_ref, noise = self.observer.y_ref[rows], self.observer.turned(covariances)

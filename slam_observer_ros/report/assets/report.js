@@ -95,9 +95,8 @@ function drawMap(id, view) {
   if (path.true_xyz) {
     traces.push({ x: along(path.true_xyz, view.across), y: along(path.true_xyz, view.up), mode: 'lines', name: 'truth, aligned', line: { color: ink(), width: 1, dash: 'dot' }, hoverinfo: 'skip' });
   }
-  const colours = path.error_m
-    ? { color: path.error_m, colorscale: scale(), size: 4, colorbar: { title: { text: 'error [m]', side: 'right' }, thickness: 12, len: 0.8 } }
-    : { color: path.t, colorscale: scale(), size: 4, colorbar: { title: { text: 'time [s]', side: 'right' }, thickness: 12, len: 0.8 } };
+  const bar = { title: { text: path.error_m ? 'error [m]' : 'time [s]', side: 'right' }, thickness: 12, len: 0.8 };
+  const colours = { color: path.error_m || path.t, colorscale: scale(), size: 4, showscale: isPlan, colorbar: bar };
   traces.push({
     x: along(path.xyz, view.across), y: along(path.xyz, view.up), mode: 'markers', name: 'estimate', marker: colours, customdata: path.t,
     text: path.error_m ? path.error_m.map((/** @type {number|null} */ e) => (e === null ? 'no truth' : `${e.toFixed(2)} m off`)) : path.t,
@@ -181,7 +180,7 @@ function rows() {
     fit.push(
       { ...curve(consistency.nis_t, consistency.nis_low, 'low', { width: 0 }), showlegend: false, hoverinfo: 'skip' },
       { ...curve(consistency.nis_t, consistency.nis_high, `95 % of NIS if all noise is as stated`, { width: 0 }), fill: 'tonexty', fillcolor: 'rgba(0,158,115,0.25)', hoverinfo: 'skip' },
-      curve(consistency.nis_t, consistency.nis, `NIS per degree of freedom, ${consistency.nis_group} observations each`, { color: GREEN, width: 0.8 }),
+      curve(consistency.nis_t, consistency.nis, `NIS per degree of freedom, means of ${consistency.nis_group}`, { color: GREEN, width: 0.8 }),
     );
     fit[2].mode = 'lines+markers';
     fit[2].marker = { size: 4, color: GREEN };
@@ -339,7 +338,7 @@ function write() {
 function draw() {
   if (!run.instants.t.length) { element('time-bar').hidden = true; return; }
   drawMap('map', PLAN);
-  element('views').hidden = run.is_flat;
+  element('views').hidden = element('side').hidden = run.is_flat;
   if (!run.is_flat) drawMap('side', chosenView());
   drawCurves();
   update();
