@@ -26,6 +26,7 @@ from slam_observer_ros.association.interpretations import (
     may_relabel,
 )
 from slam_observer_ros.association.joint_compatibility import PRUNING_COST, RESOLUTION
+from slam_observer_ros.association.standing import Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.events import (
@@ -70,6 +71,7 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._contradictions = Contradictions()
+        self._standing = Standing()
         self._delay_evidence = DelayEvidence()
 
     @property
@@ -149,6 +151,8 @@ class Hypotheses:
             state = hypothesis.state
             motion = state.motion(velocities, start_ns, end_ns)
             state.propagate(motion)
+            if state is self.best:
+                self._standing.move(motion)
             if motion.at_ends is not None and state is self.best:
                 self._delay_evidence.add(velocities, motion, start_ns, end_ns)
 
@@ -166,6 +170,7 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.state.clear_time()
         self._contradictions.clear()
+        self._standing.clear_time()
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
@@ -176,19 +181,40 @@ class Hypotheses:
                 state.remove(row)
         return bool(rows[0][0] >= 0)
 
+    @property
+    def carried_ids(self) -> frozenset[int]:
+        """Landmarks that move with the robot, and are not used."""
+        return frozenset(self._standing.carried)
+
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
-        matches = [match(hypothesis.state, event) for hypothesis in self._all]
         if self.best.filter.has_joint_covariance:
-            for hypothesis, matched in zip(self._all, matches, strict=True):
-                hypothesis.slipping.note(hypothesis.state, matched)
-        return self._observe(event, matches)
+            event = self._without_carried(event)
+        return self._observe(event)
 
-    def _observe(self, event: ObservationEvent, matches: list[MatchedObservation]) -> Outcome:
-        """Use an observation that all hypotheses are matched with."""
+    def _without_carried(self, event: ObservationEvent) -> ObservationEvent:
+        """Stop where the wheels spin; return an observation without what the robot carries."""
+        standing = self._standing
+        event = event.without(standing.carried)
+        were_spinning, were_carried = standing.is_spinning, len(standing.carried)
+        lost = standing.note(self.best, event)
+        if lost is not None:
+            for hypothesis in self._all:
+                take_back(hypothesis.state, lost)
+                hypothesis.state.counts['slip'] += not were_spinning
+        if newly := len(standing.carried) - were_carried:
+            for landmark_id in standing.carried:
+                self.forget(landmark_id)
+            for hypothesis in self._all:
+                hypothesis.state.counts['carried_landmark'] += newly
+        return event.without(standing.suspects)
+
+    def _observe(self, event: ObservationEvent) -> Outcome:
+        """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)
+        matches = [match(hypothesis.state, event) for hypothesis in self._all]
         if len(self._all) == 1 and not unknown:
             if not self.best.filter.has_joint_covariance:
                 return self._observe_alone(event, matches[0])

@@ -6,7 +6,6 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 
 from slam_observer_ros.association.landmark_index import LandmarkIndex
-from slam_observer_ros.association.slipping import Slipping
 from slam_observer_ros.association.visibility import Visibility
 from slam_observer_ros.state.state import State
 
@@ -18,7 +17,6 @@ class Hypothesis:
     state: State
     visibility: Visibility  # what is in view of a sensor that gives no ids
     index: LandmarkIndex = field(default_factory=LandmarkIndex)
-    slipping: Slipping = field(default_factory=Slipping)
     cost: float = 0.0  # −2 ln of its likelihood, over that of the most likely one
 
     @classmethod
@@ -28,10 +26,4 @@ class Hypothesis:
 
     def with_state(self, state: State) -> Hypothesis:
         """Return another hypothesis, which has had the same landmarks in view."""
-        return Hypothesis(
-            state,
-            deepcopy(self.visibility),
-            deepcopy(self.index),
-            deepcopy(self.slipping),
-            self.cost,
-        )
+        return Hypothesis(state, deepcopy(self.visibility), deepcopy(self.index), self.cost)

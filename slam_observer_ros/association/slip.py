@@ -43,28 +43,20 @@ def slip(state: State, matched: MatchedObservation) -> float:
     variances = np.maximum(np.diagonal(noise[1])[state.axes.pose], MIN_VARIANCE)
     # That motion, to where the landmarks put the robot.
     after = _pose_after(state, matched, variances)
-    state.propagate(strayed(state, np.array([start, after, after]), noise))
-    state.counts['slip'] += 1
-    way = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
-    return float(huber_loss(float(np.sqrt(np.sum(way**2 / variances)))))
-
-
-def strayed(state: State, path: FloatArray, noise: FloatArray) -> Motion:
-    """Return a motion along ``path`` (k + 1, 4, 4) that odometry has not seen, in no time.
-
-    ``noise`` (k, 6, 6) is what its pieces may be off by, rad² and m².
-    """
-    k = len(noise)
-    return Motion(
-        path=path,
-        measured_velocities=np.zeros((k, 6)),
-        dt_s=np.zeros(k),
+    motion = Motion(
+        path=np.array([start, after, after]),
+        measured_velocities=stray.body_velocities,
+        dt_s=stray.dt_s,
         covariances=noise,
         duration_s=0.0,
         at_ends=None,
         calibration=state.filter.calibration,
         is_slip=True,
     )
+    state.propagate(motion)
+    state.counts['slip'] += 1
+    strayed = se3.log(se3.inverse(start) @ observer.A)[state.axes.pose]
+    return float(huber_loss(float(np.sqrt(np.sum(strayed**2 / variances)))))
 
 
 def _duration_s(state: State, matched: MatchedObservation) -> float:

@@ -287,8 +287,9 @@ class Estimator:
         made before the pose in a loaded map was found (``'not_localised'``), how often it was lost
         (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
         had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
-        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'forgotten_landmark'``,
-        ``'unmapped_landmark'``, ``'unsupported_landmark'``) and points not used
+        landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'carried_landmark'``,
+        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``) and points
+        not used
         (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
         ``'unweighed_point'``).
         """
@@ -631,6 +632,7 @@ class Estimator:
             warnings.more_than_max(len(event.ids), limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
+        warnings.carried_landmarks(self._hypotheses.carried_ids)
         warnings.unexpected_poses(self._hypotheses.count)
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed

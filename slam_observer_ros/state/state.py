@@ -37,7 +37,6 @@ class State:
             self.relinearisation = Relinearisation(filter_, settings)
         self.counts: Counter[str] = Counter()  # landmarks rejected, moved, forgotten and so on
         self.rejected_in_a_row = 0  # observations in which all known landmarks were rejected
-        self.reckoned = np.eye(4)  # motion by odometry since what it has led to was judged
         self.was_contradicted = False  # most known landmarks seen last were rejected
         self.motion_noise = MotionNoise(settings)
         self.observation_noise = ObservationNoise(settings)
@@ -130,8 +129,6 @@ class State:
     def propagate(self, motion: Motion) -> None:
         """Move on along a motion (27)."""
         self.filter.propagate(motion)
-        if not motion.is_slip:
-            self.reckoned = self.reckoned @ (se3.inverse(motion.path[0]) @ motion.path[-1])
         if self.relinearisation is not None:
             self.relinearisation.move(motion)
         if motion.at_ends is not None:
