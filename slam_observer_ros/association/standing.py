@@ -42,6 +42,36 @@ MAX_MOTIONS = 1000
 
 
 @dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Landmarks (m,) that two observations are of, and where they were seen, body frame."""
+
+    event: ObservationEvent  # the later one …
+    rows: IntArray  # … and which of its points these are
+    before: FloatArray  # (m, 3) metres, as points
+
+    @classmethod
+    def of(cls, start: ObservationEvent, event: ObservationEvent) -> _Pairs:
+        """Return those of two observations."""
+        are_same = (start.ids[:, None] == event.ids) & (event.ids != UNKNOWN_ID)
+        before, now = np.nonzero(are_same)
+        return cls(event, now, start.points[before])
+
+    @property
+    def ids(self) -> IntArray:
+        return self.event.ids[self.rows]
+
+    @property
+    def points(self) -> FloatArray:
+        return self.event.points[self.rows]
+
+    def share(self, motion: FloatArray) -> float:
+        """Return how much of their shift by a ``motion`` (4, 4) has been seen."""
+        predicted = se3.transform(se3.inverse(motion), self.before) - self.before
+        square = np.vdot(predicted, predicted)
+        return float(np.vdot(predicted, self.points - self.before) / square) if square else 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class _View:
     """What landmarks (m,) in view have done in the robot's frame, in standard deviations."""
 
@@ -54,30 +84,18 @@ class _View:
 
     @classmethod
     def of(
-        cls,
-        state: State,
-        start: ObservationEvent,
-        event: ObservationEvent,
-        motion: FloatArray,
-        motion_noise: FloatArray,
-    ) -> _View | None:
-        """Return what an observation shows after a ``motion`` (4, 4) of noise (p, p), or None."""
-        ids, before, now = np.intersect1d(start.ids, event.ids, return_indices=True)
-        if len(ids) and ids[0] == UNKNOWN_ID:
-            ids, before, now = ids[1:], before[1:], now[1:]
-        if len(ids) < LEAST_WITNESSES:
-            return None
-        axes, points, was_at = state.axes, event.points[now], start.points[before]
-        k, A = axes.point, state.observer.A
+        cls, state: State, pairs: _Pairs, motion: FloatArray, motion_noise: FloatArray
+    ) -> _View:
+        """Return what pairs of points show after a ``motion`` (4, 4) of noise (p, p)."""
+        axes, k, A = state.axes, state.axes.point, state.observer.A
         # Of both observations: what stands has the same noise in either.
-        noise = 2.0 * state.observation_noise.covariances(event)[now, :k, :k]
-        expected = se3.transform(se3.inverse(motion), was_at)
+        noise = 2.0 * state.observation_noise.covariances(pairs.event)[pairs.rows, :k, :k]
+        expected = se3.transform(se3.inverse(motion), pairs.before)
         C = transpose(A[:k, :k]) @ axes.output_matrix(se3.transform(A, expected))
-        of_motion = C @ motion_noise @ transpose(C)
-        shifts = np.concatenate([points - was_at, points - expected])[:, :k]
-        distances = mahalanobis(shifts, np.concatenate([noise, noise + of_motion]))
-        shift, error = distances.reshape(2, -1)
-        return cls(ids, shift, error, (points - expected)[:, :k], noise, C)
+        shifts = np.concatenate([pairs.points - pairs.before, pairs.points - expected])[:, :k]
+        with_motion = noise + C @ motion_noise @ transpose(C)
+        shift, error = mahalanobis(shifts, np.concatenate([noise, with_motion])).reshape(2, -1)
+        return cls(pairs.ids, shift, error, shifts[len(pairs.ids) :], noise, C)
 
     def joint_error(self, mask: BoolArray, motion_noise: FloatArray) -> float:
         """Return the errors of some landmarks as one, in squared standard deviations."""
@@ -113,12 +131,11 @@ class Standing:
     _evidence: dict[int, float] = field(default_factory=dict)  # that each is carried
     _start: ObservationEvent | None = None  # that later ones are compared with
     _motions: list[Motion] = field(default_factory=list)  # since then
-    _left: FloatArray | None = None  # Â (4, 4) that the last observation led to
-    _step: FloatArray = field(default_factory=lambda: np.eye(4))  # motion since it
-    _motion: FloatArray = field(default_factory=lambda: np.eye(4))  # motion since the start
+    _used: int = 0  # of these, before the last observation
     _before: FloatArray = field(default_factory=lambda: np.eye(4))  # motion up to the start
     _test_ns: int = FIRST_TEST_NS  # after the start
     _compared_ns: int = 0  # when anything was compared with it, or it was seen
+    _sorted_ns: int = 0  # when landmarks were told apart
 
     def clear_time(self) -> None:
         """Compare nothing with what was seen before."""
@@ -128,8 +145,6 @@ class Standing:
     def move(self, motion: Motion) -> None:
         """Remember a motion by odometry."""
         if self._start is not None:
-            if self._left is None:
-                self._left = motion.path[0]
             self._motions.append(motion)
             if len(self._motions) > MAX_MOTIONS:
                 self.clear_time()
@@ -141,69 +156,77 @@ class Standing:
         not been made, and the one in all that may not have been.
         """
         start, lost = self._start, None
-        self._add_step(state)
         if start is None or event.stamp_ns - self._compared_ns > 2 * LAST_TEST_NS:
             self.clear_time()
             self._begin(event)
         elif event.sensor_frame != start.sensor_frame:
-            lost = np.array([self._step, self._step]) if self.is_spinning else None
+            lost = self._all_lost() if self.is_spinning else None
         elif self.is_spinning:
-            lost = self._go_on(state, start, event)
+            lost = self._go_on(state, _Pairs.of(start, event))
         elif event.stamp_ns - start.stamp_ns >= self._test_ns:
-            lost = self._test(state, start, event)
+            lost = self._test(state, _Pairs.of(start, event))
+        self._used = len(self._motions)
         return lost
-
-    def _add_step(self, state: State) -> None:
-        """Add the motion since the last observation to that since the start."""
-        self._step = np.eye(4)
-        if self._left is not None:
-            self._step = se3.inverse(self._left) @ state.observer.A
-            self._motion, self._left = self._motion @ self._step, None
 
     def _begin(self, event: ObservationEvent) -> None:
         """Compare with this observation from now on."""
         self._start, self._motions, self._test_ns = event, [], FIRST_TEST_NS
-        self._compared_ns, self._motion = event.stamp_ns, np.eye(4)
+        self._compared_ns = event.stamp_ns
 
-    def _test(
-        self, state: State, start: ObservationEvent, event: ObservationEvent
-    ) -> FloatArray | None:
+    def _test(self, state: State, pairs: _Pairs) -> FloatArray | None:
         """Look for a standstill, and for landmarks that are carried along."""
-        self._compared_ns, self._test_ns = event.stamp_ns, 2 * self._test_ns
-        motion, is_over = self._motion, self._test_ns > LAST_TEST_NS
-        noise = self._motion_noise(state)
-        view = _View.of(state, start, event, motion, noise)
-        if view is None:
-            is_over = True
-        elif self._all_stand(state, view, noise):
-            self.is_spinning = True
-            return np.array([self._step, self._before @ motion])
-        elif is_over or self._is_decided(state, view):
-            is_over = True
-            self._sort(state, view)
-        if is_over:
-            self._before = motion
-            self._begin(event)
+        self._compared_ns, self._test_ns = pairs.event.stamp_ns, 2 * self._test_ns
+        if len(pairs.rows) < LEAST_WITNESSES:
+            self._before = np.eye(4)
+            self._begin(pairs.event)
+            return None
+        motion = _product(self._motions)
+        if not self._is_usual(pairs, motion):
+            noise = self._motion_noise(state)
+            view = _View.of(state, pairs, motion, noise)
+            if self._all_stand(state, view, noise):
+                self.is_spinning = True
+                return np.array([self._all_lost()[0], self._before @ motion])
+            if self._test_ns <= LAST_TEST_NS and not self._is_decided(state, view):
+                return None
+            self._sort(view)
+            self._sorted_ns = pairs.event.stamp_ns
+        self._before = motion
+        self._begin(pairs.event)
         return None
 
-    def _go_on(
-        self, state: State, start: ObservationEvent, event: ObservationEvent
-    ) -> FloatArray | None:
+    def _is_usual(self, pairs: _Pairs, motion: FloatArray) -> bool:
+        """Return whether places have passed, as nearly always.
+
+        What has passed before is judged one by one from time to time: it may have been picked up.
+        """
+        return (
+            pairs.event.stamp_ns - self._sorted_ns < LAST_TEST_NS
+            and self._witnesses.issuperset(pairs.ids.tolist())
+            and pairs.share(motion) > 0.5
+        )
+
+    def _go_on(self, state: State, pairs: _Pairs) -> FloatArray | None:
         """Return what :meth:`note` does while the wheels spin, or None once they don't."""
-        p = state.axes.p
-        view = _View.of(state, start, event, np.eye(4), np.zeros((p, p)))
-        if view is not None:
+        if len(pairs.rows) >= LEAST_WITNESSES:
+            view = _View.of(state, pairs, np.eye(4), np.zeros((state.axes.p, state.axes.p)))
             stands = view.stands[self._may_witness(state, view.ids)]
             if len(stands) >= LEAST_WITNESSES and 2 * np.count_nonzero(stands) >= len(stands):
-                self._compared_ns, self._motions = event.stamp_ns, []
-                return np.array([self._step, self._step])
+                lost = self._all_lost()
+                self._compared_ns, self._motions = pairs.event.stamp_ns, []
+                return lost
         self.clear_time()
-        self._begin(event)
+        self._begin(pairs.event)
         return None
+
+    def _all_lost(self) -> FloatArray:
+        """Return the motion since the last observation, twice (2, 4, 4)."""
+        return np.tile(_product(self._motions[self._used :]), (2, 1, 1))
 
     def _is_decided(self, state: State, view: _View) -> bool:
         """Return whether most of what was in view has passed, or some of it clearly stands."""
-        stands = view.stands[~np.isin(view.ids, list(self.suspects))]
+        others = [i not in self.suspects for i in view.ids.tolist()]
+        stands = view.stands[others]
         clear = view.stands & (view.gain > CLEAR**2) & ~self._may_witness(state, view.ids)
         return bool(2 * np.count_nonzero(stands) <= len(stands) or clear.any())
 
@@ -223,7 +246,7 @@ class Standing:
     def _may_witness(self, state: State, ids: IntArray) -> BoolArray:
         """Return which landmarks (m,) are places, as far as is known."""
         if state.is_mapping:
-            return np.isin(ids, list(self._witnesses))
+            return np.array([i in self._witnesses for i in ids.tolist()], dtype=np.bool_)
         return np.ones(len(ids), dtype=np.bool_)
 
     def _motion_noise(self, state: State) -> FloatArray:
@@ -233,26 +256,25 @@ class Standing:
             return noise
         # A sensor whose calibration has begun since has no part in it.
         c = self._motions[0].sensitivity.shape[1]
-        F = sum(motion.sensitivity[:, :c] for motion in self._motions)
-        noise += sum(motion.noise for motion in self._motions)
+        F = np.sum([motion.sensitivity[:, :c] for motion in self._motions], axis=0)
+        noise += np.sum([motion.noise for motion in self._motions], axis=0)
         noise += (F * state.filter.calibration_variances[:c]) @ F.T
         return noise
 
-    def _sort(self, state: State, view: _View) -> None:
-        """Tell landmarks that pass, and are places, from those that stand still in view."""
+    def _sort(self, view: _View) -> None:
+        """Tell landmarks that pass, and are places, from those that stand still meanwhile."""
         passed = view.ids[view.passes].tolist()
         self._witnesses.update(passed)
         for landmark_id in self._evidence.keys() & passed:
             del self._evidence[landmark_id]
-        others_pass = len(passed) >= LEAST_WITNESSES
-        stands = view.stands & (view.gain > NOISE**2)
-        if not others_pass:
-            stands &= ~self._may_witness(state, view.ids)
-        for landmark_id, gain in zip(view.ids[stands].tolist(), view.gain[stands], strict=True):
-            self._evidence[landmark_id] = self._evidence.get(landmark_id, 0.0) + float(gain)
-            if others_pass and self._evidence[landmark_id] > 2.0 * CLEAR**2:
-                self.carried.add(landmark_id)
+        if len(passed) >= LEAST_WITNESSES:
+            stands = view.stands & (view.gain > NOISE**2)
+            for landmark_id, gain in zip(
+                view.ids[stands].tolist(), view.gain[stands], strict=True
+            ):
+                self._evidence[landmark_id] = self._evidence.get(landmark_id, 0.0) + float(gain)
         self.suspects = {i for i, evidence in self._evidence.items() if evidence > CLEAR**2}
+        self.carried |= {i for i in self.suspects if self._evidence[i] > 2.0 * CLEAR**2}
 
 
 def take_back(state: State, lost: FloatArray) -> None:
@@ -270,3 +292,11 @@ def take_back(state: State, lost: FloatArray) -> None:
         is_slip=True,
     )
     state.propagate(motion)
+
+
+def _product(motions: list[Motion]) -> FloatArray:
+    """Return motions, one after the other, as one (4, 4), in the robot's frame at their start."""
+    whole = np.eye(4)
+    for motion in motions:
+        whole = whole @ se3.inverse(motion.path[0]) @ motion.path[-1]
+    return whole
