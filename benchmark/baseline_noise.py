@@ -7,6 +7,9 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray
 from slam_observer_ros.common.units import to_s
 from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.geometry.axes import SPATIAL
+from slam_observer_ros.sensor_models import sensing
+from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
 from slam_observer_ros.sensor_models.observation_noise import ObservationNoise, repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
 
@@ -22,8 +25,17 @@ class BaselineNoise:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._noise = ObservationNoise(settings)
+        self._noise, self._settings = ObservationNoise(settings), settings
+        self._calibration = Calibration(without_calibration(settings), SPATIAL)
         self._last_seen_ns: dict[int, int] = {}
+
+    def corrected(self, event: ObservationEvent) -> ObservationEvent:
+        """Return an observation as the settings state its sensor: its range's scale, or depth."""
+        if not self._calibration.corrects_points:
+            return event
+        if event.sensor_frame not in self._calibration.sensors:
+            self._calibration.add_sensor(event.sensor_frame)
+        return sensing.corrected(self._calibration, self._settings, event)
 
     def add(self, event: ObservationEvent) -> tuple[FloatArray, FloatArray]:
         """Take in an observation; call it once for each, in the order of the stamps.

@@ -82,6 +82,7 @@ class EkfSlam:
         if isinstance(event, VelocityEvent):
             self._odometry.add(event)
             return
+        event = self._noise.corrected(event)
         self._predict(event.stamp_ns)
         known = np.array([landmark_id in self._rows for landmark_id in event.ids.tolist()])
         covariances, factors = self._noise.add(event)

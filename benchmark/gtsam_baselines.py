@@ -207,8 +207,12 @@ class FrameBuilder:
         """Take in a velocity."""
         self._odometry.add(event)
 
+    def corrected(self, event: ObservationEvent) -> ObservationEvent:
+        """Return an observation as the settings state its sensor."""
+        return self._noise.corrected(event)
+
     def see(self, event: ObservationEvent) -> Frame:
-        """Return the frame of an observation."""
+        """Return the frame of a corrected observation."""
         key = self._count
         self._count += 1
         motion, covariance = self._odometry.motion_to(event.stamp_ns)
@@ -282,6 +286,7 @@ class Isam2:
         if isinstance(event, VelocityEvent):
             self._builder.move(event)
             return
+        event = self._builder.corrected(event)
         frame = self._builder.see(event)
         guess = self._pose.compose(frame.motion)
         new = gtsam.Values()
@@ -339,7 +344,7 @@ def optimise_batch(
         if isinstance(event, VelocityEvent):
             builder.move(event)
         else:
-            frame = builder.see(event)
+            frame = builder.see(builder.corrected(event))
             graph.push_back(frame.factors)
             keys.append(frame.key)
     parameters = gtsam.LevenbergMarquardtParams()

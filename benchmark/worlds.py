@@ -159,8 +159,15 @@ def shipped_settings(config: str) -> Settings:
 
 
 def simulated_settings(config: str) -> Settings:
-    """Return the same for a simulated sensor, whose errors are new in each observation."""
-    return replace(shipped_settings(config), observation_correlation_time=0.0)
+    """Return the same for a simulated sensor: as /tf has it, with errors new each time."""
+    return replace(
+        shipped_settings(config),
+        observation_correlation_time=0.0,
+        range_is_depth=False,
+        range_scale=1.0,
+        range_scale_stddev=0.0,
+        sensor_rotation_stddev=(0.0, 0.0, 0.0),
+    )
 
 
 def mrclam(robot: int) -> World:

@@ -85,9 +85,30 @@ class Update:
     innovation: NormalisedInnovation | None = None
 
 
+MOUNTED = {
+    'sensor_rotation': (
+        (
+            'further rolled to the right/further rolled to the left',
+            'further down/further up',
+            'further to the left/further to the right',
+        ),
+        ('roll', 'pitch', 'yaw'),
+    ),
+    'sensor_translation': (
+        (
+            'further forward/further back',
+            'further to the left/further to the right',
+            'higher/lower',
+        ),
+        ('x', 'y', 'z'),
+    ),
+}
+"""In words, by axis, how a sensor is mounted whose turn or shift is positive/negative."""
+
+
 @dataclass(frozen=True, slots=True)
 class CalibrationEstimate:
-    """What was found out about one property of the velocity.
+    """What was found out about one property of the velocity, or of a sensor.
 
     ``name`` is ``angular_scale_z``, ``linear_bias_x``, ``velocity_delay`` and so on; a scale is
     the factor that the velocity is multiplied by, its ``unit`` is ''. ``nominal`` is the value at
@@ -114,6 +135,31 @@ class CalibrationEstimate:
             f'{self.name} is {value:.3g}, {times:.0f} times its stated error ({stated:.3g}) '
             f'from {nominal:g}{f" {unit}" if unit else ""}: are signs, units and frames of '
             'velocity and points right?'
+        )
+
+    @property
+    def advice(self) -> str:
+        """What to set so that a sensor is stated as it was found to be; '' if it is, or no sensor.
+
+        It is found where it is three standard deviations off, and those have become a third.
+        """
+        name, _, frame = self.name.partition('/')
+        off, sensor = self.value - self.nominal, frame or 'the sensor'
+        if abs(off) < 3.0 * self.deviation or 3.0 * self.deviation > self.stated:
+            return ''
+        if name == 'range_scale':
+            set_to = f'set range_scale: {self.value:.4f}'
+            return f'ranges of {sensor} are to be multiplied by {self}: {set_to}'
+        part, _, axis = name.rpartition('_')
+        if part not in MOUNTED:
+            return ''
+        factor, unit = self.for_people
+        words, entries = MOUNTED[part]
+        towards = words['xyz'.index(axis)].split('/')[int(off < 0.0)]
+        entry = entries['xyz'.index(axis)]
+        return (
+            f'{sensor} is mounted {abs(factor * off):.2g} ± {factor * self.deviation:.2g} {unit} '
+            f'{towards} than /tf says: add {off:.4f} to {entry} of its transform or sensor_pose'
         )
 
     @property

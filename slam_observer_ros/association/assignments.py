@@ -19,7 +19,7 @@ from slam_observer_ros.association.joint_compatibility import (
     columns_of,
     JointSearch,
     Pairs,
-    PRUNING_COST,
+    pruning_cost,
     RESOLUTION,
     unpaired_cost,
 )
@@ -28,14 +28,27 @@ from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import SPATIAL
-from slam_observer_ros.geometry.matrices import cholesky, mahalanobis, transpose, with_blocks
+from slam_observer_ros.geometry.matrices import (
+    cholesky,
+    diagonal_blocks,
+    mahalanobis,
+    transpose,
+    with_blocks,
+)
 from slam_observer_ros.observer.filter import Filter
 from slam_observer_ros.observer.residuals import Residuals
+from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.matching import sensitivity
 from slam_observer_ros.state.state import State
 
 MAX_CANDIDATES = 10
 """Landmarks that a point may be taken for; the nearest, if there are more."""
+
+
+UNCERTAIN = 3.0
+"""How many times less well than the sensor measures it is known where an old landmark should be
+seen that points are held back from.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,28 +60,38 @@ class Assignment:
 
 
 def find_assignments(
-    state: State, index: LandmarkIndex, event: ObservationEvent, budget: float
+    state: State,
+    index: LandmarkIndex,
+    event: ObservationEvent,
+    new_cost: float,
+    budget: float,
+    is_alone: bool,
 ) -> list[Assignment]:
     """Return all assignments that put the robot at different poses, the most likely first.
 
     ``state`` is that at the instant of ``event``, an observation of m points, ``index`` that of
-    its landmarks. None costs more than ``budget``.
+    its landmarks. A point without an id costs ``new_cost`` if it is of a new landmark. None costs
+    more than ``budget``. Where the state ``is_alone``, costs matter only to each other.
     """
     # Pairs of a point and a landmark that pass the gate one by one, and their joint residuals.
     axes, m = state.axes, len(event.ids)
     seen = _Points(state, event)
     at, rows = _candidates(state, index, seen)
     residuals = _as_residuals(state.filter, seen, at, rows)
-    PC, CPC = state.filter.predicted(residuals)
     r, noise = residuals.on(axes)
-    pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
-    # What it costs that a point is of no landmark, and which are of one in any case.
+    # Which points are of a known landmark in any case: nearly always all, and each of one.
     certain = (mahalanobis(r, noise) <= RESOLUTION) & ~seen.is_new_id[at]
+    if is_alone and certain.all() and len(np.unique(at)) == len(np.unique(rows)) == len(at):
+        return [Assignment(_taken(m, at, rows), 0.0)]
+    PC, CPC = state.filter.predicted(residuals)
+    pairs = Pairs(at, rows, r, with_blocks(CPC, noise), noise)
+    # What it costs that a point is of no landmark.
     gate_cost = unpaired_cost(state.settings.rejection_threshold)
-    unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), gate_cost)
+    none_costs = np.where(event.ids == UNKNOWN_ID, new_cost, gate_cost)
+    unpaired_costs = np.where(seen.is_new_id, unpaired_cost(RESOLUTION), none_costs)
     # Points outside the search; one of no landmark costs the same whatever it might have been.
-    fixed_cost = m * gate_cost - float(unpaired_costs[np.unique(at)].sum())
-    margin = 0.0 if certain.all() else PRUNING_COST
+    fixed_cost = float(none_costs.sum() - unpaired_costs[np.unique(at)].sum())
+    margin = 0.0 if certain.all() else pruning_cost(event.ids)
     search = JointSearch(pairs, certain, unpaired_costs[at], margin, budget - fixed_cost)
     # Of the pairings that put the robot at one pose, the cheapest, which comes first.
     scale = np.linalg.inv(cholesky(seen.noise[:, : axes.point, : axes.point]))
@@ -78,17 +101,24 @@ def find_assignments(
     for pairing in search.pairings():
         move = J @ PC[:, columns_of(pairing.chosen, axes.point)] @ (pairing.L.T @ pairing.z)
         if all(_largest(move - other) > RESOLUTION for other in moves):
-            found = np.full(m, -1)
-            found[at[pairing.chosen]] = rows[pairing.chosen]
-            assignments.append(Assignment(found, pairing.cost + fixed_cost))
+            taken = _taken(m, at[pairing.chosen], rows[pairing.chosen])
+            assignments.append(Assignment(taken, pairing.cost + fixed_cost))
             moves.append(move)
     return assignments
+
+
+def _taken(m: int, at: IntArray, rows: IntArray) -> IntArray:
+    """Return the landmark (m,) of each point, −1 but for the points ``at`` (q,)."""
+    taken = np.full(m, -1)
+    taken[at] = rows
+    return taken
 
 
 class _Points:
     """The points of an observation in the reference frame, and what their ids say."""
 
     def __init__(self, state: State, event: ObservationEvent) -> None:
+        self.stamp_ns = event.stamp_ns
         self.points = se3.transform(state.observer.A, event.points)  # (m, 3) Â y_i, metres
         # (m, 3, 3) their covariances, m²
         self.noise = state.observer.turned(state.observation_noise.covariances(event))
@@ -104,13 +134,41 @@ def _candidates(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntA
     at, rows = _pairs_near(state, index, seen)
     allowed = _may_be(state, seen, at, rows)
     at, rows = at[allowed], rows[allowed]
-    distances = state.filter.distances(_as_residuals(state.filter, seen, at, rows))
+    residuals = _as_residuals(state.filter, seen, at, rows)
+    distances = state.filter.distances(residuals)
+    held_back = _are_held_back(state, seen, residuals, at, distances)
+    at, rows, distances = at[~held_back], rows[~held_back], distances[~held_back]
     # Each pair passes the gate alone; a point keeps its nearest landmarks.
     order = np.lexsort((distances, at))
     rank = np.arange(len(at)) - np.searchsorted(at[order], at[order])
     passes = distances[order] <= state.settings.rejection_threshold
     near = order[(rank < MAX_CANDIDATES) & passes]
     return at[near], rows[near]
+
+
+def _are_held_back(
+    state: State, seen: _Points, residuals: Residuals, at: IntArray, distances: FloatArray
+) -> BoolArray:
+    """Return which pairs (q,) of a point and an old landmark are not yet decided.
+
+    There are so many that the point may be of, and so many new ones about that by how these lie
+    it can be decided later which of the old ones they are.
+    """
+    landmarks, rows, stamp_ns = state.landmarks, residuals.rows, seen.stamp_ns
+    held_back = np.zeros(len(at), dtype=np.bool_)
+    passes = distances <= state.settings.rejection_threshold
+    rivals = np.bincount(at[passes], minlength=len(seen.points))[at] if len(at) else at
+    may_be = passes & (rivals >= MIN_LOOP) & landmarks.are_old(rows, stamp_ns)
+    if not state.is_mapping or not may_be.any():
+        return held_back
+    if np.count_nonzero(landmarks.are_new(state.confirmed, stamp_ns)) < MIN_LOOP:
+        return held_back
+    noise = residuals.on(state.axes)[1]
+    predicted = diagonal_blocks(state.filter.predicted(residuals)[1], noise.shape[1])
+    is_uncertain = np.trace(predicted, axis1=1, axis2=2) > UNCERTAIN**2 * np.trace(
+        noise, axis1=1, axis2=2
+    )
+    return np.asarray(may_be & is_uncertain)
 
 
 def _pairs_near(state: State, index: LandmarkIndex, seen: _Points) -> tuple[IntArray, IntArray]:

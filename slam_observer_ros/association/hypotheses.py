@@ -25,7 +25,12 @@ from slam_observer_ros.association.interpretations import (
     is_ambiguous,
     may_relabel,
 )
-from slam_observer_ros.association.joint_compatibility import PRUNING_COST, RESOLUTION
+from slam_observer_ros.association.joint_compatibility import (
+    pruning_cost,
+    RESOLUTION,
+    unpaired_cost,
+)
+from slam_observer_ros.association.new_landmarks import NewLandmarks
 from slam_observer_ros.association.standing import Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
@@ -71,6 +76,7 @@ class Hypotheses:
         self._next_id = FIRST_AUTOMATIC_ID
         self._some_have_ids = False
         self._contradictions = Contradictions()
+        self._new_landmarks = NewLandmarks()
         self._standing = Standing()
         self._delay_evidence = DelayEvidence()
 
@@ -227,6 +233,8 @@ class Hypotheses:
         self._all = [child.hypothesis for child in children]
         for hypothesis in self._all:
             hypothesis.cost -= least_cost
+        if unknown:
+            self._new_landmarks.note(event, self._all[0].visibility.confirmed_now)
         return children[0].outcome
 
     def _observe_alone(self, event: ObservationEvent, matched: MatchedObservation) -> Outcome:
@@ -281,15 +289,19 @@ class Hypotheses:
         The cost is that of the hypothesis as well. A point has the same id in all of them that
         take it for a new landmark.
         """
-        new_ids = self._new_ids(len(event.ids))
+        new_ids, margin = self._new_ids(len(event.ids)), pruning_cost(event.ids)
+        gate_cost = unpaired_cost(self.best.settings.rejection_threshold)
+        new_cost = self._new_landmarks.cost(gate_cost)
         possible: list[tuple[int, Interpretation]] = []
         worst = math.inf  # the most that is worth following, the cheapest so far being known
         for number, (hypothesis, matched) in enumerate(zip(self._all, matches, strict=True)):
             state, index, cost = hypothesis.state, hypothesis.index, hypothesis.cost
             seen = corrected(state, event)
-            for taken in interpretations(state, index, seen, matched, new_ids, worst - cost):
+            for taken in interpretations(
+                state, index, seen, matched, new_ids, new_cost, worst - cost, len(self._all) == 1
+            ):
                 possible.append((number, replace(taken, cost=cost + taken.cost)))
-                worst = min(worst, cost + taken.cost + PRUNING_COST)
+                worst = min(worst, cost + taken.cost + margin)
         possible.sort(key=lambda pair: pair[1].cost)
         return [(number, taken) for number, taken in possible if taken.cost <= worst]
 

@@ -61,14 +61,18 @@ def interpretations(
     event: ObservationEvent,
     matched: MatchedObservation,
     new_ids: IntArray,
+    new_cost: float,
     budget: float,
+    is_alone: bool = False,
 ) -> list[Interpretation]:
     """Return what an observation may mean.
 
     It is taken as it came, at no cost, where there is no joint covariance to judge it by.
     ``state`` is that at its instant, ``index`` that of its landmarks, ``matched`` the observation
     with the landmarks that its ids name. Points taken for landmarks not seen before get
-    ``new_ids`` (m,). Interpretations that cost more than ``budget`` need not be returned.
+    ``new_ids`` (m,), at a cost of ``new_cost`` for one without an id.
+    Interpretations that cost more than ``budget`` need not be returned. Where there is no other
+    state, ``is_alone``, costs are compared with each other only.
     """
     if not state.filter.has_joint_covariance:
         return [Interpretation(event, 0.0)]
@@ -82,7 +86,8 @@ def interpretations(
     suspects = state.landmarks.ids[residuals.rows[is_suspect]]
     # Points that may be of several landmarks.
     if not is_contradicted and (some_are_unknown or may_relabel(state, matched)):
-        return _by_assignments(state, index, event, new_ids, suspects, budget)
+        found = find_assignments(state, index, event, new_cost, budget, is_alone)
+        return _by_assignments(state, event, new_ids, suspects, found)
     # All ids are right, or those of one or all suspects are wrong, or the robot slipped.
     if is_contradicted:
         trusting, *slipped = _rejected_or_slipped(state, matched, event, rejected)
@@ -199,16 +204,14 @@ def _suspects(state: State, residuals: Residuals, sensor_distances: FloatArray) 
 
 def _by_assignments(
     state: State,
-    index: LandmarkIndex,
     event: ObservationEvent,
     new_ids: IntArray,
     suspects: IntArray,
-    budget: float,
+    found: list[Assignment],
 ) -> list[Interpretation]:
     """Interpret points that may be of landmarks without an id."""
     # An id is believed until something contradicts it: an interpretation without a suspect costs
     # no less than one with all of them.
-    found = find_assignments(state, index, event, budget)
     outliers = [np.isin(event.ids, suspects) & (assignment.rows < 0) for assignment in found]
     pairs = list(zip(found, outliers, strict=True))
     trusting = min((assignment.cost for assignment, out in pairs if not out.any()), default=0.0)

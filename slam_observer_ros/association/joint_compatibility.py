@@ -25,6 +25,7 @@ import math
 import numpy as np
 
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
+from slam_observer_ros.events import UNKNOWN_ID
 from slam_observer_ros.geometry.matrices import cholesky, diagonal_blocks, mahalanobis, transpose
 
 MAX_PARTIAL = 16
@@ -33,8 +34,11 @@ MAX_PARTIAL = 16
 A search in depth would spend its time below the first pair, and never see that it is wrong.
 """
 
-PRUNING_COST = 35.0
-"""How much more than the cheapest something may cost: at odds of e^17.5 it is given up."""
+PRUNING_COST, PRUNING_COST_OF_IDS = 16.0, 35.0
+"""How much more than the cheapest something may cost: at odds of e^8 it is given up. Where all
+points have ids, at odds of e^17.5: that one of them is wrong, or that wheels have slipped, costs
+what it is set to cost, and few points say which.
+"""
 
 RESOLUTION = 2.0
 """Standard deviations of the sensor within which two poses can't be distinguished."""
@@ -186,6 +190,11 @@ def joint_cost(r: FloatArray, S: FloatArray, noise: FloatArray) -> float:
     z = np.linalg.solve(L, r[order].ravel()).reshape(r.shape)
     log_det = 2.0 * np.log(np.diagonal(L)).sum() - np.linalg.slogdet(noise)[1].sum()
     return float(huber_loss(np.sqrt((z * z).sum(axis=1))).sum() + log_det)
+
+
+def pruning_cost(ids: IntArray) -> float:
+    """Return how much more than the cheapest an interpretation of points (m,) may cost."""
+    return PRUNING_COST if np.count_nonzero(ids == UNKNOWN_ID) else PRUNING_COST_OF_IDS
 
 
 def unpaired_cost(gate: float) -> float:

@@ -187,7 +187,7 @@ class Standing:
             if self._all_stand(state, view, noise):
                 self.is_spinning = True
                 return np.array([self._all_lost()[0], self._before @ motion])
-            if self._test_ns <= LAST_TEST_NS and not self._is_decided(state, view):
+            if self._test_ns <= LAST_TEST_NS and not self._has_passed(view):
                 return None
             self._sort(view)
             self._sorted_ns = pairs.event.stamp_ns
@@ -223,12 +223,10 @@ class Standing:
         """Return the motion since the last observation, twice (2, 4, 4)."""
         return np.tile(_product(self._motions[self._used :]), (2, 1, 1))
 
-    def _is_decided(self, state: State, view: _View) -> bool:
-        """Return whether most of what was in view has passed, or some of it clearly stands."""
-        others = [i not in self.suspects for i in view.ids.tolist()]
-        stands = view.stands[others]
-        clear = view.stands & (view.gain > CLEAR**2) & ~self._may_witness(state, view.ids)
-        return bool(2 * np.count_nonzero(stands) <= len(stands) or clear.any())
+    def _has_passed(self, view: _View) -> bool:
+        """Return whether most of what was in view is elsewhere now, but for what is carried."""
+        stands = view.stands[[i not in self.suspects for i in view.ids.tolist()]]
+        return bool(2 * np.count_nonzero(stands) <= len(stands))
 
     def _all_stand(self, state: State, view: _View, motion_noise: FloatArray) -> bool:
         """Return whether all that is in view says that the robot stands, and clearly so."""
@@ -269,10 +267,8 @@ class Standing:
             del self._evidence[landmark_id]
         if len(passed) >= LEAST_WITNESSES:
             stands = view.stands & (view.gain > NOISE**2)
-            for landmark_id, gain in zip(
-                view.ids[stands].tolist(), view.gain[stands], strict=True
-            ):
-                self._evidence[landmark_id] = self._evidence.get(landmark_id, 0.0) + float(gain)
+            gains = dict(zip(view.ids[stands].tolist(), view.gain[stands].tolist(), strict=True))
+            self._evidence |= {i: self._evidence.get(i, 0.0) + gain for i, gain in gains.items()}
         self.suspects = {i for i, evidence in self._evidence.items() if evidence > CLEAR**2}
         self.carried |= {i for i in self.suspects if self._evidence[i] > 2.0 * CLEAR**2}
 

@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from slam_observer_ros.association.field_of_view import FieldOfView
-from slam_observer_ros.common.types import BoolArray, IntArray
+from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.events import is_automatic, ObservationEvent
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.state.landmark_table import LandmarkTable
 from slam_observer_ros.state.state import State
 
@@ -20,6 +21,9 @@ MIN_SHARE, MOST_SHARE = 0.1, 0.9
 that was seen each time may yet be hidden.
 """
 
+MOVED_M = 0.05
+"""Distance, metres, after which a robot looks from another place; and turn, rad."""
+
 MAX_EVIDENCE = 2.0
 """Evidence of one observation at most: what hides a landmark hides others, and for some time."""
 
@@ -29,6 +33,8 @@ class Visibility:
 
     def __init__(self, k: int) -> None:
         self._field_of_view = FieldOfView(k)
+        self.confirmed_now = 0  # how many landmarks without an id the last observation confirmed
+        self._last_place: FloatArray | None = None  # (4, 4) Â, if it moved since the one before
         # −ln of the probability that for so long none is seen of the landmarks known before: those
         # without an id that were numbered up to here.
         self._evidence = 0.0
@@ -57,12 +63,22 @@ class Visibility:
         rows = np.flatnonzero(is_numbered & in_view)
         cost = self._cost(landmarks, rows[~seen[rows] & ~landmarks.tentative[rows]])
         self.missed = self._missed(in_view & ~landmarks.tentative, seen)
-        landmarks.note_in_view(rows, seen[rows])
+        landmarks.note_in_view(rows, seen[rows], self._has_moved(state))
         self._field_of_view.include(event.points)
-        # Those that were seen too seldom.
+        # Those that were seen too seldom, and those that were confirmed.
+        were_tentative = np.count_nonzero(landmarks.tentative)
         unsupported = landmarks.unsupported(state.settings.min_support)
+        self.confirmed_now = int(were_tentative - np.count_nonzero(landmarks.tentative))
         state.forget(unsupported, 'unsupported_landmark')
         return cost
+
+    def _has_moved(self, state: State) -> bool:
+        """Return whether the robot is at another place than when it last was at another one."""
+        A, last = state.observer.A, self._last_place
+        if last is not None and np.abs(se3.log(se3.inverse(last) @ A)).max() < MOVED_M:
+            return False
+        self._last_place = A.copy()
+        return True
 
     def _missed(self, in_view: BoolArray, seen: BoolArray) -> float:
         """Return how many landmarks (n,) in view should have been seen, and were not."""

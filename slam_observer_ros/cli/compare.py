@@ -16,8 +16,8 @@ from slam_observer_ros.cli.figures import (
     number_text,
     TRAJECTORY_ROWS,
 )
-from slam_observer_ros.cli.options import add_settings_options
-from slam_observer_ros.cli.outputs import add_force_option, check_outputs
+from slam_observer_ros.cli.options import add_settings_options, named, named_path
+from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
 from slam_observer_ros.cli.replay.asked import (
     add_run_options,
     Asked,
@@ -34,6 +34,7 @@ from slam_observer_ros.evaluation.plots.overlay_plot import plot_overlay
 from slam_observer_ros.evaluation.relative_errors import trajectory_figures
 from slam_observer_ros.evaluation.trajectory import read_tum, Trajectory
 from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -62,10 +63,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'Compare gain designs, parameter files and the trajectories of other tools on one '
         'recording: one table, and one picture.'
     )
-    parser.add_argument('recording', type=Path, metavar='RECORDING')
+    parser.add_argument('recording', type=named_path, metavar='RECORDING')
     parser.add_argument(
         'what',
         nargs='+',
+        type=named,
         metavar='WHAT',
         help=f'{", ".join(DESIGNS)}: gains, with the settings given; a parameter file: that in '
         'place of --config; a .tum or .txt file: a trajectory of any tool, or of batch '
@@ -73,7 +75,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument(
-        '--plot', type=Path, metavar='FILE', help=f'picture, of a suffix {", ".join(SUFFIXES)}'
+        '--plot',
+        type=named_path,
+        metavar='FILE',
+        help=f'picture, of a suffix {", ".join(SUFFIXES)}',
     )
     outputs.add_argument('--json', action='store_true', help='print one JSON object')
     add_force_option(parser)
@@ -86,6 +91,9 @@ def run(args: argparse.Namespace) -> None:
     """Run or read each, and put all side by side."""
     if args.plot is not None and args.plot.suffix.removeprefix('.') not in SUFFIXES:
         raise UsageError(f'--plot {args.plot}: its suffix is to be one of {", ".join(SUFFIXES)}')
+    compared_files = [Path(what) for what in args.what]
+    read = {f'the recording {args.recording}': files_of(args.recording)}
+    check_inputs_are_kept({'--plot': args.plot}, read | {'what is compared': compared_files})
     check_outputs([args.plot], args.force)
     if len(set(args.what)) < len(args.what):
         raise UsageError('each is compared once')

@@ -8,8 +8,9 @@ import json
 import sys
 
 from slam_observer_ros.cli.completion import completed_by
-from slam_observer_ros.cli.options import config_files, find_config, shipped_names
+from slam_observer_ros.cli.options import config_files, find_config, named, shipped_names
 from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.settings.dump import parameter_file_text
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.node_settings import ObserverNodeSettings
@@ -27,7 +28,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'Without a name, list the parameter files that come with the package; with one, print it.'
     )
     name = parser.add_argument(
-        'name', nargs='?', metavar='NAME', help='a parameter file, or the name of one of those'
+        'name',
+        nargs='?',
+        type=named,
+        metavar='NAME',
+        help='a parameter file, or the name of one of those',
     )
     completed_by(name, config_files)
     printed = parser.add_mutually_exclusive_group()
@@ -59,7 +64,7 @@ def _text(args: argparse.Namespace) -> str:
         return parameter_file_text(ROWS, _values(args.name))
     if args.name is None:
         return ''.join(f'{name}\n' for name in shipped_names())
-    return find_config(args.name).read_text(encoding='utf-8')
+    return not_special(find_config(args.name)).read_text(encoding='utf-8')
 
 
 def _values(name: str | None) -> Mapping[str, Value]:

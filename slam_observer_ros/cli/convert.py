@@ -6,7 +6,13 @@ import argparse
 from pathlib import Path
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.outputs import add_force_option, check_outputs, recording_path
+from slam_observer_ros.cli.options import named_path
+from slam_observer_ros.cli.outputs import (
+    add_force_option,
+    check_inputs_are_kept,
+    check_outputs,
+    recording_path,
+)
 from slam_observer_ros.common.errors import OutputError
 from slam_observer_ros.common.output_files import unfinished_file
 from slam_observer_ros.recording.datasets.data_set import DataSet, write_data_set
@@ -34,22 +40,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     starry_night = data_sets.add_parser(
         'starry-night', help='stereo camera and IMU moved by hand: dataset3.mat'
     )
-    starry_night.add_argument('file', type=Path, metavar='FILE', help='dataset3.mat')
+    starry_night.add_argument('file', type=named_path, metavar='FILE', help='dataset3.mat')
     starry_night.set_defaults(run=_run, load=lambda args: load_starry_night(args.file))
     mrclam = data_sets.add_parser(
         'mrclam', help='wheeled robots among coded landmarks: MRCLAM_Dataset1 to 9'
     )
-    mrclam.add_argument('folder', type=Path, metavar='FOLDER', help='such as MRCLAM_Dataset6')
+    mrclam.add_argument(
+        'folder', type=named_path, metavar='FOLDER', help='such as MRCLAM_Dataset6'
+    )
     mrclam.add_argument(
         '--robot', type=int, required=True, metavar='N', help='which robot, from 1 to 5'
     )
-    mrclam.set_defaults(run=_run, load=lambda args: load_mrclam(args.folder, args.robot))
+    mrclam.set_defaults(
+        run=_run, file=None, truth=None, load=lambda args: load_mrclam(args.folder, args.robot)
+    )
     graph = data_sets.add_parser(
         'graph', help='poses and points in the plane, in the text formats of iSAM and g2o'
     )
-    graph.add_argument('file', type=Path, metavar='FILE', help='such as victoria_park.txt')
+    graph.add_argument('file', type=named_path, metavar='FILE', help='such as victoria_park.txt')
     graph.add_argument(
-        '--truth', type=Path, metavar='FILE', help='the same graph with true, or the best, values'
+        '--truth',
+        type=named_path,
+        metavar='FILE',
+        help='the same graph with true, or the best, values',
     )
     graph.set_defaults(run=_run_graph, load=lambda args: load_graph(args.file, args.truth))
     for data_set in (starry_night, mrclam, graph):
@@ -62,7 +75,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def _run_graph(args: argparse.Namespace) -> None:
     """Write a graph, and beside it the parameters without which its steps mean something else."""
     parameters: Path = args.output.with_suffix('.yaml')
-    check_outputs([args.output, parameters], args.force)
+    _check(args, parameters)
     rows = _written(args)
     try:
         with unfinished_file(parameters) as file:
@@ -74,8 +87,16 @@ def _run_graph(args: argparse.Namespace) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    check_outputs([args.output], args.force)
+    _check(args)
     print_table(str(args.output), _written(args))
+
+
+def _check(args: argparse.Namespace, parameters: Path | None = None) -> None:
+    given = (vars(args).get(name) for name in ('file', 'truth'))  # mrclam has a folder instead
+    read = [file for file in given if file is not None]
+    outputs = {'OUT.mcap': args.output, 'the file of parameters': parameters}
+    check_inputs_are_kept(outputs, {'the data set': read})
+    check_outputs(outputs.values(), args.force)
 
 
 def _written(args: argparse.Namespace) -> dict[str, str]:

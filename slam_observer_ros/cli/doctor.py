@@ -13,6 +13,8 @@ import sys
 from typing import Any
 
 from slam_observer_ros.cli.console import print_json, print_table
+from slam_observer_ros.cli.fitting_file import fitting_file
+from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import UsageError
 from slam_observer_ros.common.version import VERSION
 
@@ -43,7 +45,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command, and its description."""
     parser.description = (
         'Say which Python, ROS and packages are found, and which topics with velocities or '
-        'landmarks are alive. Topics are heard for some seconds, in the ROS domain of this shell.'
+        'landmarks are alive. Topics are heard for some seconds, in the ROS domain of this shell. '
+        'Of a recording, say which of the parameter files that come with the package fits it, and '
+        'why.'
+    )
+    parser.add_argument(
+        'recording', nargs='?', type=named_path, metavar='RECORDING', help='as replay takes it'
     )
     parser.add_argument(
         '--seconds', type=float, default=3.0, metavar='S', help='how long to listen (default 3)'
@@ -56,6 +63,13 @@ def run(args: argparse.Namespace) -> None:
     """Look, listen and print."""
     if not 0.0 < args.seconds <= 3600.0:
         raise UsageError(f'--seconds takes seconds above 0, up to 3600, not {args.seconds:g}')
+    if args.recording is not None:
+        name, why = fitting_file(args.recording)
+        if args.json:
+            print_json({'recording': str(args.recording), 'config': name, 'why': why})
+            return
+        print_table(str(args.recording), {'fits': f'--config {name}', 'because': why})
+        return
     installed = _installed()
     has_ros = find_spec('rclpy') is not None
     topics = _topics(args.seconds) if has_ros else []

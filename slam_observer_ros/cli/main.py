@@ -19,7 +19,12 @@ with leaving_at_once():
 
     from slam_observer_ros.cli.completion import complete, typed_words
     from slam_observer_ros.cli.console import MessageHandler, PROGRAM, show_message
-    from slam_observer_ros.common.errors import IncompleteError, LossError, SlamObserverError
+    from slam_observer_ros.common.errors import (
+        IncompleteError,
+        LossError,
+        message_of,
+        SlamObserverError,
+    )
     from slam_observer_ros.common.threads import use_one_thread
     from slam_observer_ros.common.version import VERSION
     from slam_observer_ros.settings.parameter_table import suggestion
@@ -122,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (SlamObserverError, OSError) as error:
         if isinstance(error, BrokenPipeError):
             return _leave_broken_pipe()
-        show_message('error', str(error))
+        show_message('error', message_of(error))
         return EXIT_OF.get(type(error), EXIT_ERROR)
     except ModuleNotFoundError as error:
         _explain_missing(error)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 
 from slam_observer_ros.cli import map_check
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.outputs import add_force_option, check_outputs
+from slam_observer_ros.cli.options import named, named_path
+from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
 from slam_observer_ros.known_map.map_file import write_map
 from slam_observer_ros.known_map.map_import import import_map, TAG_AXES
 
@@ -26,10 +26,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'of apriltag_ros for ROS 1: poses in the frame of the bundle.',
     )
     convert.add_argument(
-        'file', type=Path, metavar='FILE', help='.csv, .tsv, .txt, .yaml or .json'
+        'file', type=named_path, metavar='FILE', help='.csv, .tsv, .txt, .yaml or .json'
     )
-    convert.add_argument('output', type=Path, metavar='OUT.yaml', help='map file to make')
-    convert.add_argument('--frame', default='map', help='frame of the positions (default map)')
+    convert.add_argument('output', type=named_path, metavar='OUT.yaml', help='map file to make')
+    convert.add_argument(
+        '--frame', type=named, default='map', help='frame of the positions (default map)'
+    )
     convert.add_argument(
         '--sigma',
         type=_deviation,
@@ -74,6 +76,7 @@ def _deviation(text: str) -> float:
 
 
 def _run(args: argparse.Namespace) -> None:
+    check_inputs_are_kept({'OUT.yaml': args.output}, {'what is converted': [args.file]})
     check_outputs([args.output], args.force)
     landmark_map = import_map(
         args.file, args.frame, args.sigma, args.orientation_sigma, args.tag_axes

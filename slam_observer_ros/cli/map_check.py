@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 
 import numpy as np
 
 from slam_observer_ros.cli.console import print_table
-from slam_observer_ros.cli.outputs import add_force_option, check_outputs
+from slam_observer_ros.cli.options import named_path
+from slam_observer_ros.cli.outputs import add_force_option, check_inputs_are_kept, check_outputs
 from slam_observer_ros.geometry.axes import axes_of
 from slam_observer_ros.known_map.map_check import (
     look_around,
@@ -24,7 +24,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    parser.add_argument('file', type=Path, metavar='MAP.yaml', help='map file')
+    parser.add_argument('file', type=named_path, metavar='MAP.yaml', help='map file')
     parser.add_argument(
         '--view',
         type=_metres,
@@ -49,13 +49,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--space', action='store_true', help='a robot that also rolls and pitches, not two_d_mode'
     )
-    parser.add_argument('--plot', type=Path, metavar='OUT.png', help='picture of it to write')
+    parser.add_argument(
+        '--plot', type=named_path, metavar='OUT.png', help='picture of it to write'
+    )
     add_force_option(parser)
     parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> None:
-    check_outputs([args.plot] if args.plot else [], args.force)
+    check_inputs_are_kept({'--plot': args.plot}, {'the map': [args.file]})
+    check_outputs([args.plot], args.force)
     known, settings = read_map(args.file), Settings()
     known = known if args.space else known.flattened()
     looks = look_around(

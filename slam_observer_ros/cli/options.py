@@ -49,6 +49,7 @@ def add_settings_options(parser: argparse.ArgumentParser, *others: type[Dataclas
     group = parser.add_argument_group('estimator')
     config = group.add_argument(
         '--config',
+        type=named,
         metavar='FILE',
         help="the observer node's parameter file, or the name of one that comes with the package",
     )
@@ -209,6 +210,18 @@ def parse_value(text: str) -> object:
     with suppress(ValueError):
         return float(text)
     return text
+
+
+def named(text: str) -> str:
+    """Take a name, as an argparse type: an empty one is a mistake, often that of a variable."""
+    if not text:
+        raise argparse.ArgumentTypeError('the name is empty; . is this directory')
+    return text
+
+
+def named_path(text: str) -> Path:
+    """Take the name of a file or directory, as an argparse type."""
+    return Path(named(text))
 
 
 def value_of(row: Parameter) -> Callable[[str], Value]:

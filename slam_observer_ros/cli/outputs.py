@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import os
 from pathlib import Path
 
+from slam_observer_ros.cli.options import named_path
 from slam_observer_ros.common.errors import EvaluationError, OutputError, UsageError
 from slam_observer_ros.common.output_files import destination, unfinished_directory
 
@@ -21,7 +22,7 @@ def add_result_options(parser: argparse._ActionsContainer, figures: Iterable[str
     """Add ``--plot``, its format, and ``--json``."""
     parser.add_argument(
         '--plot',
-        type=_figures_path,
+        type=named_path,
         metavar='DIR',
         help=f'draw the figures {", ".join(figures)}',
     )
@@ -42,19 +43,15 @@ def recording_path(text: str) -> Path:
     return path
 
 
-def _figures_path(text: str) -> Path:
-    """Take the name of a directory for figures, as an argparse type."""
-    if not text:
-        raise argparse.ArgumentTypeError('a directory is needed: . for this one')
-    return Path(text)
-
-
 def check_outputs(files: Iterable[Path | None], force: bool) -> None:
     """Raise a UsageError if a file can't be written, or not without ``force``; None is none."""
     wanted = [file for file in files if file is not None]
     for number, file in enumerate(wanted):
         if file.is_dir():
             raise UsageError(f'{file} is a directory; give the name of a file')
+        real = Path(os.path.realpath(file))  # which fails in no circle of links
+        if real.is_symlink():
+            raise UsageError(f'{file} is a link to itself; give another name')
         if file.exists() and not file.is_file():
             raise UsageError(f'{file} is there, and no regular file; give another name')
         if file.exists() and not force:
@@ -63,7 +60,7 @@ def check_outputs(files: Iterable[Path | None], force: bool) -> None:
             raise UsageError(f'{file}: there is no directory {file.parent}; make it first')
         if not os.access(file.parent, os.W_OK):
             raise UsageError(f'{file}: nothing may be written to {file.parent}')
-        if file.resolve() in [other.resolve() for other in wanted[:number]]:
+        if real in [Path(os.path.realpath(other)) for other in wanted[:number]]:
             raise UsageError(f'{file} is named for two outputs')
 
 
@@ -74,10 +71,9 @@ def check_inputs_are_kept(
 
     Outputs are by option, None where not asked for; inputs by what they are.
     """
-    read = {file.resolve(): what for what, files in inputs.items() for file in files}
+    read = {os.path.realpath(file): what for what, files in inputs.items() for file in files}
     for option, file in outputs.items():
-        if file is not None and file.resolve() in read:
-            what = read[file.resolve()]
+        if file is not None and (what := read.get(os.path.realpath(file))) is not None:
             raise UsageError(f'{option} {file} would replace {what}; give another name')
 
 
@@ -86,21 +82,35 @@ def figure_files(args: argparse.Namespace, figures: Iterable[str]) -> list[str]:
     return [f'{name}.{args.plot_format}' for name in figures]
 
 
-def check_plots(args: argparse.Namespace, figures: Iterable[str]) -> None:
+def check_plots(
+    args: argparse.Namespace, figures: Iterable[str], others: Iterable[Path | None]
+) -> None:
     """Raise a UsageError if the figures can't be written to the directory of ``--plot``.
 
-    It need not exist, but its parent must.
+    It need not exist, but its parent must; ``others`` are the other outputs.
     """
     directory: Path | None = args.plot
     if directory is None:
         return
+    check_directory(directory)
+    files = [directory / name for name in figure_files(args, figures)]
+    written = {os.path.realpath(file) for file in (directory, *files)}
+    for other in others:
+        if other is not None and os.path.realpath(other) in written:
+            raise UsageError(f'{other} is named for two outputs')
     if directory.is_dir():
-        check_outputs((directory / name for name in figure_files(args, figures)), args.force)
-    elif directory.exists():
-        raise UsageError(f'{directory} is a file; give a directory for the figures')
-    elif not directory.parent.is_dir():
+        check_outputs(files, args.force)
+
+
+def check_directory(directory: Path) -> None:
+    """Raise a UsageError if a directory is not there, and can't be made."""
+    if directory.is_dir():
+        return
+    if os.path.lexists(directory):
+        raise UsageError(f'{directory} is no directory; give the name of one')
+    if not directory.parent.is_dir():
         raise UsageError(f'{directory}: there is no directory {directory.parent}; make it first')
-    elif not os.access(directory.parent, os.W_OK):
+    if not os.access(directory.parent, os.W_OK):
         raise UsageError(f'{directory}: nothing may be written to {directory.parent}')
 
 

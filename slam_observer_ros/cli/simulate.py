@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> None:
         max_innovation_time=max(args.step, Settings().max_innovation_time),
     )
     check_outputs([args.output], args.force)
-    check_plots(args, FIGURES)
+    check_plots(args, FIGURES, [args.output])
     simulation = Simulation(scenario, START_NS)
     result = run_simulation(simulation, _events(simulation, 'simulating'), settings)
     if args.output is not None:

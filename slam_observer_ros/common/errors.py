@@ -14,6 +14,13 @@ def shown(value: object) -> str:
     return _shortened.repr(value)
 
 
+def message_of(error: Exception) -> str:
+    """Return what an error says, in one line; of an OSError, without the number."""
+    if isinstance(error, OSError) and error.strerror:
+        return f'{error.filename}: {error.strerror}' if error.filename else error.strerror
+    return ' '.join(str(error).split())
+
+
 class SlamObserverError(Exception):
     """Root of every error that this package raises on purpose."""
 

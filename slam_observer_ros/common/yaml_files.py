@@ -14,7 +14,7 @@ from typing import Any, Final
 import yaml
 
 from slam_observer_ros.common.errors import shown, YamlError
-from slam_observer_ros.common.output_files import checked_name
+from slam_observer_ros.common.input_files import not_special
 
 MAX_LEVELS: Final = 30
 """How deep lists and mappings may be in each other; parameters and maps have less than ten."""
@@ -39,7 +39,7 @@ def load_yaml(
     Raises an OSError if the file can't be read, or has more bytes, and a YamlError that says in
     one line, and where, what is wrong with its YAML.
     """
-    with checked_name(path).open('rb') as file:
+    with not_special(path).open('rb') as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         reason = f'it has more than {max_bytes / 1e6:g} MB'
@@ -48,12 +48,6 @@ def load_yaml(
         return _Builder(yaml.parse(data, loader), plain).document()
     except yaml.YAMLError as error:
         raise YamlError(_reason_of(error)) from error
-
-
-def refuse_special(path: Path) -> None:
-    """Raise an OSError if something is there that is no file: reading it might never end."""
-    if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, 'it is no regular file', str(path))
 
 
 def constructed(kind: str, text: str) -> object:

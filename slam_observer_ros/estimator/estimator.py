@@ -29,6 +29,7 @@ from slam_observer_ros.events import (
     AngularVelocityEvent,
     Event,
     ObservationEvent,
+    UNKNOWN_ID,
     VelocityBlock,
     VelocityEvent,
 )
@@ -36,6 +37,7 @@ from slam_observer_ros.geometry import se3
 from slam_observer_ros.known_map.export import map_of
 from slam_observer_ros.known_map.landmark_map import LandmarkMap
 from slam_observer_ros.known_map.localiser import is_rough, Localiser
+from slam_observer_ros.known_map.loop_closure import LoopClosure
 from slam_observer_ros.observer.designs import make_filter
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -96,6 +98,7 @@ class Estimator:
         self._was_placed = False  # by somebody, so the pose of the settings is not its start
         self._hypotheses = Hypotheses(self._state_at(np.eye(4)))
         self._localiser = Localiser()
+        self._loop_closure = LoopClosure()
         self.reset(initial_pose)
         self._warn_of_unused()
 
@@ -288,9 +291,9 @@ class Estimator:
         (``'lost'``) or the estimate has diverged (``'diverged'``), the robot not where odometry
         had it (``'slip'``) or nothing in view where the map has it (``'unexpected_place'``),
         landmarks (``'rejected_landmark'``, ``'moved_landmark'``, ``'carried_landmark'``,
-        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``) and points
-        not used
-        (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
+        ``'forgotten_landmark'``, ``'unmapped_landmark'``, ``'unsupported_landmark'``,
+        ``'merged_landmark'``) and points not
+        used (``'unknown_id'``, ``'repeated_id'``, ``'reserved_id'``, ``'impossible_id'``,
         ``'unweighed_point'``).
         """
         return self._counts + self._localiser.counts + self._hypotheses.counts
@@ -532,12 +535,25 @@ class Estimator:
             self._doubt_rough_pose(event)
         outcome = self._hypotheses.observe(event)
         self._localise(event, outcome)
+        if np.count_nonzero(event.ids == UNKNOWN_ID):
+            self._close_loops(event.stamp_ns)
         self._counts['observation'] += 1
         self._counts['late_observation'] += self._timeline.was_late
         self._warn_of(event, outcome)
         self.last_update = self._update(event.stamp_ns, outcome)
         if self._on_update is not None:
             self._on_update(self.last_update)
+
+    def _close_loops(self, stamp_ns: int) -> None:
+        """Merge landmarks without ids that turn out to be one."""
+        state, closure = self._state, self._loop_closure
+        closure.note(state, stamp_ns)
+        if not closure.is_due(state, stamp_ns):
+            return
+        if closure.close(state, stamp_ns):
+            self._hypotheses.prune_to_best()
+        if len(self._hypotheses) == 1:
+            closure.merge_twins(state)
 
     def _doubt_rough_pose(self, event: ObservationEvent) -> None:
         """Search about a given pose that is too rough for the points of an observation."""

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
+from slam_observer_ros.common.input_files import read_lines
 from slam_observer_ros.common.output_files import unfinished_file
-from slam_observer_ros.common.text_files import read_lines
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.geometry import se3, so3

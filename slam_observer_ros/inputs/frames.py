@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -15,6 +16,11 @@ from slam_observer_ros.inputs.transform_buffer import TransformBuffer
 from slam_observer_ros.messages.detections import TagDetections
 from slam_observer_ros.messages.poses_and_velocities import pose_stack, PoseMessage
 from slam_observer_ros.settings.input_settings import InputSettings, Pose6
+
+OPTICAL = 'optical'
+"""What the name of a frame has, by REP 103, whose axis z points forward; of others x does."""
+
+_ALONG_X, _ALONG_Z = np.eye(3)[[0, 2]]
 
 EventT = TypeVar('EventT', ObservationEvent, VelocityEvent, AngularVelocityEvent)
 
@@ -77,10 +83,16 @@ class BaseFrame:
         self._sensor_pose = _sensor_pose(settings.sensor_pose)
 
     def observation(self, event: ObservationEvent, frame_id: str) -> ObservationEvent:
-        """Return landmarks in the base frame; those measured in the map's frame are refused."""
+        """Return landmarks in the base frame; those measured in the map's frame are refused.
+
+        Its ``sensor_frame`` is '' where they were measured in the base frame itself.
+        """
+        frame_id = self._sensor_frame or frame_id
+        plain = frame_id.lstrip('/')
+        axis = _ALONG_Z if OPTICAL in plain else _ALONG_X
+        event = replace(event, sensor_frame='' if plain == self.name else plain, sensor_axis=axis)
         if self._sensor_pose is not None:
             return event.moved(self._sensor_pose)
-        frame_id = self._sensor_frame or frame_id
         self._refuse_map_frame(frame_id)
         return self._moved(event, frame_id)
 

@@ -38,7 +38,6 @@ from slam_observer_ros.common.yaml_files import (
     FAST_LOADER,
     load_yaml,
     plain_value,
-    refuse_special,
 )
 from slam_observer_ros.events import MAX_ID
 from slam_observer_ros.geometry import so3
@@ -139,7 +138,6 @@ def read_map(path: Path) -> LandmarkMap:
     the reason.
     """
     try:
-        refuse_special(path)
         content = load_yaml(path, MAX_BYTES, _plain_value, FAST_LOADER)
     except OSError as error:
         raise MapError(f"can't read map {path}: {error.strerror}") from error

@@ -12,7 +12,7 @@ import yaml
 from slam_observer_ros.common.errors import MapError, YamlError
 from slam_observer_ros.common.output_files import unfinished_file
 from slam_observer_ros.common.types import FloatArray
-from slam_observer_ros.common.yaml_files import load_yaml, plain_value, refuse_special
+from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.geometry import se3, so3
 
 FORMAT = 'slam_observer_ros pose'
@@ -52,7 +52,6 @@ def write_pose(path: Path, stored: StoredPose) -> None:
 def read_pose(path: Path) -> StoredPose:
     """Read the file; MapError if it can't be read, or is no such file."""
     try:
-        refuse_special(path)
         content = load_yaml(path, MAX_BYTES, plain_value)
     except OSError as error:
         raise MapError(f"can't read the pose {path}: {error.strerror}") from error

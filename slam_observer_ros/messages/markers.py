@@ -13,6 +13,7 @@ from slam_observer_ros.messages.outgoing import OutgoingMessages
 POINT_SIZE_M = 0.2
 TEXT_HEIGHT_M = 0.3
 LINE_WIDTH_M = 0.03
+ARROW_LENGTH_M, ARROW_WIDTH_M = 1.0, 0.15
 
 GREEN = (0.0, 0.62, 0.45, 1.0)  # red, green, blue, opacity
 WHITE = (1.0, 1.0, 1.0, 1.0)
@@ -25,7 +26,7 @@ MIN_SIZE_M = 1e-3  # RViz complains about markers without a size
 
 # Of visualization_msgs/Marker
 ADD, DELETEALL = 0, 3
-SPHERE, LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING = 2, 5, 7, 9
+ARROW, SPHERE, LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING = 0, 2, 5, 7, 9
 
 
 class MarkerMessages:
@@ -64,6 +65,18 @@ class MarkerMessages:
         ellipsoids = self._ellipsoids(header, points, covariances)
         drawn = [self._points(header, points), lines, *ellipsoids, *labels]
         return self._array([self._removal(header), *drawn])
+
+    def places(self, stamp_ns: int, poses: FloatArray) -> Any:
+        """Return arrows, in place of all earlier markers, at poses (q, 4, 4) of a lost robot."""
+        header = self._messages.header(stamp_ns, self._frame_id)
+        arrows = []
+        for number, pose in enumerate(poses[:MAX_LABELS]):
+            arrow = self._marker(header, 'possible places', ARROW, ORANGE, ARROW_WIDTH_M)
+            arrow.id = number
+            arrow.pose = self._messages.pose(pose)
+            arrow.scale.x = ARROW_LENGTH_M
+            arrows.append(arrow)
+        return self._array([self._removal(header), *arrows])
 
     def none(self, stamp_ns: int) -> Any:
         """Return what removes all earlier markers."""

@@ -8,6 +8,7 @@ covariances (m, 3, 3), m².
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from slam_observer_ros.common.types import BoolArray, FloatArray, IntArray
 from slam_observer_ros.geometry import se3
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.observer.configuration import turned_moment
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.observer import Observer
 from slam_observer_ros.observer.orientations import LandmarkOrientations, SeenOrientations
@@ -202,6 +204,13 @@ class Filter:
         """Return the covariance (p + m k, p + m k) of ε and ã_i of m landmarks."""
         return None
 
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit: see :mod:`.riccati`.
+
+        Gains that know no joint covariance merge nothing, and return infinity.
+        """
+        return math.inf
+
     def configuration_covariance(self, rows: IntArray) -> FloatArray | None:
         """Return the joint covariance (m k, m k) of landmarks as seen from the robot, m²."""
         P, axes = self.joint_covariance(rows), self.axes
@@ -211,7 +220,10 @@ class Filter:
         m, k, p = len(rows), axes.point, axes.p
         C = axes.output_matrix(self.points[rows]).reshape(-1, p)
         CP = C @ P[:p] - P[p:]
-        blocks = (CP[:, :p] @ C.T - CP[:, p:]).reshape(m, k, m, k).swapaxes(1, 2)
+        seen_covariance = CP[:, :p] @ C.T - CP[:, p:]
+        turns = slice(p - k)
+        seen_covariance = turned_moment(seen_covariance, CP[:, turns], P[turns, turns])
+        blocks = seen_covariance.reshape(m, k, m, k).swapaxes(1, 2)
         R = self.observer.A[:k, :k]
         seen: FloatArray = (R.T @ blocks @ R).swapaxes(1, 2).reshape(m * k, m * k)
         return seen

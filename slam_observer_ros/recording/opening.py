@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
-from slam_observer_ros.common.errors import RecordingError, YamlError
+from slam_observer_ros.common.errors import message_of, RecordingError, YamlError
+from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.yaml_files import load_yaml, plain_value
 from slam_observer_ros.recording.compression import (
     decompressed,
@@ -41,8 +42,12 @@ def open_source(path: Path) -> tuple[MessageSource, str | None]:
     Also returns a warning, if only a part of it could be read. Raises a RecordingError that says
     in one line what to do if there is nothing to read.
     """
-    if not path.exists():
-        raise RecordingError(f'{path}: no such file or directory')
+    try:
+        not_special(path)
+    except FileNotFoundError as error:
+        raise RecordingError(f'{path}: no such file or directory') from error
+    except OSError as error:
+        raise RecordingError(message_of(error)) from error
     if path.is_dir():
         return _open_directory(path)
     if path.suffix == SUFFIX:

@@ -143,4 +143,5 @@ def _consistency(run: ReportedRun) -> list[Finding]:
 
 
 def _calibration(run: ReportedRun) -> list[Finding]:
-    return [Finding(problem) for problem in calibration_problems(run.calibration)]
+    advice = [part.advice for part in run.calibration if part.advice]
+    return [Finding(text) for text in [*calibration_problems(run.calibration), *advice]]

@@ -43,6 +43,8 @@ def estimator_values(estimator: Diagnosed, dropped: Counter[str]) -> dict[str, s
     values['landmarks known'] = str(len(estimator.landmark_ids))
     values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
     values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
+    advice = {part.name: part.advice for part in estimator.calibration if part.advice}
+    values |= {f'mounting: {name}': text for name, text in advice.items()}
     values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
     return values
 

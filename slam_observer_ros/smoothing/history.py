@@ -204,6 +204,18 @@ class History:
         self.prior = self.prior.without(self._axes, rows)
         self.summary = self.summary.without(self._axes, rows)
 
+    def merge(self, rows: IntArray, copies: IntArray) -> None:
+        """Take what was seen of landmarks ``copies`` (m,) for what was seen of ``rows`` (m,)."""
+
+        def renamed(keyframes: Keyframes) -> Keyframes:
+            landmarks = keyframes.landmarks.copy()
+            for row, copy_ in zip(rows.tolist(), copies.tolist(), strict=True):
+                landmarks[landmarks == copy_] = row
+            return replace(keyframes, landmarks=landmarks)
+
+        self._change(renamed)
+        self.remove(copies)
+
     def keyframes(self) -> Keyframes:
         """Return all keyframes."""
         return joined([*self._summarised, self._gathered()])

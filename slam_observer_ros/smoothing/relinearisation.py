@@ -176,6 +176,18 @@ class Relinearisation:
         """Forget landmarks; those behind move up."""
         self.history.remove(rows)
 
+    def merge(self, rows: IntArray, copies: IntArray) -> None:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,), as the filter has done.
+
+        What was summed up of both would have to be merged, too: what the filter knows now stands
+        for it, and for what was seen since.
+        """
+        were_summed_up = np.min(copies) < len(self.history.summary.points)
+        self.history.merge(rows, copies)
+        if were_summed_up and self.is_active:
+            self.history.summarise(self._known().least_nonlinear(self._axes)[0])
+            self._clear_counts()
+
     def smooth(self) -> tuple[Solution, int]:
         """Return all smoothed estimates, and how many slips they confirm (:mod:`.slips`).
 

@@ -14,6 +14,15 @@ PATIENCE = 4
 Some are seen more seldom than others: from afar, or from one side only.
 """
 
+TOO_SELDOM = 5
+"""How many times more seldom than others a landmark may be seen that was confirmed once."""
+
+NEW_S, OLD_S = 60.0, 20.0
+"""A landmark is new for so long, and an old one was not seen for so long, seconds."""
+
+MIN_LOOP = 5
+"""New landmarks, and old ones, that can say by how they lie whether a loop has closed."""
+
 _COLUMNS = (
     'ids',
     'counts',
@@ -24,7 +33,9 @@ _COLUMNS = (
     'seen_before_ns',
     'tentative',
     'in_view',
+    'passed',
     'missed',
+    'born_ns',
 )
 
 
@@ -45,7 +56,12 @@ class LandmarkTable:
         self.tentative: BoolArray = np.empty(0, dtype=np.bool_)
         # (n,) observations without ids that had it in view, and those since the one that saw it
         self.in_view: IntArray = np.empty(0, dtype=np.int64)
+        # (n,) those from another place than the one before: what hides one from a robot that
+        # stands hides it in all of them
+        self.passed: IntArray = np.empty(0, dtype=np.int64)
         self.missed: IntArray = np.empty(0, dtype=np.int64)
+        # (n,) stamp at which each was seen for the first time; −1 for one that a map had
+        self.born_ns: IntArray = np.empty(0, dtype=np.int64)
         # (n, 3) its position at the first and the last of the rejections, metres, reference frame
         self.rejected_at: FloatArray = np.empty((0, 3))
         self.rejected_last: FloatArray = np.empty((0, 3))
@@ -91,6 +107,7 @@ class LandmarkTable:
         """Take all landmarks as last seen before any stamp to come."""
         self.last_seen_ns = np.full(len(self), -1)
         self.seen_before_ns = np.full(len(self), -1)
+        self.born_ns = np.full(len(self), -1)
 
     def renumber(self, rows: IntArray, ids: IntArray) -> None:
         """Give ``rows`` (m,) other ids (m,)."""
@@ -125,6 +142,18 @@ class LandmarkTable:
             unseen_s[was_never_seen] = np.inf
         return unseen_s
 
+    def are_new(self, rows: IntArray, stamp_ns: int) -> BoolArray:
+        """Return which ``rows`` (m,) were first seen of late and are still about."""
+        is_new: BoolArray = to_s(stamp_ns - self.born_ns[rows]) < NEW_S
+        is_about: BoolArray = to_s(stamp_ns - self.last_seen_ns[rows]) < OLD_S
+        return is_new & is_about
+
+    def are_old(self, rows: IntArray, stamp_ns: int) -> BoolArray:
+        """Return which ``rows`` (m,) are not new, and were not seen of late."""
+        is_new: BoolArray = to_s(stamp_ns - self.born_ns[rows]) < NEW_S
+        is_about: BoolArray = to_s(stamp_ns - self.last_seen_ns[rows]) < OLD_S
+        return ~is_new & ~is_about
+
     def reject(self, rows: IntArray, points: FloatArray, tolerances_m: FloatArray) -> None:
         """Count one more rejected observation of ``rows`` (m,).
 
@@ -155,12 +184,16 @@ class LandmarkTable:
         needed = np.minimum(self.counts[rows] + 1, max_rejections)
         return np.asarray(rejections >= needed)
 
-    def note_in_view(self, rows: IntArray, seen: BoolArray) -> None:
-        """Count one more observation that had rows (m,) in view, and which of them it saw."""
+    def note_in_view(self, rows: IntArray, seen: BoolArray, has_moved: bool = True) -> None:
+        """Count one more observation that had rows (m,) in view, and which of them it saw.
+
+        ``has_moved`` says whether it was made from another place than the one before.
+        """
         confirmed = ~self.tentative[rows]
         self._confirmed_in_view += int(np.sum(confirmed))
         self._confirmed_seen += int(np.sum(confirmed & seen))
         self.in_view[rows] += 1
+        self.passed[rows] += has_moved
         self.missed[rows] = np.where(seen, 0, self.missed[rows] + 1)
 
     def _sort(self) -> None:
@@ -177,7 +210,8 @@ class LandmarkTable:
 
         That is less than ``min_support`` times by when a confirmed one, as often in view, would
         have been seen :data:`PATIENCE` times as often. One that was seen so often is confirmed
-        here.
+        here. It stays unless it is passed by so often that it is seen :data:`TOO_SELDOM` times
+        more seldom than others; one that a map had stays in any case.
         """
         confirmed_now = self.tentative & (self.counts >= min_support)
         self._confirmed_in_view += int(np.sum(self.in_view[confirmed_now]))
@@ -185,7 +219,11 @@ class LandmarkTable:
         self.tentative &= ~confirmed_now
         # Before any is confirmed nobody knows how often one is seen.
         expected = self.in_view * self.seen_share
-        return np.flatnonzero(self.tentative & (expected >= PATIENCE * min_support))
+        had_its_chance = self.tentative & (expected >= PATIENCE * min_support)
+        expected = self.passed * self.seen_share
+        has_gone = is_automatic(self.ids) & (self.born_ns >= 0)
+        has_gone &= expected >= np.maximum(TOO_SELDOM * self.counts, PATIENCE * min_support)
+        return np.flatnonzero(had_its_chance | has_gone)
 
     def unseen_since(self, stamp_ns: int) -> IntArray:
         """Return rows not seen since a stamp: least often seen first, then longest ago."""
@@ -194,13 +232,24 @@ class LandmarkTable:
 
     def take_for_new(self, rows: IntArray, stamp_ns: int) -> None:
         """Take ``rows`` as seen for the first time, at a stamp."""
-        self.last_seen_ns[rows] = stamp_ns
+        self.last_seen_ns[rows] = self.born_ns[rows] = stamp_ns
         self.seen_before_ns[rows] = -1
         self.counts[rows] = 1
         self.rejections[rows] = 0
         self.tentative[rows] = is_automatic(self.ids[rows])
-        self.in_view[rows] = 0
-        self.missed[rows] = 0
+        self.in_view[rows] = self.passed[rows] = self.missed[rows] = 0
+
+    def merge(self, rows: IntArray, copies: IntArray) -> None:
+        """Count what was seen of ``copies`` (m,) for ``rows`` (m,), and delete the copies."""
+        for counted in (self.counts, self.in_view, self.passed):
+            counted[rows] += counted[copies]
+        is_later = self.last_seen_ns[copies] > self.last_seen_ns[rows]
+        later, latest = rows[is_later], copies[is_later]
+        for column in (self.last_seen_ns, self.seen_before_ns, self.missed):
+            column[later] = column[latest]
+        self.rejections[rows] = 0
+        self.tentative[rows] &= self.tentative[copies]
+        self.remove(copies)
 
     def remove(self, rows: IntArray) -> None:
         """Delete rows; those behind move up."""

@@ -186,6 +186,16 @@ class State:
         self.filter.remove(rows)
         self.landmarks.remove(rows)
 
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit; see the filter's merge."""
+        square = self.filter.merge(rows, copies, most)
+        if square <= most:
+            self.landmarks.merge(rows, copies)
+            if self.relinearisation is not None:
+                self.relinearisation.merge(rows, copies)
+            self.counts['merged_landmark'] += len(rows)
+        return square
+
     def forget(self, rows: IntArray, why: str) -> None:
         """Remove landmarks, if there are any at ``rows``; ``why`` is the count they go to."""
         if len(rows):

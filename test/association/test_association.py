@@ -15,7 +15,6 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-from slam_observer_ros.association.assignments import PRUNING_COST
 from slam_observer_ros.association.field_of_view import FieldOfView
 from slam_observer_ros.association.hypotheses import are_one, Hypotheses
 from slam_observer_ros.association.interpretations import interpretations
@@ -26,8 +25,10 @@ from slam_observer_ros.association.joint_compatibility import (
     JointSearch,
     MAX_PARTIAL,
     Pairs,
+    PRUNING_COST,
 )
 from slam_observer_ros.association.landmark_index import LandmarkIndex
+from slam_observer_ros.association.new_landmarks import NewLandmarks
 from slam_observer_ros.association.visibility import Visibility
 from slam_observer_ros.estimator.estimator import Estimator
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
@@ -49,7 +50,7 @@ from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.live_settings import LiveSettings
 from slam_observer_ros.settings.parameter_file import read_parameter_file
 from slam_observer_ros.settings.parameter_table import from_parameters, table
-from slam_observer_ros.state.landmark_table import LandmarkTable, PATIENCE
+from slam_observer_ros.state.landmark_table import LandmarkTable, PATIENCE, TOO_SELDOM
 from slam_observer_ros.state.matching import match
 from slam_observer_ros.state.state import State
 
@@ -489,7 +490,7 @@ def test_what_new_landmarks_cost_does_not_depend_on_what_else_is_in_the_map():
         event = ObservationEvent(estimator.stamp_ns, np.array([1, 2, 77]), new)
         state, index = estimator._hypotheses.best, LandmarkIndex()
         matched = match(state, event)
-        (only,) = interpretations(state, index, event, matched, np.arange(3), np.inf)
+        (only,) = interpretations(state, index, event, matched, np.arange(3), 20.0, np.inf)
         costs.append(only.cost)
     assert costs[0] == pytest.approx(costs[1], abs=0.5)
 
@@ -556,7 +557,7 @@ def looked_at(counts, looks, settled_looks=0, settled_seen=0):
         landmarks.note_in_view(np.array([0]), np.array([look < settled_seen]))
     for row, times in enumerate(looks, start=1):
         for _ in range(times):
-            landmarks.note_in_view(np.array([row]), np.array([False]))
+            landmarks.note_in_view(np.array([row]), np.array([False]), has_moved=False)
     return landmarks
 
 
@@ -571,12 +572,37 @@ def test_where_all_are_seen_seldom_it_takes_longer():
     assert landmarks.unsupported(5).tolist() == [2]
 
 
-def test_what_has_settled_stays_however_long_it_is_not_seen():
+def test_what_has_settled_stays_however_long_it_is_hidden_from_one_place():
     landmarks = looked_at([5], [0], settled_looks=100, settled_seen=100)
     assert landmarks.unsupported(5).tolist() == []
     for _ in range(1000):
-        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
+        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]), has_moved=False)
     assert landmarks.unsupported(5).tolist() == []
+
+
+@pytest.mark.parametrize('counts', [5, 20])
+def test_what_has_settled_goes_if_it_is_seen_five_times_too_seldom_from_many_places(counts):
+    landmarks = looked_at([counts], [0], settled_looks=100, settled_seen=100)
+    landmarks.unsupported(5)
+    for _ in range(TOO_SELDOM * counts - 1):
+        landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
+        landmarks._confirmed_in_view = landmarks._confirmed_seen  # others are seen each time
+    assert landmarks.unsupported(5).tolist() == []
+    landmarks.note_in_view(np.array([0, 1]), np.array([True, False]))
+    landmarks._confirmed_in_view = landmarks._confirmed_seen
+    assert landmarks.unsupported(5).tolist() == [1]
+
+
+def test_on_new_ground_a_new_landmark_costs_less_and_where_all_is_known_as_much_as_the_gate():
+    new, gate_cost = NewLandmarks(), huber_loss(6.0)
+    event = ObservationEvent(0, np.full(5, UNKNOWN_ID), np.zeros((5, 3)))
+    for second in range(100):
+        new.note(replace(event, stamp_ns=second * 10**9), confirmed=1)
+    assert new.cost(gate_cost) == pytest.approx(gate_cost - 2.0 * np.log(0.2 / 0.0017), abs=0.1)
+    for second in range(100, 600):
+        new.note(replace(event, stamp_ns=second * 10**9), confirmed=0)
+    assert new.cost(gate_cost) == pytest.approx(gate_cost, abs=0.6)
+    assert new.cost(4.0) == 4.0, 'no more than a point at the gate'
 
 
 def test_nothing_is_forgotten_before_it_is_known_how_often_a_landmark_is_seen():
@@ -624,7 +650,7 @@ def test_a_place_costs_what_should_have_been_seen_there_and_a_hidden_landmark_so
     state = state_of(landmarks, np.array([[2.0, 0.0, 0.0]]))
     ahead = 4.0 * np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]])
     others = ObservationEvent(10, np.full(2, UNKNOWN_ID), ahead)
-    landmarks.note_in_view = lambda rows, seen: None  # so that the share stays
+    landmarks.note_in_view = lambda rows, seen, has_moved: None  # so that the share stays
     costs = [visibility.note(state, others, some_have_ids=False)]
     for landmarks.missed[0] in range(misses):
         costs.append(visibility.note(state, others, some_have_ids=False))

@@ -8,6 +8,7 @@ import math
 import os
 from pathlib import Path
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -54,6 +55,23 @@ def fixture_recordings(tmp_path):
     folder = tmp_path / 'recordings' / 'monday'
     folder.mkdir(parents=True)
     return [write_mcap(folder / 'one.mcap'), write_rosbag1(folder / 'two.bag')]
+
+
+def test_a_line_that_does_not_fit_on_the_disk_is_an_error_that_names_the_file(tmp_path):
+    path = tmp_path / 'runs.jsonl'
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40, limits[1]))
+    try:
+        with (
+            pytest.raises(OutputError, match=r"can't write .*runs\.jsonl: File too large"),
+            opened_log(path) as log,
+        ):
+            log.append(RUN)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with opened_log(path) as log:
+        log.append(RUN)
+    assert list(read_logs(tmp_path)) == ['a']
 
 
 def lines_of(directory: Path):
@@ -153,7 +171,9 @@ def test_the_same_recording_under_two_names_is_run_once(slam_observer, recording
         (['--grid', 'gains=constant', '--smooth'], '--smooth needs riccati gains'),
         (['--shard', '3/2'], 'i from 1 to N'),
         (['nothing/*.mcap'], "no file is named 'nothing/*.mcap'"),
-        (['--workers', '0'], 'at least one'),
+        (['--grid', 'range_noise=0.1,0.10'], '--grid range_noise: 0.1 is given twice'),
+        (['--workers', '0'], 'a number of processes from 1 is needed'),
+        (['--workers', 'many'], 'a number of processes from 1 is needed'),
     ],
 )
 def test_what_can_not_be_run_is_refused_before_anything_is(

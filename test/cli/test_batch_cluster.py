@@ -128,3 +128,4 @@ def test_a_scheduler_that_can_not_be_is_an_error_in_one_line(tmp_path):
 def test_a_scheduler_that_does_not_answer_is_an_error_in_one_line(capsys, tmp_path):
     options = ('batch', SAMPLE, '--out', tmp_path / 'r', '--scheduler', 'tcp://127.0.0.1:9')
     assert 'no Dask scheduler answers there' in CommandLine(capsys).fail(*options)
+    assert not list(tmp_path.iterdir())

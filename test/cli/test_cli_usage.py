@@ -76,7 +76,10 @@ def test_a_former_name_of_a_parameter_is_refused_with_the_new_one(
         ('replay nothing.mcap --jsn', "'--json'?; see 'slam-observer replay --help'"),
         ('replay nothing.mcap --gain constant', "--gain constant; did you mean '--gains'?"),
         ('replay nothing.mcap --gains best', "--gains: invalid choice: 'best'"),
-        ('replay nothing.mcap --config nowhere', 'come with the package: apriltags, observer'),
+        (
+            'replay nothing.mcap --config nowhere',
+            'come with the package: apriltags, localization',
+        ),
         (
             'replay nothing.mcap --config nowhere/a.yaml',
             "can't read parameter file nowhere/a.yaml",
@@ -154,7 +157,7 @@ def wait_until_ready(process: subprocess.Popen[str]) -> None:
 @pytest.mark.parametrize('command', ['replay run.mcap', 'simulate'])
 def test_figures_without_a_directory(slam_observer, command):
     error = slam_observer.fail(*command.split(), '--plot', '')
-    assert 'argument --plot: a directory is needed' in error
+    assert 'argument --plot: the name is empty' in error
 
 
 @pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])

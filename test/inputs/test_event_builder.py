@@ -170,6 +170,26 @@ def test_landmarks_in_the_odometrys_frame_or_of_a_sensor_by_parameter_are_used()
 
 
 @pytest.mark.parametrize(
+    ('frame', 'called', 'axis'),
+    [
+        ('camera', 'camera', [1.0, 0.0, 0.0]),
+        ('/camera_optical', 'camera_optical', [0.0, 0.0, 1.0]),
+        ('base_link', '', [1.0, 0.0, 0.0]),
+        ('', '', [1.0, 0.0, 0.0]),
+    ],
+)
+def test_landmarks_name_their_sensor_and_the_axis_along_which_it_looks(frame, called, axis):
+    transforms = TransformBuffer()
+    for sensor in ('camera', 'camera_optical'):
+        transforms.insert('base_link', sensor, 0, CAMERA, is_static=True)
+    event = ObservationEvent(0, np.array([3]), np.ones((1, 3)))
+    seen = BaseFrame(InputSettings(), transforms).observation(event, frame)
+    assert seen.sensor_frame == called
+    R = CAMERA[:3, :3] if called else np.eye(3)
+    assert_allclose(seen.sensor_axis, R @ np.array(axis))
+
+
+@pytest.mark.parametrize(
     ('base', 'frame', 'meant'),
     [
         ('base_link', 'robot1/camera', "set that to 'robot1/base_link'"),

@@ -98,3 +98,20 @@ def test_what_nobody_reads_is_not_published(monkeypatch):
     assert not published.poses
     published.publisher.publish_overview()
     assert len(published.poses) == 1, 'which who comes late gets'
+
+
+def test_a_lost_robot_is_drawn_as_arrows_at_the_places_that_fit(monkeypatch):
+    published = Published(monkeypatch)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = 4.0, -2.0, 0.0
+    lost = Mock(is_localised=False, stamp_ns=SECOND, possible_poses=poses)
+    published.publisher._estimator = lost
+    published.publisher._markers = markers = Mock()
+    published.publisher.publish_overview()
+    removal, *arrows = markers.publish.call_args.args[0].markers
+    assert removal.action == removal.DELETEALL
+    assert [(arrow.type, arrow.pose.position.x) for arrow in arrows] == [(0, 0.0), (0, 4.0)]
+    # With nobody who looks nothing is made of them.
+    markers.get_subscription_count.return_value = 0
+    published.publisher.publish_overview()
+    assert markers.publish.call_count == 1

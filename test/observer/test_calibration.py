@@ -38,6 +38,7 @@ WHEELS = Settings(
     linear_scale_stddev=(0.1, 0.0, 0.0),
     angular_bias_stddev=NO_BIAS,
     velocity_delay_stddev=0.0,
+    sensor_rotation_stddev=NO_BIAS,
 )
 WHEEL_SCALE = np.array([1.0, 1.0, 0.95, 1.05, 1.0, 1.0])
 
@@ -210,6 +211,7 @@ def test_the_delay_of_velocities_stamped_too_late_does_not_stray():
         angular_velocity_noise=(0.0, 0.0, 0.005),
         velocity_delay_stddev=0.2,
         angular_bias_stddev=NO_BIAS,
+        sensor_rotation_stddev=NO_BIAS,
     )
     for seed in range(4):
         estimator = estimate(drive(settings, 60.0, seed, delay_ns=-200_000_000), settings)

@@ -12,9 +12,14 @@ import numpy as np
 import pytest
 from strategies import generators
 
-from slam_observer_ros.events import ObservationEvent
+from slam_observer_ros.estimates import CalibrationEstimate
+from slam_observer_ros.estimator.estimator import Estimator
+from slam_observer_ros.events import ObservationEvent, UNKNOWN_ID
 from slam_observer_ros.geometry import so3
 from slam_observer_ros.geometry.axes import axes_of
+from slam_observer_ros.known_map.landmark_map import LandmarkMap
+from slam_observer_ros.observer.riccati.compressed_covariance import BlockSize
+from slam_observer_ros.observer.riccati.riccati import RiccatiFilter
 from slam_observer_ros.sensor_models import sensing, sensor_calibration
 from slam_observer_ros.sensor_models.calibration import Calibration
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -31,6 +36,7 @@ EVERYTHING = Settings(
     range_scale=1.01,
     range_scale_stddev=0.02,
     angular_bias_stddev=NONE,
+    velocity_delay_stddev=0.0,
     angular_velocity_noise=(0.003,) * 3,
     linear_velocity_noise=(0.003,) * 3,
     range_noise=0.02,
@@ -54,7 +60,8 @@ def erring(world, settings, turned=TURNED, shifted=SHIFTED, longer=LONGER, **whe
 
 def calibrated(settings):
     calibration = Calibration(
-        replace(settings, angular_bias_stddev=NONE), axes_of(settings.two_d_mode)
+        replace(settings, angular_bias_stddev=NONE, velocity_delay_stddev=0.0),
+        axes_of(settings.two_d_mode),
     )
     calibration.add_sensor('')
     return calibration
@@ -162,6 +169,7 @@ def range_scales(seeds):
         range_scale_stddev=0.05,
         range_noise=0.1,
         angular_bias_stddev=NONE,
+        velocity_delay_stddev=0.0,
         relinearization_interval=0,
     )
     off = []
@@ -249,3 +257,77 @@ def test_other_gains_use_what_is_stated_and_estimate_none_of_it(gains):
     estimator = estimate(shown, settings)
     assert estimator.calibration == []
     assert configuration_error_m(estimator, world) < 1e-6
+
+
+@both
+def test_in_a_large_map_it_is_found_as_in_a_small_one(settings, monkeypatch):
+    settings = replace(settings, relinearization_interval=0)
+    world = erring(drive(settings, 30.0, landmarks=30), settings)
+    dense = estimate(world, settings)
+    monkeypatch.setattr(RiccatiFilter, 'block', BlockSize(dense=10, most=10, kept=4))
+    compressed = estimate(world, settings)
+    assert not compressed._state.filter.joint.is_dense
+    for before, after in zip(dense.calibration, compressed.calibration, strict=True):
+        assert abs(after.value - before.value) < 0.05 * before.deviation
+        assert after.deviation == pytest.approx(before.deviation, rel=0.01)
+
+
+@both
+@pytest.mark.parametrize('mode', ['uncertain', 'fixed'])
+def test_in_a_surveyed_map_it_is_found_fast(settings, mode):
+    settings = replace(settings, localization_mode=mode)
+    world = erring(drive(settings, 20.0, landmarks=20), settings)
+    estimator = Estimator(settings)
+    ids = np.arange(len(world.world_points))
+    covariances = np.tile(1e-6 * np.eye(3), (len(ids), 1, 1))
+    counts = np.full(len(ids), 10)
+    surveyed = LandmarkMap(ids, world.world_points, covariances, counts)
+    estimator.load_map(surveyed, world.poses[0])
+    for event in world.events:
+        estimator.add(event)
+    estimator.flush()
+    truth = dict(zip(sensor_calibration.NAMES, [*TURNED, *SHIFTED, LONGER], strict=True))
+    for part in estimator.calibration:
+        assert abs(part.value - truth[part.name]) < 3.5 * part.deviation
+        assert part.deviation < 0.25 * part.stated
+
+
+def test_points_without_ids_are_matched_where_a_calibrated_sensor_has_them():
+    settings = replace(PLANE, range_is_depth=True, range_scale=LONGER, confirmations=2)
+    world = drive(settings, 30.0, landmarks=8)
+
+    def shown(_, event):
+        along = event.points[:, :1] / np.linalg.norm(event.points, axis=1, keepdims=True)
+        is_ahead = along[:, 0] > 0.3
+        points = (event.points * along / LONGER)[is_ahead]
+        return replace(event, points=points, ids=np.full(len(points), UNKNOWN_ID))
+
+    estimator = estimate(world.with_observations(shown), settings)
+    assert len(estimator.landmark_ids) <= 8
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'text'),
+    [
+        ('sensor_rotation_z/camera', 0.0349, 'camera is mounted 2 ± 0.57 ° further to the left'),
+        ('sensor_rotation_y', -0.0349, 'the sensor is mounted 2 ± 0.57 ° further up than'),
+        (
+            'sensor_translation_x',
+            -0.05,
+            'is mounted 0.05 ± 0.01 m further back than /tf',
+        ),
+        ('range_scale', 0.95, 'multiplied by 0.950 ± 0.010: set range_scale: 0.9500'),
+        ('sensor_rotation_z', 0.02, ''),
+        ('linear_scale_x', 1.5, ''),
+    ],
+)
+def test_what_was_found_is_said_as_what_to_set(name, value, text):
+    part = CalibrationEstimate(
+        name, value, 0.01, UNITS[name.split('/')[0]], float('scale' in name), 0.035
+    )
+    assert part.advice == text or text in part.advice != ''
+
+
+UNITS = dict(zip(sensor_calibration.NAMES, sensor_calibration.UNITS, strict=True)) | {
+    'linear_scale_x': ''
+}

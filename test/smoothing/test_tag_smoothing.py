@@ -34,6 +34,7 @@ SETTINGS = Settings(
     huber_threshold=0.0,
     rejection_threshold=100.0,
     angular_bias_stddev=(0.0, 0.0, 0.0),
+    velocity_delay_stddev=0.0,
     max_hypotheses=1,
     confirmations=1,
     reorder_window=0.0,
@@ -321,3 +322,32 @@ def test_what_is_off_since_the_map_has_moved_is_not_taken_for_outliers(axes):
 
     assert miss_m(smoother.ungated(start)) < 0.5 * miss_m(start)
     np.testing.assert_array_equal(smoother.ungated(solution).poses, solution.poses)
+
+
+@pytest.mark.parametrize('two_d_mode', [False, True])
+def test_a_camera_that_is_askew_is_found_by_how_tags_are_turned_too(two_d_mode):
+    stated = np.array([0.0, 0.0, 0.05]) if two_d_mode else np.full(3, 0.05)
+    settings = replace(
+        OFTEN,
+        two_d_mode=two_d_mode,
+        sensor_rotation_stddev=tuple(stated),
+        orientation_noise=0.01,
+        point_noise=0.01,
+        angular_velocity_noise=(0.02,) * 3,
+        linear_velocity_noise=(0.02,) * 3,
+    )
+    world, _ = tag_world(settings, 30.0, sigma_rad=0.01)
+    askew = so3.exp(np.where(stated > 0.0, [0.02, -0.03, 0.04], 0.0))
+
+    def shown(_, event):
+        orientations = askew.T @ event.orientations
+        return replace(event, points=event.points @ askew, orientations=orientations)
+
+    estimator = estimate(world.with_observations(shown), settings)
+    truth = so3.log(askew)[stated > 0.0]
+    for part, turned in zip(estimator.calibration, truth, strict=True):
+        assert abs(part.value - turned) < 3.5 * part.deviation
+        assert part.deviation < 0.2 * part.stated
+    deviations_m = np.sqrt(np.trace(estimator.landmark_covariances, axis1=1, axis2=2))
+    shifts = estimator.world_points - estimator.smooth().world_points
+    assert np.all(np.linalg.norm(shifts, axis=1) < 0.5 * deviations_m)

@@ -35,10 +35,12 @@ from slam_observer_ros.cli.console import (
     show_message,
     show_runs,
 )
-from slam_observer_ros.cli.options import add_settings_options
+from slam_observer_ros.cli.options import add_settings_options, named, named_path
+from slam_observer_ros.cli.outputs import check_directory
 from slam_observer_ros.cli.replay.asked import add_run_options, read_asked
 from slam_observer_ros.cli.replay.identity import sha256_of
-from slam_observer_ros.common.errors import IncompleteError
+from slam_observer_ros.common.errors import IncompleteError, OutputError
+from slam_observer_ros.common.output_files import destination
 from slam_observer_ros.settings.input_settings import InputSettings
 
 logger = logging.getLogger(__name__)
@@ -55,6 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'recordings',
         nargs='+',
+        type=named,
         metavar='RECORDING',
         help="recordings, or patterns such as 'recordings/**/*.mcap'",
     )
@@ -68,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument(
         '--out',
-        type=Path,
+        type=named_path,
         required=True,
         metavar='DIR',
         help='where runs.jsonl, a line for each run, and index.html are written',
@@ -144,10 +147,9 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _worker_count(text: str) -> int:
-    count = int(text)
-    if count < 1:
-        raise argparse.ArgumentTypeError('at least one is needed')
-    return count
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"a number of processes from 1 is needed, not '{text}'")
+    return int(text)
 
 
 def _pool(args: argparse.Namespace, jobs: int) -> Pool:
@@ -157,11 +159,17 @@ def _pool(args: argparse.Namespace, jobs: int) -> Pool:
 
 
 def _make_folders(args: argparse.Namespace) -> None:
-    folders = [(REPORTS, args.reports), (TRAJECTORIES, args.trajectories)]
-    args.out.mkdir(exist_ok=True)
-    for name, is_wanted in folders:
-        if is_wanted:
-            (args.out / name).mkdir(exist_ok=True)
+    """Make the directories of the outputs, whose files must not be in the way either."""
+    wanted = {REPORTS: args.reports, TRAJECTORIES: args.trajectories}
+    folders = [args.out / name for name, is_wanted in wanted.items() if is_wanted]
+    for folder in (args.out, *folders):
+        check_directory(folder)
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"can't make the directory {folder}: {error.strerror}") from error
+    for file in (*(log_name(kind, args.shard) for kind in ('runs', 'failed')), INDEX):
+        destination(args.out / file)
 
 
 def _is_done(args: argparse.Namespace, line: Line | None) -> bool:

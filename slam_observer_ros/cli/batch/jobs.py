@@ -17,7 +17,8 @@ from typing import Any
 from slam_observer_ros.cli.options import parse_value
 from slam_observer_ros.cli.replay.asked import Asked, check_smooth
 from slam_observer_ros.cli.replay.input_options import topic_names
-from slam_observer_ros.common.errors import UsageError
+from slam_observer_ros.common.errors import shown, UsageError
+from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
@@ -79,6 +80,9 @@ def grid_points(texts: Iterable[str]) -> list[Point]:
         axes[name] = [
             _KNOWN[name].check(parse_value(value)) for value in re.split(r',(?![^\[]*\])', values)
         ]
+        for number, value in enumerate(axes[name]):
+            if value in axes[name][:number]:
+                raise UsageError(f'--grid {name}: {shown(value)} is given twice')
     return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
 
 
@@ -127,13 +131,14 @@ def make_job(
     args: argparse.Namespace, recording: Path, sha256: str, point: Point, asked: Asked
 ) -> Job:
     """Return the job of one recording at one point."""
+    map_bytes = None if args.load_map is None else not_special(args.load_map).read_bytes()
     depends_on = {
         'recording': sha256,
         'version': VERSION,
         'settings': _changed(asked.settings),
         'inputs': _changed(asked.inputs),
         'topics': dataclasses.astuple(topic_names(args)),
-        'map': None if args.load_map is None else _sha256_of_bytes(args.load_map.read_bytes()),
+        'map': None if map_bytes is None else _sha256_of_bytes(map_bytes),
         'smooth': args.smooth,
     }
     run_id = _sha256_of_bytes(json.dumps(depends_on, sort_keys=True).encode())[:_ID_DIGITS]

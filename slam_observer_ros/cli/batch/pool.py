@@ -26,7 +26,7 @@ import signal
 import threading
 from typing import Generic, TypeVar
 
-from slam_observer_ros.common.errors import SlamObserverError, UsageError
+from slam_observer_ros.common.errors import message_of, SlamObserverError, UsageError
 
 CONNECT_S = 10.0
 """How long the scheduler of a cluster may take to answer."""
@@ -100,7 +100,7 @@ def _ended(job: _Job, future: Future[_Result]) -> Ended[_Job, _Result]:
     try:
         return Ended(job, future.result())
     except (SlamObserverError, OSError) as error:
-        return Ended(job, None, ' '.join(str(error).split()))
+        return Ended(job, None, message_of(error))
     except CancelledError:
         return Ended(job, None, 'cancelled: the scheduler is gone')
     except Exception as error:  # noqa: BLE001 (of whatever kind: the other runs are to be done)
@@ -113,7 +113,12 @@ def local_pool(workers: int) -> Pool:
 
 
 def cluster_pool(address: str, jobs: int) -> Pool:
-    """Return a pool of a Dask scheduler's workers, which share out all jobs among them."""
+    """Return a pool of a Dask scheduler's workers, which share out all jobs among them.
+
+    Raises a UsageError if no scheduler answers there.
+    """
+    with _cluster(address, jobs):
+        pass
     return Pool(partial(_cluster, address), jobs)
 
 

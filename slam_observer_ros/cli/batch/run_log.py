@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import fcntl
+from io import FileIO
 import json
 import logging
 import os
 from pathlib import Path
 import sys
-from typing import Any, BinaryIO
+from typing import Any
 
 from slam_observer_ros.cli.figures import FIGURES
 from slam_observer_ros.common.digits import json_text
@@ -62,7 +63,7 @@ def read_logs(directory: Path) -> dict[str, Line]:
 @contextmanager
 def opened_log(path: Path) -> Iterator[RunLog]:
     """Give the file to append to; an OutputError is raised if another batch is writing to it."""
-    with path.open('a+b') as file:
+    with path.open('a+b', buffering=0) as file:  # what does not fit is not tried again at the end
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -71,24 +72,27 @@ def opened_log(path: Path) -> Iterator[RunLog]:
         end = file.read().rpartition(b'\n')[2]
         if end and _parsed(end):  # an editor has left out the end of the last line
             file.write(b'\n')
-            file.flush()
         else:  # a power cut has: that run is to be done again
             file.seek(-len(end), os.SEEK_END)
             file.truncate()
-        yield RunLog(file)
+        yield RunLog(path, file)
 
 
 class RunLog:
     """Appends lines."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
+    def __init__(self, path: Path, file: FileIO) -> None:
+        self._path, self._file = path, file
 
     def append(self, line: Mapping[str, object]) -> None:
         """Append a line, in one piece; it is on the disk when this returns."""
-        self._file.write(json_text(line).encode() + b'\n')
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        left = json_text(line).encode() + b'\n'
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise OutputError(f"can't write {self._path}: {error.strerror}") from error
 
 
 def write_failures(path: Path, failures: Iterable[Mapping[str, object]]) -> None:

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
-from slam_observer_ros.cli.options import read_settings
+from slam_observer_ros.cli.options import named_path, read_settings
 from slam_observer_ros.cli.replay.input_options import (
     add_input_options,
     INPUT_NAMES,
@@ -32,7 +32,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     add_input_options(parser)
     parser.add_argument(
         '--load-map',
-        type=Path,
+        type=named_path,
         metavar='FILE',
         help='known landmarks, as --map writes them: the estimate is then in their frame, and has '
         'no ANEES of the pose (nor of the configuration, if they are fixed)',

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 
 from slam_observer_ros.cli.console import kept_warnings, print_json
-from slam_observer_ros.cli.options import add_settings_options
+from slam_observer_ros.cli.options import add_settings_options, named_path
 from slam_observer_ros.cli.outputs import add_force_option, add_result_options
 from slam_observer_ros.cli.replay.asked import add_run_options, read_asked
 from slam_observer_ros.cli.replay.estimate_recording import add_recording_options
@@ -29,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         'recording',
-        type=Path,
+        type=named_path,
         metavar='RECORDING',
         help='.mcap, .db3 or ROS 1 .bag file, or rosbag2 directory',
     )
@@ -37,14 +36,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument(
         '--tum',
-        type=Path,
+        type=named_path,
         metavar='FILE',
         help='trajectory, as evo reads it, at most 20 poses a second',
     )
-    outputs.add_argument('--map', type=Path, metavar='FILE', help='landmarks, as YAML')
+    outputs.add_argument('--map', type=named_path, metavar='FILE', help='landmarks, as YAML')
     outputs.add_argument(
         '--report',
-        type=Path,
+        type=named_path,
         metavar='OUT.html',
         help='one page for any browser, without a network: map, residuals, consistency and '
         'calibration over time',

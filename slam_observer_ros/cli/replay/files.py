@@ -34,17 +34,20 @@ def check_files(args: argparse.Namespace) -> None:
     if args.config is not None:
         read['the file of --config'] = [find_config(args.config)]
     loaded = {} if args.load_map is None else {'the file of --load-map': [args.load_map]}
-    kept = {
+    files = {
         '--tum': args.tum,
         '--report': args.report,
         '--mcap': args.mcap,
         '--rerun': args.rerun or None,
     }
-    check_inputs_are_kept(kept, read | loaded)
+    figures = () if args.plot is None else figure_files(args, FIGURES)
+    drawn = {f'{name} of --plot,': args.plot / name for name in figures}
+    check_inputs_are_kept(files | drawn, read | loaded)
     check_inputs_are_kept({'--map': args.map}, read)
-    check_outputs([args.tum, args.map, args.report, args.mcap, args.rerun or None], args.force)
+    outputs = [args.map, *files.values()]
+    check_outputs(outputs, args.force)
     check_rerun(args)
-    check_plots(args, FIGURES)
+    check_plots(args, FIGURES, outputs)
 
 
 def write_files(

@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 
 from slam_observer_ros.cli.replay.outcome import ReplayOutcome
+from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.version import VERSION
 from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.parameter_table import changed_names
@@ -29,7 +30,7 @@ def sha256_of(recording: Path) -> str:
     """Return the SHA-256 of a recording's files, one after the other, as hexadecimal digits."""
     digest = hashlib.sha256()
     for file in files_of(recording):
-        with file.open('rb') as opened:
+        with not_special(file).open('rb') as opened:
             while block := opened.read(_BLOCK_BYTES):
                 digest.update(block)
     return digest.hexdigest()

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import logging
 
-from slam_observer_ros.cli.options import read_assignments, read_config
+from slam_observer_ros.cli.options import named, read_assignments, read_config
 from slam_observer_ros.recording.reader import Recording
 from slam_observer_ros.recording.topics import SelectedTopics, TopicNames
 from slam_observer_ros.settings.estimator_settings import Settings
@@ -48,7 +48,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         ),
         ('--landmark-truth-topic', 'true landmarks'),
     ):
-        topics.add_argument(option, metavar='TOPIC', help=what)
+        topics.add_argument(option, type=named, metavar='TOPIC', help=what)
     inputs = parser.add_argument_group(
         'inputs', "the node's parameters of these names, which --config and --set give as well"
     )
@@ -59,6 +59,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     )
     inputs.add_argument(
         '--base-frame',
+        type=named,
         metavar='FRAME',
         help='frame whose pose is estimated; other sensors are placed in it by /tf and '
         '/tf_static (default: that of the velocities, or base_link if they name none)',

@@ -204,9 +204,11 @@ def _warn_of_rejections(result: Replay) -> None:
 
 
 def _warn_of_calibration(result: Replay) -> None:
-    """Say what may be wrong if a scale, bias or delay is one that nobody can mean."""
-    for problem in calibration_problems(result.estimator.calibration):
-        logger.warning('%s', problem)
+    """Say what may be wrong if nobody can mean an estimate, and how sensors are really mounted."""
+    calibration = result.estimator.calibration
+    advice = [part.advice for part in calibration if part.advice]
+    for text in [*calibration_problems(calibration), *advice]:
+        logger.warning('%s', text)
 
 
 def _warn_of_unmapped(result: Replay) -> None:

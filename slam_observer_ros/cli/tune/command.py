@@ -5,11 +5,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from slam_observer_ros.cli.console import muted_warnings, print_json, print_table, shown_steps
-from slam_observer_ros.cli.options import add_settings_options, read_assignments, read_config
-from slam_observer_ros.cli.outputs import add_force_option, check_outputs
+from slam_observer_ros.cli.options import (
+    add_settings_options,
+    named_path,
+    read_assignments,
+    read_config,
+)
+from slam_observer_ros.cli.outputs import (
+    add_force_option,
+    check_inputs_are_kept,
+    check_outputs,
+)
 from slam_observer_ros.cli.replay.asked import Asked, read_asked
 from slam_observer_ros.cli.replay.input_options import add_input_options
 from slam_observer_ros.cli.tune.material import HELD_OUT_SHARE, Material, read_material
@@ -19,6 +27,7 @@ from slam_observer_ros.cli.tune.tuned_file import certainty, rounded, verdict_li
 from slam_observer_ros.cli.tune.verdict import judge, Judged, Verdict
 from slam_observer_ros.common.errors import IncompleteError, UsageError
 from slam_observer_ros.observer.designs import DESIGNS
+from slam_observer_ros.recording.opening import files_of
 from slam_observer_ros.settings.estimator_settings import Settings
 from slam_observer_ros.settings.input_settings import InputSettings
 
@@ -30,18 +39,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         'is needed. What is found must hold on what was held out: other recordings, or the last '
         'third of each. If it does not, no file is written, and the exit code is 4.'
     )
-    parser.add_argument('recordings', nargs='+', type=Path, metavar='RECORDING')
+    parser.add_argument('recordings', nargs='+', type=named_path, metavar='RECORDING')
     parser.add_argument(
         '--hold-out',
         action='append',
         default=[],
-        type=Path,
+        type=named_path,
         metavar='RECORDING',
         help='hold this one out, and train on all of the others; may be given several times',
     )
     outputs = parser.add_argument_group('outputs')
     outputs.add_argument(
-        '--out', type=Path, metavar='FILE', help='parameter file to write if it is an improvement'
+        '--out',
+        type=named_path,
+        metavar='FILE',
+        help='parameter file to write if it is an improvement',
     )
     outputs.add_argument('--json', action='store_true', help='print one JSON object')
     add_force_option(parser)
@@ -55,9 +67,17 @@ def run(args: argparse.Namespace) -> None:
     asked = read_asked(args)
     if not DESIGNS[asked.settings.gains].has_joint_covariance:
         raise UsageError(f'tune needs riccati gains, not {asked.settings.gains}')
+    recordings = [*args.recordings, *args.hold_out]
+    read = {f'the recording {path}': files_of(path) for path in recordings}
+    check_inputs_are_kept({'--out': args.out}, read)
     check_outputs([args.out], args.force)
+    with muted_warnings():  # they are shown when it is judged; here, before the long search
+        hashes = [read_material(args, path, asked, 1.0).sha256 for path in args.hold_out]
     share = 0.0 if args.hold_out else HELD_OUT_SHARE
     trained_on = [read_material(args, path, asked, share) for path in args.recordings]
+    hashes += [material.sha256 for material in trained_on]
+    if len(set(hashes)) < len(hashes):
+        raise UsageError('a recording is given twice; what is trained on can not be held out, too')
     kinds, found = _search(trained_on, asked.settings)
     tuned = _rounded(scaled(asked.settings, kinds, found.log_factors.tolist()), kinds)
     verdict = _verdict(args, asked, trained_on, tuned)

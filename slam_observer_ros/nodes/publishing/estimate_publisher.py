@@ -157,7 +157,12 @@ class EstimatePublisher:
     def publish_overview(self) -> None:
         """Publish path, map and markers if they are new; they are costly, so seldom."""
         stamp_ns = self._estimator.stamp_ns
-        if stamp_ns is None or not self._is_new(self._slow_stamp_ns):
+        if stamp_ns is None:
+            return
+        if not self._estimator.is_localised and self._markers.get_subscription_count():
+            poses = self._estimator.possible_poses
+            self._markers.publish(self._messages.markers.places(stamp_ns, poses))
+        if not self._is_new(self._slow_stamp_ns):
             return
         self._slow_stamp_ns = stamp_ns
         self._keep_pose(stamp_ns)

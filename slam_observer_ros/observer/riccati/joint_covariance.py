@@ -307,6 +307,7 @@ class ExactMapCovariance(JointCovariance):
         self, axes: EstimatedAxes, joint: JointCovariance, covariances: FloatArray
     ) -> None:
         self._axes, self._p, self.first = axes, axes.p, joint.first
+        self._first_columns = joint._first_columns
         self.P = joint.P[: self.first, : self.first].copy()
         self._covariances = covariances  # (n, 3, 3) of the map, which are only passed on
 

@@ -20,7 +20,12 @@ import numpy as np
 
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, slam_group
-from slam_observer_ros.geometry.matrices import block_diagonal, mahalanobis, with_blocks
+from slam_observer_ros.geometry.matrices import (
+    block_diagonal,
+    mahalanobis,
+    solve_symmetric,
+    with_blocks,
+)
 from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
@@ -35,6 +40,14 @@ from slam_observer_ros.observer.robust import observation_weights
 from slam_observer_ros.sensor_models.motion import Motion, Passage
 from slam_observer_ros.sensor_models.observation_noise import repetition_factors
 from slam_observer_ros.settings.estimator_settings import Settings
+
+MERGER_ROUNDS = 4
+"""How often a merger is linearised; the last times it hardly changes."""
+
+SAME_M = 0.01
+"""Standard deviation of how far apart two landmarks may be that are one, metres: no two views of
+a thing have quite the same centre.
+"""
 
 
 class RiccatiFilter(Filter):
@@ -186,6 +199,35 @@ class RiccatiFilter(Filter):
         self.remove(copies)
         self.observer.set_reference(self.observer.points)
         self._compress_if_large(0)
+
+    def merge(self, rows: IntArray, copies: IntArray, most: float) -> float:
+        """Take landmarks ``copies`` (m,) for ``rows`` (m,) if they fit, and forget the copies.
+
+        Return the normalised square of how far they are apart, per axis; they fit up to ``most``.
+        """
+        self.joint = joint = self.joint.dense()
+        both, m = np.append(rows, copies), len(rows)
+        x, square = np.zeros(len(joint.P)), np.inf
+        # At the end of a loop the map may turn so far that it has to be linearised again.
+        for _ in range(MERGER_ROUNDS):
+            own, other = np.split(self._moved_points(both, -x), [m])
+            H = joint.difference(rows, copies, own, other)
+            HP, r = H @ joint.P, (own - other)[:, : self.axes.point].ravel() + H @ x
+            S = HP @ H.T + SAME_M**2 * np.eye(len(r))
+            weighted = solve_symmetric(S, r)
+            x, square = HP.T @ weighted, float(r @ weighted) / len(r)
+        if square <= most:
+            joint.update(HP, S, r)
+            self._move(-x)
+            self.remove(copies)
+            self.observer.set_reference(self.observer.points)
+        self._compress_if_large(0)
+        return square
+
+    def _moved_points(self, rows: IntArray, x: FloatArray) -> FloatArray:
+        """Return where landmarks (m, 3) would be if the state was moved by exp(x)."""
+        X = slam_group.exp(self.axes.full_pose(x[: self.axes.p]), self.joint.split(x)[0][rows])
+        return np.asarray(se3.rotate(X.A, self.points[rows]) + X.a)
 
     def _merge_orientations(self, rows: IntArray, copies: IntArray) -> None:
         """Merge those of landmarks ``rows`` (m,) with the map's, which are at ``copies``."""

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_observer_ros.common.errors import DataSetError, shown
+from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.truth import LandmarkTruth
@@ -124,7 +125,7 @@ def load_graph(file: Path | str, truth: Path | str | None = None) -> DataSet:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding='ascii').splitlines()
+        return not_special(path).read_text(encoding='ascii').splitlines()
     except FileNotFoundError as error:
         raise DataSetError(f'{path}: no such file') from error
     except OSError as error:

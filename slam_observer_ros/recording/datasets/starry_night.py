@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import scipy.io
 
-from slam_observer_ros.common.errors import DataSetError
+from slam_observer_ros.common.errors import DataSetError, message_of
+from slam_observer_ros.common.input_files import not_special
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import NANOSECONDS_PER_SECOND
 from slam_observer_ros.evaluation.truth import LandmarkTruth
@@ -85,10 +86,12 @@ def triangulate(pixels: FloatArray, variables: dict[str, FloatArray]) -> FloatAr
 
 def _read(file: Path) -> dict[str, FloatArray]:
     try:
-        with file.open('rb') as stream:
+        with not_special(file).open('rb') as stream:
             variables: dict[str, FloatArray] = scipy.io.loadmat(stream)
     except FileNotFoundError as error:
         raise DataSetError(f'{file}: no such file; give dataset3.mat of Starry Night') from error
+    except OSError as error:
+        raise DataSetError(message_of(error)) from error
     except Exception as error:  # SciPy's reader raises nearly anything where bytes are damaged
         raise DataSetError(f'{file}: not a MATLAB file, or damaged: {error}') from error
     missing = [name for name in _SHAPES if name not in variables]

@@ -1,0 +1,213 @@
+"""Landmarks without ids that turn out to be one: near each other, or at the end of a loop.
+
+After a loop the pose is so uncertain that a point may be of many landmarks, and one taken for a
+wrong one throws the map. So while enough new landmarks can decide later, points are held back
+from old ones (:mod:`slam_observer_ros.association.assignments`), and taken for new ones. Where
+these lie to each other as old ones do, in one way only, they are those.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import cholesky
+
+from slam_observer_ros.common.types import FloatArray, IntArray
+from slam_observer_ros.events import is_automatic
+from slam_observer_ros.geometry.matrices import mahalanobis
+from slam_observer_ros.known_map.constellation import find_places
+from slam_observer_ros.known_map.distances import MappedLandmarks
+from slam_observer_ros.known_map.merging import without_frame
+from slam_observer_ros.known_map.places import Anywhere, Constellation
+from slam_observer_ros.state.landmark_table import MIN_LOOP
+from slam_observer_ros.state.state import State
+
+PERIOD_NS = 2_000_000_000
+"""Time between two searches, nanoseconds."""
+
+MAX_SOUGHT = 12
+"""New landmarks that are looked for among old ones, those seen last."""
+
+MAX_OLD = 400
+"""Old landmarks among which they are looked for, those that are nearest."""
+
+REACH = 4.0
+"""Standard deviations of the pose within which a loop may close."""
+
+MOST = 4.0
+"""Normalised square, per axis, of how far landmarks may be apart that are one."""
+
+LEAST_M = 0.01
+"""Standard deviation of how far apart they may be though exactly known, metres: no two views of a
+thing have quite the same centre.
+"""
+
+NEIGHBOURS = 3
+"""Landmarks next to one to which distances say how well it is known where it lies there."""
+
+
+class LoopClosure:
+    """Merges landmarks of one map that are one."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._searched: tuple[bytes, int] | None = None
+        self._apart: set[tuple[int, int]] = set()  # ids that were seen at once, side by side
+        self._near_m = math.inf  # how far side by side is
+
+    def note(self, state: State, stamp_ns: int) -> None:
+        """Note which landmarks an observation, already used, has shown to be two."""
+        landmarks = state.landmarks
+        rows = np.flatnonzero(landmarks.last_seen_ns == stamp_ns)
+        if len(rows) < 2:
+            return
+        points, ids = state.filter.points[rows], landmarks.ids[rows].tolist()
+        lengths_m = np.linalg.norm(points[:, None] - points, axis=2)
+        for i, j in zip(*np.nonzero(np.triu(lengths_m < self._near_m, 1)), strict=True):
+            self._apart.add((min(ids[i], ids[j]), max(ids[i], ids[j])))
+
+    def is_due(self, state: State, stamp_ns: int) -> bool:
+        """Return whether it is time to look for landmarks that are one."""
+        if not state.is_mapping or not state.filter.has_joint_covariance:
+            return False
+        if self._last_ns is not None and 0 <= stamp_ns - self._last_ns < PERIOD_NS:
+            return False
+        self._last_ns = stamp_ns
+        return True
+
+    def close(self, state: State, stamp_ns: int) -> bool:
+        """Merge new landmarks with old ones if they lie alike; return whether they do."""
+        landmarks, own = state.landmarks, _own(state)
+        new = own[landmarks.are_new(own, stamp_ns)]
+        old = own[landmarks.are_old(own, stamp_ns)]
+        if len(new) < MIN_LOOP or len(old) < MIN_LOOP:
+            return False
+        seen_ns = landmarks.last_seen_ns
+        new = np.sort(new[np.argsort(-seen_ns[new], kind='stable')][:MAX_SOUGHT])
+        old = _within_reach(state, new, old)
+        searched = (landmarks.ids[new].tobytes(), len(old))
+        if len(old) < MIN_LOOP or searched == self._searched:
+            return False
+        self._searched = searched
+        pairs = _pairs(state, new, old)
+        return pairs is not None and state.merge(*pairs, MOST) <= MOST
+
+    def merge_twins(self, state: State) -> int:
+        """Merge landmarks that are as near each other as one would be; return how many."""
+        own, merged = _own(state), 0
+        while len(own) > 2 and (pair := self._twins(state, own)) is not None:
+            if state.merge(*pair, MOST) > MOST:
+                break
+            own = own[own != pair[1]]
+            own -= own > pair[1]
+            merged += 1
+        return merged
+
+    def _twins(self, state: State, own: IntArray) -> tuple[IntArray, IntArray] | None:
+        """Return the row of a landmark and that of one which it certainly is, (1,) each."""
+        from scipy.spatial import cKDTree  # which only points without ids need
+
+        landmarks, k = state.landmarks, state.axes.point
+        points = state.filter.points[own, :k]
+        tree = cKDTree(points)
+        # How many there are about each, but for a twin.
+        some = min(NEIGHBOURS + 2, len(own))
+        radii_m = tree.query(points, k=some)[0][:, -1]
+        unit = math.pi if k == 2 else 4.0 / 3.0 * math.pi
+        densities = (some - 1) / (unit * np.maximum(radii_m, LEAST_M) ** k)
+        self._near_m = float(np.median(radii_m))
+        at = tree.query_pairs(self._near_m, output_type='ndarray')
+        first = np.minimum(own[at[:, 0]], own[at[:, 1]])
+        second = np.maximum(own[at[:, 0]], own[at[:, 1]])
+        ids = np.sort(np.column_stack([landmarks.ids[first], landmarks.ids[second]]), axis=1)
+        may_be = np.array([tuple(pair) not in self._apart for pair in ids.tolist()], dtype=bool)
+        may_be &= landmarks.last_seen_ns[first] != landmarks.last_seen_ns[second]
+        if not may_be.any():
+            return None
+        at, first, second = at[may_be], first[may_be], second[may_be]
+        # How much likelier it is that they are one, there and not seen side by side.
+        r, S = _differences(state, first, second)
+        squares = mahalanobis(r, S) ** 2
+        log_density = np.log(np.maximum(densities[at[:, 0]], densities[at[:, 1]]))
+        odds = -0.5 * (squares + np.linalg.slogdet(2.0 * math.pi * S)[1]) - log_density
+        was_gone = landmarks.last_seen_ns[first] < landmarks.born_ns[second]
+        missed = np.where(was_gone, landmarks.missed[first] * landmarks.seen_share, 0.0)
+        odds += np.log1p(missed)
+        best = int(np.argmax(np.where(squares <= MOST * k, odds, -np.inf)))
+        is_sure = odds[best] > -math.log(state.settings.localization_error_probability)
+        return (first[[best]], second[[best]]) if is_sure and squares[best] <= MOST * k else None
+
+
+def _own(state: State) -> IntArray:
+    """Return the rows of the landmarks in the map that have no id."""
+    rows = state.confirmed
+    return rows[is_automatic(state.landmarks.ids[rows])]
+
+
+def _within_reach(state: State, new: IntArray, old: IntArray) -> IntArray:
+    """Return the old landmarks (n,) that new ones (m,) may be."""
+    points = state.filter.points
+    centre = points[new].mean(axis=0)
+    radius_m = np.linalg.norm(points[new] - centre, axis=1).max()
+    off_m = np.linalg.norm(points[old] - centre, axis=1)
+    nearest = np.argsort(off_m, kind='stable')[:MAX_OLD]
+    old, off_m = old[nearest], off_m[nearest]
+    # Those that may lie among them, by how well it is known where these are to each other.
+    S = _differences(state, np.full(len(old), new[0]), old)[1]
+    spread_m = np.sqrt(np.trace(S, axis1=1, axis2=2))
+    return np.sort(old[off_m <= 2.0 * radius_m + REACH * spread_m])
+
+
+def _pairs(state: State, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray] | None:
+    """Return which old landmarks (q,) are certainly which new ones (q,), if that is so."""
+    P = state.filter.joint_covariance(np.append(new, old))
+    if P is None:
+        return None
+    axes, points, p = state.axes, state.filter.points, state.axes.p
+    m, k = len(new), axes.point
+    blocks = P[p:, p:].reshape(m + len(old), k, -1, k).swapaxes(1, 2)
+    known = MappedLandmarks(points[old], _local_covariances(points[old], blocks[m:, m:]), axes)
+    # How the new ones lie to each other: where they are is not known.
+    G = axes.output_matrix(points[new] - points[new].mean(axis=0)).reshape(-1, axes.p)
+    of_new = P[p : p + m * k, p : p + m * k] + LEAST_M**2 * np.eye(m * k)
+    root = without_frame(cholesky(of_new, lower=True), G)
+    shape = root @ root.T + LEAST_M**2 * np.eye(m * k)
+    seen = Constellation(points[new], shape, np.full(m, -1))
+    error_probability = state.settings.localization_error_probability
+    places = find_places(known, seen, Anywhere(known), error_probability)
+    place = places.decided(error_probability)
+    if place is None or place.matches < MIN_LOOP:
+        return None
+    matched = place.rows >= 0
+    return old[place.rows[matched]], new[matched]
+
+
+def _local_covariances(points: FloatArray, blocks: FloatArray) -> FloatArray:
+    """Return how well it is known (n, 3, 3) where landmarks lie to those next to them.
+
+    ``blocks`` (n, n, k, k) is their joint covariance.
+    """
+    n, k = blocks.shape[0], blocks.shape[2]
+    lines = points[:, None, :k] - points[None, :, :k]
+    lengths_m = np.linalg.norm(lines, axis=2)
+    np.fill_diagonal(lengths_m, np.inf)
+    near = np.argsort(lengths_m, axis=1)[:, :NEIGHBOURS]
+    a, b = np.repeat(np.arange(n), near.shape[1]), near.ravel()
+    u = lines[a, b] / np.maximum(lengths_m[a, b], LEAST_M)[:, None]
+    joint = blocks[a, a] + blocks[b, b] - blocks[a, b] - blocks[b, a]
+    variances = 0.5 * np.einsum('ai,aij,aj->a', u, joint, u).reshape(n, -1).mean(axis=1)
+    return np.asarray(np.maximum(variances, LEAST_M**2)[:, None, None] * np.eye(3))
+
+
+def _differences(state: State, rows: IntArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far landmarks (q,) are from others (q,): (q, k), and its covariances."""
+    k, p, q = state.axes.point, state.axes.p, len(rows)
+    both, at = np.unique(np.append(rows, others), return_inverse=True)
+    P = state.filter.joint_covariance(both)
+    if P is None:
+        raise TypeError('a filter without a joint covariance has no twins')
+    blocks = P[p:, p:].reshape(len(both), k, len(both), k).swapaxes(1, 2)
+    a, b = at[:q], at[q:]
+    S = blocks[a, a] + blocks[b, b] - blocks[a, b] - blocks[b, a] + LEAST_M**2 * np.eye(k)
+    return (state.filter.points[rows] - state.filter.points[others])[:, :k], S

@@ -1,0 +1,72 @@
+"""``doctor RECORDING``: which shipped parameter file fits, and a graph's own parameters."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from slam_observer_ros.cli.main import main
+from slam_observer_ros.events import ObservationEvent, VelocityEvent
+from slam_observer_ros.recording.writer import RecordingWriter
+
+STEP_NS = 50_000_000
+SEEN = np.array([[2.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+
+
+def recording(path, velocities):
+    with RecordingWriter(path) as writer:
+        for number, velocity in enumerate(velocities, 1):
+            writer.write_event(VelocityEvent(number * STEP_NS, velocity))
+        stamp_ns = (len(velocities) + 1) * STEP_NS
+        writer.write_event(ObservationEvent(stamp_ns, np.array([1, 2]), SEEN))
+    return path
+
+
+@pytest.mark.parametrize(
+    ('axes', 'repeated', 'expected'),
+    [
+        ([2, 3], 1, 'wheeled_robot'),
+        ([2, 3], 5, 'wheeled_bearing_range'),
+        (list(range(6)), 1, 'stereo_inertial'),
+    ],
+)
+def test_how_a_robot_moves_says_which_file_fits(tmp_path, capsys, axes, repeated, expected):
+    drawn = np.random.default_rng(0).uniform(0.1, 1.0, (20, len(axes)))
+    velocities = np.zeros((20 * repeated, 6))
+    velocities[:, axes] = np.repeat(drawn, repeated, axis=0)
+    path = recording(tmp_path / 'run.mcap', velocities)
+    assert main(['doctor', str(path), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['config'] == expected
+    assert found['why']
+    assert main(['doctor', str(path)]) == 0
+    assert expected in capsys.readouterr().out
+
+
+def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path, capsys):
+    assert main(['doctor', str(tmp_path / 'none.mcap')]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_graph_comes_with_parameters_that_replay_takes(tmp_path, capsys):
+    graph, out = tmp_path / 'graph.txt', tmp_path / 'out.mcap'
+    graph.write_text(
+        'ODOMETRY 0 1 1 0 0 10 0 0 10 0 10\n'
+        'ODOMETRY 1 2 1 0 0 10 0 0 10 0 10\n'
+        'LANDMARK 0 7 3 1 10 0 10\n'
+        'LANDMARK 1 7 2 1 10 0 10\n',
+        encoding='utf-8',
+    )
+    assert main(['convert', 'graph', str(graph), str(out)]) == 0
+    parameters = tmp_path / 'out.yaml'
+    assert 'velocity_delay_stddev: 0.0' in parameters.read_text(encoding='utf-8')
+    assert main(['replay', str(out), '--config', str(parameters), '--json']) == 0
+    replayed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert set(replayed['calibration']) == {'angular_bias_z'}
+    parameters.write_text('mine', encoding='utf-8')
+    out.unlink()
+    assert main(['convert', 'graph', str(graph), str(out)]) == 2
+    assert parameters.read_text(encoding='utf-8') == 'mine'
+    assert not out.exists()
