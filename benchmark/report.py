@@ -125,7 +125,7 @@ estimate that has both may be nearer to the truth than the table says.
 
 Configuration error: after each observation, the RMS over all landmarks seen three times or more so
 far of |P̂⁻¹p̂ᵢ − P⁻¹pᵢ|; over a run, the RMS of that. It needs no alignment. A landmark without id
-is compared with the true one that it was nearest to for most of the time so far. ATE and heading
+is compared with the true one that it was nearest to most often when seen. ATE and heading
 are those of the poses right after the observations, after one rigid alignment of their positions.
 CPU time is that of the estimator's own calls, the least of three runs (of one, where ids are left
 out), in which the estimators take turns, so that the load of the machine affects all alike;

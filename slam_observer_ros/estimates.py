@@ -1,4 +1,4 @@
-"""What the estimator gives out: updates, calibration, smoothed run, names of its counts."""
+"""What the estimator gives out: updates, calibration, noise, smoothed run, names of its counts."""
 
 from __future__ import annotations
 
@@ -34,6 +34,10 @@ DELAY_NAME = 'velocity_delay'
 
 IMPLAUSIBLE = 4.0
 """Stated standard deviations by which no calibration is off: something else is wrong."""
+
+
+NOTABLY_NOISIER = 1.5
+"""Factor of the noise of the odometry from which it is named as a problem."""
 
 
 def used_points(counts: Counter[str]) -> int:
@@ -191,6 +195,39 @@ def calibration_problems(calibration: Iterable[CalibrationEstimate]) -> list[str
                 '(Tune the noise).'
             ]
     return [part.problem for part in parts if part.problem]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionFactor:
+    """How noisy the odometry is over what is stated: in ``'turning'`` or in ``'driving'``.
+
+    Factors are of standard deviations: ``factor`` was found, and ``applied`` is in force.
+    ``deviation`` is that of the logarithm of ``factor``, and ``proposed`` are the settings that
+    state what was found.
+    """
+
+    name: str
+    factor: float
+    deviation: float
+    applied: float
+    proposed: str
+
+    @property
+    def problem(self) -> str:
+        """What to state if the odometry is clearly noisier than stated; else ''."""
+        is_clear = math.log(self.factor) > IMPLAUSIBLE * self.deviation
+        if self.factor < NOTABLY_NOISIER or not is_clear:
+            return ''
+        remedy = f'set {self.proposed}' if self.proposed else 'state more'
+        return (
+            f'the odometry is {self.factor:.1f} × noisier in {self.name} than stated: {remedy}, '
+            'or let its messages state larger covariances'
+        )
+
+    def __str__(self) -> str:
+        """Write what was found, and what is made of it."""
+        found = f'{self.factor:.2f} × as stated (± {100.0 * self.deviation:.0f} %)'
+        return f'{found}, taken as {self.applied:.2f} ×'
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,6 +48,11 @@ from slam_observer_ros.state.matching import corrected, match, MatchedObservatio
 from slam_observer_ros.state.state import State
 from slam_observer_ros.state.step import disbelieve, Outcome, step
 
+MOST_WITHOUT_IDS = 2
+"""Hypotheses that are followed at most where points have no ids: each costs as much as the first,
+and a third one is hardly ever the right one.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class _Child:
@@ -247,6 +252,9 @@ class Hypotheses:
         self, event: ObservationEvent, possible: list[tuple[int, Interpretation]]
     ) -> list[_Child]:
         """Let hypotheses use an observation as interpreted; return them, the cheapest first."""
+        limit = self._limit
+        if np.count_nonzero(event.ids == UNKNOWN_ID):
+            limit = min(limit, MOST_WITHOUT_IDS)
         # A state is copied for each use of it but the last.
         uses = Counter(number for number, taken in possible if taken.slipped is None)
         children: list[_Child] = []
@@ -262,7 +270,7 @@ class Hypotheses:
             child = self._child(hypothesis, taken, event)
             if not any(_are_one(child, other) for other in children):
                 children.append(child)
-            if len(children) == self._limit:
+            if len(children) == limit:
                 break
         return sorted(children, key=lambda child: child.hypothesis.cost)
 

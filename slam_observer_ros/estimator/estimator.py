@@ -14,7 +14,7 @@ from slam_observer_ros.association.hypotheses import Hypotheses
 from slam_observer_ros.common.errors import InvalidEventError, ParameterError
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.common.units import to_ns, to_s
-from slam_observer_ros.estimates import CalibrationEstimate, Smoothed, Update
+from slam_observer_ros.estimates import CalibrationEstimate, MotionFactor, Smoothed, Update
 from slam_observer_ros.estimator.checks import (
     check_event,
     check_velocities,
@@ -458,6 +458,11 @@ class Estimator:
         return self._hypotheses.calibration
 
     @property
+    def motion_factors(self) -> list[MotionFactor]:
+        """How noisy turning and driving are over what is stated; empty where that is not known."""
+        return self._state.motion_noise.factors.estimates
+
+    @property
     def lyapunov(self) -> float:
         """L (34) of the latest observation's residuals; zero before the first."""
         return 0.0 if self.last_update is None else self.last_update.lyapunov
@@ -550,8 +555,11 @@ class Estimator:
         closure.note(state, stamp_ns)
         if not closure.is_due(state, stamp_ns):
             return
+        merged = state.counts['merged_landmark']
         if closure.close(state, stamp_ns):
             self._hypotheses.prune_to_best()
+            merged = state.counts['merged_landmark'] - merged
+            logger.info('A loop has closed: %d landmarks without ids were seen before.', merged)
         if len(self._hypotheses) == 1:
             closure.merge_twins(state)
 

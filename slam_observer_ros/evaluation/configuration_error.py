@@ -53,8 +53,8 @@ class ConfigurationError:
         ----------
         ids : IntArray
             (n,) landmarks known so far; those without truth are passed over. One whose sensor
-            gave no id stands for the true landmark that it was nearest to most often since it was
-            first seen, as seen by the robot; until then it is passed over, too.
+            gave no id stands for the true landmark that it was nearest to most often when it was
+            seen; until then it is passed over, too. At other times drift puts it next to others.
         covariance_of : callable, optional
             Gives the joint covariance (m k, m k) of rows (m,) of the landmarks as seen by the
             robot, of their first k coordinates, m²; None if it is not known.
@@ -69,8 +69,7 @@ class ConfigurationError:
 
         # Which true landmark each is
         new_ids = ids if seen_ids is None else seen_ids
-        were_seen = np.isin(ids, [*self._votes, *new_ids.tolist()])
-        without_id = is_automatic(ids) & were_seen
+        without_id = is_automatic(ids) & np.isin(ids, new_ids)
         self._vote(ids[without_id], seen[without_id], truth.ids, true_seen)
         true_ids = np.array([self._true_id(i) for i in ids.tolist()], dtype=np.int64)
         rows, true_rows = np.nonzero(true_ids[:, None] == truth.ids)

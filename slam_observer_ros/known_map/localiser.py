@@ -167,7 +167,7 @@ class Localiser:
 
     def _find(self, state: State) -> None:
         """Find the pose by landmarks without ids."""
-        if self.loaded is None or state.filter.joint is None:
+        if self.loaded is None or not len(self.loaded.ids) or state.filter.joint is None:
             return
         if self._finder is None:
             self._finder = Finder(self.loaded, state, self._rough)

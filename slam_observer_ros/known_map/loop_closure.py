@@ -23,7 +23,7 @@ from slam_observer_ros.known_map.places import Anywhere, Constellation
 from slam_observer_ros.state.landmark_table import MIN_LOOP
 from slam_observer_ros.state.state import State
 
-PERIOD_NS = 2_000_000_000
+PERIOD_NS = 5_000_000_000
 """Time between two searches, nanoseconds."""
 
 MAX_SOUGHT = 12

@@ -20,7 +20,7 @@ import numpy as np
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.geometry import se3, so3
 from slam_observer_ros.geometry.axes import EstimatedAxes, SPATIAL
-from slam_observer_ros.observer.filter import Filter, OF_SENSORS
+from slam_observer_ros.observer.filter import Filter, OF_JOINT_COVARIANCES
 from slam_observer_ros.observer.innovation import lyapunov
 from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.sensor_models.calibration import Calibration, without_calibration
@@ -45,7 +45,7 @@ class ConstantFilter(Filter):
         'angular_bias_stddev',
         'linear_bias_stddev',
         'velocity_delay_stddev',
-        *OF_SENSORS,
+        *OF_JOINT_COVARIANCES,
         'calibration_drift',
         'landmark_velocity_stddev',
         'observation_correlation_time',

@@ -24,13 +24,19 @@ from slam_observer_ros.observer.residuals import Residuals
 from slam_observer_ros.observer.riccati.joint_covariance import JointCovariance
 from slam_observer_ros.sensor_models.calibration import Calibration, without_sensor_calibration
 from slam_observer_ros.sensor_models.motion import Motion, Passage
+from slam_observer_ros.sensor_models.motion_noise import MotionNoise
 from slam_observer_ros.settings.estimator_settings import Settings
 
 OF_CONSTANT_GAINS = ('gain_l', 'step_mode', 'max_innovation_time')
 """Settings without effect on other filters; ``gain_k`` is in the Lyapunov value of all."""
 
 
-OF_SENSORS = ('sensor_rotation_stddev', 'sensor_translation_stddev', 'range_scale_stddev')
+OF_JOINT_COVARIANCES = (
+    'motion_noise_factor',
+    'sensor_rotation_stddev',
+    'sensor_translation_stddev',
+    'range_scale_stddev',
+)
 """Settings of what only a joint covariance can estimate."""
 
 
@@ -51,6 +57,7 @@ class Filter:
         self.observer = Observer(reference_pose)  # X̂ and its reference ξ°
         estimated = settings if self.has_joint_covariance else without_sensor_calibration(settings)
         self.calibration = Calibration(estimated, self.axes)  # of velocities and sensors
+        self.motion_noise = MotionNoise(settings)
 
     # The step (27)-(31)
 
@@ -83,6 +90,9 @@ class Filter:
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by the innovation (28)–(31); return the weights (m,), 0 for rejected."""
         raise NotImplementedError
+
+    def learn_motion_noise(self, residuals: Residuals) -> None:
+        """Let residuals show how noisy the motion was, if something else than them corrects it."""
 
     def correct_by_orientations(self, seen: SeenOrientations) -> tuple[FloatArray, BoolArray]:
         """Move the state by how tags are turned; return the weights (m,), and which are unclear.

@@ -9,7 +9,8 @@ import numpy as np
 
 from slam_observer_ros.common.errors import EvaluationError
 from slam_observer_ros.common.types import FloatArray, IntArray
-from slam_observer_ros.estimates import Smoothed
+from slam_observer_ros.common.units import to_ns, to_s
+from slam_observer_ros.estimates import CalibrationEstimate, Smoothed
 from slam_observer_ros.evaluation.configuration_error import ConfigurationError
 from slam_observer_ros.evaluation.consistency import anchored_average_nees
 from slam_observer_ros.evaluation.gaps import filled
@@ -20,9 +21,14 @@ from slam_observer_ros.evaluation.metrics import (
 )
 from slam_observer_ros.evaluation.trajectory import Trajectory
 from slam_observer_ros.events import is_automatic
+from slam_observer_ros.geometry import se3
 from slam_observer_ros.recording.recorded_truth import Truth
+from slam_observer_ros.sensor_models.calibration import DELAY, NAMES, NOMINAL
 
 logger = logging.getLogger(__name__)
+
+STILL = 1e-12
+"""Change of a pose, m and rad, below which it is that of rounding: a robot at rest has no bias."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,15 +98,33 @@ def measure_smoothed(
 
 
 def smoothed_trajectory(
-    smoothed: Smoothed, stamps_ns: IntArray, dead_reckoning: Trajectory
+    smoothed: Smoothed,
+    stamps_ns: IntArray,
+    dead_reckoning: Trajectory,
+    calibration: list[CalibrationEstimate],
 ) -> Trajectory:
     """Return the smoothed poses at any stamps (m,), such as those of the online trajectory.
 
     Between observations, and beyond the first and last one, the robot moved as the velocities
-    have it.
+    have it by their ``calibration``.
     """
     estimate = Trajectory.from_samples(smoothed.stamps_ns.tolist(), list(smoothed.poses))
-    return filled(estimate, dead_reckoning, stamps_ns)
+    return filled(estimate, _calibrated(dead_reckoning, calibration), stamps_ns)
+
+
+def _calibrated(motion: Trajectory, calibration: list[CalibrationEstimate]) -> Trajectory:
+    """Return dead reckoning as it is with the scales, biases and the delay of the velocities."""
+    if len(motion) < 2:
+        return motion
+    found = {estimate.name: estimate.value for estimate in calibration}
+    values = np.array([found.get(name, value) for name, value in zip(NAMES, NOMINAL, strict=True)])
+    dt_s = to_s(np.diff(motion.stamps_ns))[:, None]
+    twists = se3.log(se3.inverse(motion.poses[:-1]) @ motion.poses[1:])
+    moves = np.abs(twists).max(axis=1, keepdims=True) > STILL
+    poses = se3.path(
+        motion.poses[0], values[:6] * twists + values[6:DELAY] * np.where(moves, dt_s, 0.0)
+    )
+    return Trajectory(motion.stamps_ns + to_ns(values[DELAY]), poses)
 
 
 def _pose_errors(name: str, estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors | None:

@@ -7,7 +7,12 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from slam_observer_ros.common.types import IntArray
-from slam_observer_ros.estimates import calibration_problems, CalibrationEstimate, Update
+from slam_observer_ros.estimates import (
+    calibration_problems,
+    CalibrationEstimate,
+    MotionFactor,
+    Update,
+)
 from slam_observer_ros.messages.outgoing import OutgoingMessages
 
 OK, WARN = 0, 1
@@ -28,6 +33,8 @@ class Diagnosed(Protocol):
     @property
     def calibration(self) -> Sequence[CalibrationEstimate]: ...  # noqa: D102
     @property
+    def motion_factors(self) -> Sequence[MotionFactor]: ...  # noqa: D102
+    @property
     def lyapunov(self) -> float: ...  # noqa: D102
     @property
     def stamp_ns(self) -> int | None: ...  # noqa: D102
@@ -36,13 +43,14 @@ class Diagnosed(Protocol):
 
 
 def estimator_values(estimator: Diagnosed, dropped: Counter[str]) -> dict[str, str]:
-    """Return what was used, what was dropped and why, the map's size and the calibration."""
+    """Return what was used, what was dropped and why, the map's size, calibration and noise."""
     update = estimator.last_update
     values = {f'used: {kind}': str(count) for kind, count in sorted(estimator.counts.items())}
     values |= {f'dropped: {reason}': str(count) for reason, count in sorted(dropped.items())}
     values['landmarks known'] = str(len(estimator.landmark_ids))
     values['known landmarks seen last'] = str(0 if update is None else len(update.ids))
     values |= {f'calibration: {part.name}': str(part) for part in estimator.calibration}
+    values |= {f'noise of {part.name}': str(part) for part in estimator.motion_factors}
     advice = {part.name: part.advice for part in estimator.calibration if part.advice}
     values |= {f'mounting: {name}': text for name, text in advice.items()}
     values['Lyapunov value'] = f'{estimator.lyapunov:.3e}'
@@ -50,10 +58,11 @@ def estimator_values(estimator: Diagnosed, dropped: Counter[str]) -> dict[str, s
 
 
 def estimator_warnings(estimator: Diagnosed) -> list[str]:
-    """Return what is wrong with the velocity, by the estimate alone."""
+    """Return what is wrong with the velocity or its noise, by the estimate alone."""
     stale = estimator.stamp_ns is not None and estimator.velocity_is_stale
     warnings = ['no velocity in force: the pose is held'] if stale else []
-    return warnings + calibration_problems(estimator.calibration)
+    warnings += calibration_problems(estimator.calibration)
+    return warnings + [part.problem for part in estimator.motion_factors if part.problem]
 
 
 def diagnostics(

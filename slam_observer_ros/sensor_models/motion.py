@@ -35,6 +35,19 @@ class Motion:
         """(p, p) Σ Ad_Â Q Ad_Âᵀ, what the motion adds to the covariance of ε."""
         return se3.summed_noise(self._adjoints, self.covariances)
 
+    @property
+    def noise_by_kind(self) -> FloatArray | None:
+        """(2, p, p) what turning and driving add to it; None if it stands or was not all measured.
+
+        By how fast it grows with the factor of either: what errors of both share is half theirs.
+        """
+        stands = not np.count_nonzero(self.measured_velocities)
+        if self.is_slip or stands or np.count_nonzero(self.dt_s) < len(self.dt_s):
+            return None
+        half = 0.5 * se3.summed_noise(self._adjoints, _of_angular_part(self.covariances))
+        of_turning = half + half.T
+        return np.array([of_turning, self.noise - of_turning])
+
     @cached_property
     def sensitivity(self) -> FloatArray:
         """(p, c) F, how ε grows with the errors of the calibration."""
@@ -67,6 +80,13 @@ class Motion:
     def _adjoints(self) -> FloatArray:
         """(k + 1, p, 6) the estimated rows of Ad_Â along the path."""
         return se3.adjoint(self.path)[:, self.calibration.axes.pose]
+
+
+def _of_angular_part(covariances: FloatArray) -> FloatArray:
+    """Return covariances (k, 6, 6) with the columns of the linear part zero."""
+    part: FloatArray = covariances.copy()
+    part[:, :, 3:] = 0.0
+    return part
 
 
 @dataclass(frozen=True)

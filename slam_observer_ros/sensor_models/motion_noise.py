@@ -1,13 +1,39 @@
-"""Noise of velocities, from the settings or from the messages."""
+"""Noise of velocities, from the settings or from the messages, and how far it is stated wrong.
+
+Turning and driving have a factor ρ_j of the variance each, found by maximum likelihood of the
+residuals r before the gate, S = H P Hᵀ + R their covariance. The motion since the observation
+before has added M_j = C N_j Cᵀ to it, N_j (p, p) to the covariance of ε, C_i = [−[ŷ_i]×, I]. With
+θ_j = ln ρ_j the score and the Fisher information of an observation are
+
+    g_j = ½ (w rᵀ S⁻¹ M_j S⁻¹ r − tr S⁻¹ M_j),      F_jk = ½ tr(S⁻¹ M_j S⁻¹ M_k),
+
+and θ ← θ + (F̄ + I)⁻¹ (g − θ/n): F̄ is the sum of F with a memory of n observations, and I the
+information of a prior, θ_j ~ N(0, 1). M_j has the rank of N_j, so u = Cᵀ S⁻¹ r and G = Cᵀ S⁻¹ C
+are enough: rᵀ S⁻¹ M_j S⁻¹ r = uᵀ N_j u, tr S⁻¹ M_j = tr N_j G, 2 F_jk = tr N_j G N_k G.
+
+A slip, a robot that was carried, and outliers are no noise of the odometry: points beyond the gate
+are left out where most are within it, and the weight w lets no observation be further off than
+one in a hundred is. Nothing is learnt where the odometry says that the robot stands, nor across
+gaps and slips, whose noise is stated apart. The points' noise has no factor: where errors last,
+innovations are small while errors are large.
+"""
 
 from __future__ import annotations
 
 from functools import lru_cache
+import math
 
 import numpy as np
 
-from slam_observer_ros.common.types import FloatArray, Immutable
-from slam_observer_ros.geometry.matrices import limited
+from slam_observer_ros.common.digits import significant
+from slam_observer_ros.common.types import FloatArray
+from slam_observer_ros.estimates import MotionFactor
+from slam_observer_ros.geometry.matrices import (
+    diagonal_blocks,
+    limited,
+    mahalanobis,
+    solve_definite,
+)
 from slam_observer_ros.sensor_models.held_velocities import HeldVelocities
 from slam_observer_ros.settings.estimator_settings import Settings, Vector3
 
@@ -26,14 +52,36 @@ More would only drown all else that is known in rounding.
 SPEED_WINDOW_S = 1.0
 """Time over which a velocity is averaged, as its error may be in proportion to it."""
 
-_IDENTITY_6 = np.eye(6)
+MEMORY = 300
+"""Observations over which the factors are found: they follow a change of the ground."""
+
+MAX_STEP = 0.5
+"""Change of ln ρ by one observation, at most."""
+
+LEAST_LOGARITHM, LARGEST_LOGARITHM = math.log(1e-2), math.log(1e3)
+"""Of ρ: a tenth to thirty times the standard deviation that is stated."""
+
+RARE = 2.33
+"""Standard deviations beyond which one in a hundred is."""
+
+LEAST = {'stated': math.inf, 'at_least_stated': 0.0, 'auto': -math.inf}
+"""Least ln ρ that is applied, by ``motion_noise_factor``; 'stated' applies none."""
+
+KINDS = {'turning': 'angular', 'driving': 'linear'}
+"""The motions that have a factor, and how the names of their noise begin."""
+
+_IDENTITY_6, _PRIOR = np.eye(6), np.eye(2)
 
 
-class MotionNoise(Immutable):
-    """How far motions may be off: noise densities of the settings, or covariances of messages."""
+class MotionNoise:
+    """How far motions may be off: noise densities of the settings, or covariances of messages.
+
+    Either of them times the ``factors`` that were found for turning and driving.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = s = settings
+        self.factors = MotionFactors(settings)
         self._unknown_squared = (
             np.repeat([s.unknown_angular_motion, s.unknown_linear_motion], 3) ** 2
         )
@@ -49,6 +97,8 @@ class MotionNoise(Immutable):
         variances = _squares(s.angular_velocity_noise, s.linear_velocity_noise) * _white_s(held)
         if self._has_scale:
             variances += (self._scale * held.averaged(SPEED_WINDOW_S)) ** 2 * dt_s
+        factors = self.factors.applied.repeat(3)
+        variances = variances * factors
         if some_are_stated:
             variances[np.repeat(held.is_stated, 3, axis=1)] = 0.0
         # In a gap the robot may do anything that is allowed.
@@ -60,7 +110,7 @@ class MotionNoise(Immutable):
         # however many motions that was cut into. Of angular and linear part one may have none.
         if some_are_stated:
             squared = dt_s * (2.0 * held.before_s + dt_s)  # (before + dt)² − before²
-            grown_s = np.repeat(np.sqrt(squared), 3, axis=1)
+            grown_s = np.repeat(np.sqrt(squared), 3, axis=1) * np.sqrt(factors)
             stated = limited(held.covariances, MAX_SPEED_ERRORS)
             covariances += grown_s[:, :, None] * stated * grown_s[:, None, :]
         return covariances
@@ -99,3 +149,102 @@ def _white_s(held: HeldVelocities) -> FloatArray:
     grown_s = until_s * np.maximum(until_s / held.usual_s, 1.0)
     grown_s -= held.before_s * np.maximum(held.before_s / held.usual_s, 1.0)
     return np.repeat(grown_s, 3, axis=1)
+
+
+class MotionFactors:
+    """Factors ρ of the variances of turning and driving, and what they are found from."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._least = LEAST[settings.motion_noise_factor]
+        # (2,) those of the variances in force: of turning, and of driving
+        self.applied: FloatArray = np.ones(2)
+        self._logs = np.zeros(2)  # θ
+        self._information = np.zeros((2, 2))  # F̄
+        self._found = 0  # observations that they were found from
+        # (2, p, p) N_j of the motion since the last one, none at first; None if unknown.
+        self._shares: FloatArray | None = np.zeros(())
+
+    @property
+    def estimates(self) -> list[MotionFactor]:
+        """What was found out, as factors of standard deviations; nothing before the first."""
+        if not self._found:
+            return []
+        deviations = 0.5 * np.sqrt(np.diagonal(np.linalg.inv(self._information + _PRIOR)))
+        each = zip(KINDS, self._logs, deviations, np.sqrt(self.applied), strict=True)
+        return [
+            MotionFactor(
+                name, math.exp(0.5 * log), float(deviation), float(applied), self._proposed(name)
+            )
+            for name, log, deviation, applied in each
+        ]
+
+    def move(self, shares: FloatArray | None) -> None:
+        """Take in N_j (2, p, p) of a motion, as it was applied; None if that says nothing."""
+        self._shares = None if shares is None or self._shares is None else self._shares + shares
+
+    def learn(self, r: FloatArray, S: FloatArray, C: FloatArray) -> None:
+        """Take in residuals r (m, k), metres, with S (m k, m k) and C (m, k, p), as they are used.
+
+        They are of the motions since the last time.
+        """
+        shares = self._shares
+        self.forget_motion()
+        if shares is None or not shares.ndim:
+            return
+        # As the likelihood at θ has it, which may be less than is applied.
+        ratios = np.exp(self._logs) / self.applied
+        N = ratios[:, None, None] * shares
+        C = C.reshape(-1, C.shape[2])
+        if np.count_nonzero(ratios != 1.0):
+            S = S + C.dot((N - shares).sum(axis=0)).dot(C.T)
+        g, F = self._score(r, S, C, N)
+        self._information = (1.0 - 1.0 / MEMORY) * self._information + F
+        change = np.linalg.solve(self._information + _PRIOR, g - self._logs / MEMORY)
+        logs = self._logs + np.minimum(np.maximum(change, -MAX_STEP), MAX_STEP)
+        self._logs = np.minimum(np.maximum(logs, LEAST_LOGARITHM), LARGEST_LOGARITHM)
+        if self._least < math.inf:
+            self.applied = np.exp(np.maximum(self._logs, self._least))
+        self._found += 1
+
+    def forget_motion(self) -> None:
+        """Let the motion until now be of no concern for what is seen next."""
+        self._shares = np.zeros(())
+
+    def _score(
+        self, r: FloatArray, S: FloatArray, C: FloatArray, N: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return g (2,) and F (2, 2)."""
+        S_inv_r, S_inv_C = np.split(
+            solve_definite(S, np.column_stack([r.ravel(), C])), [1], axis=1
+        )
+        squared, gate = r.ravel().dot(S_inv_r)[0], self._settings.rejection_threshold
+        # No residual is further out than all of them together are.
+        if squared > gate**2:
+            k = r.shape[1]
+            passed = mahalanobis(r, diagonal_blocks(S, k)) <= gate
+            if len(r) < 2 * np.count_nonzero(passed) < 2 * len(r):
+                used = np.flatnonzero(np.repeat(passed, k))
+                return self._score(r[passed], S[np.ix_(used, used)], C[used], N)
+        u, G = C.T.dot(S_inv_r)[:, 0], C.T.dot(S_inv_C)
+        w, NG = min(1.0, _rare(r.size) / max(squared, 1.0)), N.dot(G)
+        g = 0.5 * (w * N.dot(u).dot(u) - N.reshape(2, -1).dot(G.ravel()))
+        F = 0.5 * NG.reshape(2, -1).dot(NG.swapaxes(1, 2).reshape(2, -1).T)
+        return g, F
+
+    def _proposed(self, name: str) -> str:
+        """Return the settings that state what was found."""
+        position, kind = list(KINDS).index(name), KINDS[name]
+        factor = math.exp(0.5 * self._logs[position])
+        names = [f'{kind}_velocity_noise', f'{kind}_scale_noise']
+        stated = {each: getattr(self._settings, each) for each in names}
+        return ', '.join(
+            f'{each}: [{", ".join(significant(factor * value, 2) for value in values)}]'
+            for each, values in stated.items()
+            if any(values)
+        )
+
+
+def _rare(q: int) -> float:
+    """Return what χ² of q degrees of freedom exceeds once in a hundred times (R. A. Fisher)."""
+    return 0.5 * (math.sqrt(2.0 * q - 1.0) + RARE) ** 2

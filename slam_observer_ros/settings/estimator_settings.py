@@ -149,6 +149,12 @@ class Settings(Immutable):
         minimum=0.0,
         maximum=10.0,
     )
+    motion_noise_factor: str = parameter(
+        'at_least_stated',
+        'Riccati gains: whether the noise of the velocity is as stated, as much more as what is '
+        'seen shows (at_least_stated), or also less (auto)',
+        choices=('stated', 'at_least_stated', 'auto'),
+    )
     unknown_angular_motion: float = parameter(
         0.5,
         'How much the robot may turn while no velocity is known, or its wheels slip: standard '
@@ -394,7 +400,8 @@ class Settings(Immutable):
     max_hypotheses: int = parameter(
         8,
         'Riccati gains, points without id, or with one that may be wrong, or a robot that may '
-        'have slipped: most hypotheses that are followed until it is clear which one is right',
+        'have slipped: most hypotheses that are followed until it is clear which one is right; '
+        'where points have no id, no more than two',
         minimum=1,
         maximum=1000,
     )

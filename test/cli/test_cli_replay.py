@@ -28,7 +28,7 @@ REPORT_KEYS = {
     'events', 'duration_s', 'seconds', 'landmarks', 'dropped', 'ate_rmse_m', 'rotation_rmse_rad',
     'heading_rmse_rad', 'landmark_rmse_m', 'configuration_rmse_m', 'anees',
     'dead_reckoning_ate_rmse_m', 'smoothed_ate_rmse_m', 'smoothed_landmark_rmse_m', 'calibration',
-    'unsmoothed_ate_rmse_m', 'smoothed_slips',
+    'unsmoothed_ate_rmse_m', 'smoothed_slips', 'motion_factors',
     'localised_after_s', 'unaligned_rmse_m', 'used', 'velocity_topic', 'landmarks_topic',
     'imu_topic', 'gains', 'truth_covered', 'configuration_anees',
 }  # fmt: skip
@@ -116,8 +116,9 @@ def test_a_replay_of_which_nothing_was_used_says_so_first(
     recording = write_events(tmp_path / 'blind.mcap', without(kind))
     ended = slam_observer('replay', recording)
     assert ended.code == 0
-    first_row = ended.output.splitlines()[2]
-    assert sentence in first_row
+    lines = ended.output.splitlines()
+    top = next(i for i, line in enumerate(lines) if line.startswith('┌'))
+    assert sentence in lines[top + 1]
     ended = slam_observer('replay', recording, '--strict')
     assert ended.code == 3
     assert sentence in ended.errors.splitlines()[-1]
@@ -283,14 +284,17 @@ class TestReport:
         assert '…' not in values
 
     def test_without_an_unknown_calibration_none_is_reported(self, slam_observer, simulated):
-        options = ('--set', 'angular_bias_stddev=[0, 0, 0]', '--json')
+        unknown = ('angular_bias_stddev=[0, 0, 0]', 'velocity_delay_stddev=0')
+        options = ('--set', unknown[0], '--set', unknown[1], '--json')
         assert slam_observer.succeed('replay', simulated, *options).json['calibration'] == {}
 
-    def test_a_bias_of_the_angular_velocity_is_reported_unasked(self, slam_observer, simulated):
+    def test_biases_and_the_delay_of_the_velocity_are_reported_unasked(
+        self, slam_observer, simulated
+    ):
         ended = slam_observer.succeed('replay', simulated, '--json')
-        biases = {f'angular_bias_{axis}' for axis in 'xyz'}
-        assert set(ended.json['calibration']) == biases
-        assert biases <= set(slam_observer.succeed('replay', simulated).output.split())
+        unknown = {*(f'angular_bias_{axis}' for axis in 'xyz'), 'velocity_delay'}
+        assert set(ended.json['calibration']) == unknown
+        assert unknown <= set(slam_observer.succeed('replay', simulated).output.split())
         constant = slam_observer.succeed('replay', simulated, '--gains', 'constant', '--json')
         assert constant.json['calibration'] == {}
         assert 'No effect' not in constant.errors
@@ -881,8 +885,8 @@ class TestRealData:
         report = self.check(slam_observer, path, 'stereo_inertial', expected_m)
         assert report['dead_reckoning_ate_rmse_m'] == pytest.approx(0.83, abs=0.01)
         assert report['landmarks'] == 20
-        # Over all poses: most of both is from 78 s without a landmark, where odometry alone leads.
-        assert report['smoothed_ate_rmse_m'] < 0.95 * report['ate_rmse_m']
+        # Over all poses, also those of 78 s without a landmark, where odometry alone leads.
+        assert report['smoothed_ate_rmse_m'] < 0.85 * report['ate_rmse_m']
 
     def test_mrclam(self, slam_observer, data_dir, tmp_path):
         path = tmp_path / 'robot4.mcap'
@@ -897,5 +901,5 @@ class TestRealData:
         }
         report = self.check(slam_observer, path, 'wheeled_bearing_range', expected_m)
         assert report['landmarks'] == 15
-        # Over all poses: most of both is from 78 s without a landmark, where odometry alone leads.
-        assert report['smoothed_ate_rmse_m'] < 0.95 * report['ate_rmse_m']
+        # Over all poses, also those of 78 s without a landmark, where odometry alone leads.
+        assert report['smoothed_ate_rmse_m'] < 0.85 * report['ate_rmse_m']

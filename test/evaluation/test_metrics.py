@@ -143,7 +143,7 @@ def test_configuration_error_is_the_rms_over_landmarks_and_then_over_time() -> N
     assert error.rmse_m == pytest.approx(np.sqrt((0.125 + 0.09) / 2))
 
 
-def test_a_landmark_without_id_stands_for_what_it_was_nearest_to_since_it_was_first_seen() -> None:
+def test_a_landmark_without_id_stands_for_what_it_was_nearest_to_when_it_was_seen() -> None:
     truth = LandmarkTruth(np.array([7, 3]), np.array([[1.0, 0.0, 0.0], [0.0, 4.0, 0.0]]))
     ids, points = FIRST_AUTOMATIC_ID + np.arange(2), np.array([[1.5, 0.0, 0.0], [9.0, 9.0, 0.0]])
     error = ConfigurationError()
@@ -152,8 +152,8 @@ def test_a_landmark_without_id_stands_for_what_it_was_nearest_to_since_it_was_fi
     points[0] = 0.0, 3.8, 0.0
     for stamp_ns in (3, 4, 5):
         error.add(stamp_ns, np.eye(4), ids, points, np.eye(4), truth, seen_ids=ids[2:])
-    far_m = np.hypot(1.0, 3.8)
-    assert error.values_m == pytest.approx([0.5, 0.5, far_m, far_m, 0.2])
+    far_m = np.hypot(1.0, 3.8)  # drift has put it next to another one
+    assert error.values_m == pytest.approx([0.5, 0.5, far_m, far_m, far_m])
 
 
 def random_covariance(rng: np.random.Generator, d: int) -> FloatArray:

@@ -160,3 +160,15 @@ def test_after_a_merger_all_that_was_seen_of_both_is_smoothed_as_of_one():
     smoothed, expected = estimator.smooth(), named.smooth()
     assert_allclose(smoothed.poses, expected.poses, atol=1e-3)
     assert_allclose(estimator.pose, named.pose, atol=0.02)
+
+
+def test_that_a_loop_has_closed_is_logged(caplog):
+    estimator = Estimator(PLANAR)
+    state, _ = after_a_loop(points_in_a_hall(0), np.arange(3, 10))
+    estimator._hypotheses.reset(state)
+    caplog.set_level('INFO', logger='slam_observer_ros')
+    estimator._close_loops(LOOP_NS + 10**9)
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line == 'A loop has closed: 7 landmarks without ids were seen before.'
+    estimator._close_loops(LOOP_NS + 2 * 10**9)
+    assert len(caplog.records) == 1

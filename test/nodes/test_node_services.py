@@ -286,8 +286,9 @@ class Publishing:
         self.dropped = Counter()
         self.estimator = SimpleNamespace(
             counts=Counter(), dropped=self.dropped, landmark_ids=[], last_update=None,
-            calibration=[], lyapunov=0.0, stamp_ns=None, velocity_is_stale=False,
-            is_localised=True, localisation_problem='what was seen fits 2 places',
+            calibration=[], motion_factors=[], lyapunov=0.0, stamp_ns=None,
+            velocity_is_stale=False, is_localised=True,
+            localisation_problem='what was seen fits 2 places',
         )  # fmt: skip
         vars(self.estimator).update(estimate)
         self.feed = SimpleNamespace(

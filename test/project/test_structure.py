@@ -40,7 +40,7 @@ def test_folders_show_the_architecture(structure):
 def test_a_step_with_ids_takes_no_more_calls_than_it_did(structure):
     step = structure.traced_step()
     assert len(step.modules) <= 36
-    assert step.changes <= 133
+    assert step.changes <= 140  # 7 of them find out how noisy the motion is
     assert step.depth <= 14
 
 

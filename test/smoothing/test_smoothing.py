@@ -127,7 +127,11 @@ def test_a_map_turns_with_the_pose_unless_it_is_known_better(axes, turns_togethe
 def test_a_keyframes_motion_is_the_same_in_one_piece_or_several(axes):
     """A stretch without observations reaches the history in pieces."""
     rng, d, k = np.random.default_rng(0), axes.p, 6
-    settings = Settings(linear_scale_stddev=(0.1, 0.1, 0.1), angular_bias_stddev=(0.0, 0.0, 0.1))
+    settings = Settings(
+        linear_scale_stddev=(0.1, 0.1, 0.1),
+        angular_bias_stddev=(0.0, 0.0, 0.1),
+        velocity_delay_stddev=0.0,
+    )
     V, dt_s = np.zeros((k, 6)), np.full(k, 0.2)
     V[:, axes.pose] = rng.normal(size=(k, d))
     path = [np.eye(4)]
@@ -471,6 +475,7 @@ def test_a_bias_that_drifts_is_followed_online_and_smoothed(two_d_mode):
     drifting = Settings(
         two_d_mode=two_d_mode,
         angular_bias_stddev=(0.0, 0.0, 0.05),
+        velocity_delay_stddev=0.0,
         calibration_drift=0.3,
         relinearization_interval=3,
         relinearization_angle=0.0,

@@ -155,7 +155,12 @@ def with_smoothed(outcome: ReplayOutcome) -> ReplayOutcome:
             len(smoothed.stamps_ns),
             smoothed.since,
         )
-    trajectory = smoothed_trajectory(smoothed, stamps_ns, outcome.result.dead_reckoning)
+    trajectory = smoothed_trajectory(
+        smoothed,
+        stamps_ns,
+        outcome.result.dead_reckoning,
+        outcome.result.estimator.calibration,
+    )
     return replace(
         outcome,
         smoothed=smoothed,

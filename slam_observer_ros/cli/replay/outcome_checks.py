@@ -207,7 +207,8 @@ def _warn_of_calibration(result: Replay) -> None:
     """Say what may be wrong if nobody can mean an estimate, and how sensors are really mounted."""
     calibration = result.estimator.calibration
     advice = [part.advice for part in calibration if part.advice]
-    for text in [*calibration_problems(calibration), *advice]:
+    noisier = [part.problem for part in result.estimator.motion_factors if part.problem]
+    for text in [*calibration_problems(calibration), *advice, *noisier]:
         logger.warning('%s', text)
 
 

@@ -40,6 +40,7 @@ def as_json(outcome: ReplayOutcome) -> dict[str, object]:
         'lost': outcome.lost,
         'used': dict(estimator.counts),
         'calibration': {part.name: asdict(part) for part in estimator.calibration},
+        'motion_factors': {part.name: asdict(part) for part in estimator.motion_factors},
         'localised_after_s': outcome.localised_after_s,
         'truth_covered': outcome.truth_covered,
         'ate_rmse_m': _ate_rmse_m(errors),
@@ -97,6 +98,7 @@ def summary_rows(outcome: ReplayOutcome) -> dict[str, str]:
     if outcome.localised_after_s is not None:
         rows['pose in the map'] = _localisation_text(outcome.result, outcome.localised_after_s)
     rows |= {part.name: str(part) for part in estimator.calibration}
+    rows |= {f'noise of {part.name}': str(part) for part in estimator.motion_factors}
     return rows | _accuracy_rows(outcome)
 
 

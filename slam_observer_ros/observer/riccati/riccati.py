@@ -73,12 +73,15 @@ class RiccatiFilter(Filter):
         observer, active = self.observer, self.joint.active
         points = observer.y_ref[active] + observer.a[active]
         self.joint.propagate(motion, points, observer.u[active])
+        self.motion_noise.factors.move(motion.noise_by_kind)
 
     def correct(self, residuals: Residuals) -> FloatArray:
         """Move the state by exp(−K r); return the weight that each point was given."""
         r, R = residuals.on(self.axes)
         # A gate, then Huber's weights; errors that last make R larger, too.
-        weights = observation_weights(r, self.predicted(residuals)[1], R, self._settings)
+        predicted = self.predicted(residuals)[1]
+        self._learn_motion_noise(residuals, r, with_blocks(predicted, R))
+        weights = observation_weights(r, predicted, R, self._settings)
         passed, used = weights > 0.0, residuals
         if np.count_nonzero(passed) < len(r):
             used, r, R = residuals.select(passed), r[passed], R[passed]
@@ -87,6 +90,17 @@ class RiccatiFilter(Filter):
         # For (30) and (31): K = P Hᵀ S⁻¹, S = H P Hᵀ + R, then X̂ ← exp(−K r) · X̂.
         self._move(self.joint.correct(self.joint.output_matrix(used), used.rows, R, r))
         return weights
+
+    def learn_motion_noise(self, residuals: Residuals) -> None:
+        """Let residuals show how noisy the motion was, if something else than them corrects it."""
+        if len(residuals.rows):
+            S = self.innovation_covariance(residuals)
+            self._learn_motion_noise(residuals, residuals.on(self.axes)[0], S)
+
+    def _learn_motion_noise(self, residuals: Residuals, r: FloatArray, S: FloatArray) -> None:
+        # C as the prediction has it: in the middle between where landmarks are expected and seen.
+        C = self.axes.output_matrix(residuals.e - 0.5 * residuals.r + residuals.a)
+        self.motion_noise.factors.learn(r, S, C)
 
     def distances(self, residuals: Residuals) -> FloatArray:
         """Return the Mahalanobis distance (m,) of each residual."""
@@ -118,6 +132,7 @@ class RiccatiFilter(Filter):
         """Append landmarks seen for the first time at ``points`` (m, 3), body frame."""
         self._compress_if_large(len(points))
         super().add(points, covariances)
+        self.motion_noise.factors.forget_motion()  # until now, which is none of theirs
         self.joint.add_seen(self.observer.turned(covariances), D)
 
     def add_known(self, known: KnownLandmarks) -> None:
@@ -157,6 +172,7 @@ class RiccatiFilter(Filter):
     def set_pose(self, pose: FloatArray, covariance: FloatArray) -> None:
         """Put the robot at Â = ``pose``; its correlation with the map is forgotten."""
         super().set_pose(pose, covariance)
+        self.motion_noise.factors.forget_motion()
         self.joint.set_pose(covariance[self.axes.pose, self.axes.pose], self.points)
 
     def anchor(self, rows: IntArray, r: FloatArray, covariances: FloatArray) -> None:

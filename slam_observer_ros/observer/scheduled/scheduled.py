@@ -35,7 +35,7 @@ from slam_observer_ros.geometry.matrices import (
     symmetric,
     transpose,
 )
-from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, OF_SENSORS
+from slam_observer_ros.observer.filter import Filter, OF_CONSTANT_GAINS, OF_JOINT_COVARIANCES
 from slam_observer_ros.observer.gauge import anchor
 from slam_observer_ros.observer.known_landmarks import KnownLandmarks
 from slam_observer_ros.observer.residuals import Residuals
@@ -62,7 +62,7 @@ class ScheduledFilter(Filter):
 
     ignores = (
         *OF_CONSTANT_GAINS,
-        *OF_SENSORS,
+        *OF_JOINT_COVARIANCES,
         'landmark_velocity_stddev',
         'use_tag_orientation',
         'orientation_noise',
