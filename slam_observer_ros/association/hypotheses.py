@@ -206,7 +206,8 @@ class Hypotheses:
     def _without_carried(self, event: ObservationEvent) -> ObservationEvent:
         """Stop where the wheels spin; return an observation without what the robot carries."""
         standing = self._standing
-        event = event.without(standing.carried)
+        if standing.carried:
+            event = event.without(standing.carried)
         were_spinning, were_carried = standing.is_spinning, len(standing.carried)
         lost = standing.note(self.best, event)
         if lost is not None:
@@ -218,7 +219,7 @@ class Hypotheses:
                 self.forget(landmark_id)
             for hypothesis in self._all:
                 hypothesis.state.counts['carried_landmark'] += newly
-        return event.without(standing.suspects)
+        return event.without(standing.suspects) if standing.suspects else event
 
     def _observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation of places."""

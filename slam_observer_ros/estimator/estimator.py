@@ -656,7 +656,8 @@ class Estimator:
             warnings.more_than_max(len(event.ids), limit)
         if len(outcome.moved_ids):
             warnings.moved_landmarks(outcome.moved_ids, event.stamp_ns)
-        warnings.carried_landmarks(self._hypotheses.carried_ids)
+        if carried_ids := self._hypotheses.carried_ids:
+            warnings.carried_landmarks(carried_ids)
         warnings.unexpected_poses(self._hypotheses.count)
         joint = state.filter.joint
         is_dense = joint is not None and joint.is_dense and not state.is_fixed
