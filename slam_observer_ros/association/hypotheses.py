@@ -31,6 +31,7 @@ from slam_observer_ros.association.joint_compatibility import (
     unpaired_cost,
 )
 from slam_observer_ros.association.new_landmarks import NewLandmarks
+from slam_observer_ros.association.standing import Standing, take_back
 from slam_observer_ros.common.types import FloatArray, IntArray
 from slam_observer_ros.estimates import CalibrationEstimate, DELAY_NAME
 from slam_observer_ros.events import (
@@ -81,6 +82,7 @@ class Hypotheses:
         self._some_have_ids = False
         self._contradictions = Contradictions()
         self._new_landmarks = NewLandmarks()
+        self._standing = Standing()
         self._delay_evidence = DelayEvidence()
 
     @property
@@ -160,6 +162,8 @@ class Hypotheses:
             state = hypothesis.state
             motion = state.motion(velocities, start_ns, end_ns)
             state.propagate(motion)
+            if state is self.best:
+                self._standing.move(motion)
             if motion.at_ends is not None and state is self.best:
                 self._delay_evidence.add(velocities, motion, start_ns, end_ns)
 
@@ -177,6 +181,7 @@ class Hypotheses:
         for hypothesis in self._all:
             hypothesis.state.clear_time()
         self._contradictions.clear()
+        self._standing.clear_time()
 
     def forget(self, landmark_id: int) -> bool:
         """Remove a landmark from all maps; return whether the most likely one had it."""
@@ -187,8 +192,37 @@ class Hypotheses:
                 state.remove(row)
         return bool(rows[0][0] >= 0)
 
+    @property
+    def carried_ids(self) -> frozenset[int]:
+        """Landmarks that move with the robot, and are not used."""
+        return frozenset(self._standing.carried)
+
     def observe(self, event: ObservationEvent) -> Outcome:
         """Use an observation made at their instant; return its outcome for the best one."""
+        if self.best.filter.has_joint_covariance:
+            event = self._without_carried(event)
+        return self._observe(event)
+
+    def _without_carried(self, event: ObservationEvent) -> ObservationEvent:
+        """Stop where the wheels spin; return an observation without what the robot carries."""
+        standing = self._standing
+        if standing.carried:
+            event = event.without(standing.carried)
+        were_spinning, were_carried = standing.is_spinning, len(standing.carried)
+        lost = standing.note(self.best, event)
+        if lost is not None:
+            for hypothesis in self._all:
+                take_back(hypothesis.state, lost)
+                hypothesis.state.counts['slip'] += not were_spinning
+        if newly := len(standing.carried) - were_carried:
+            for landmark_id in standing.carried:
+                self.forget(landmark_id)
+            for hypothesis in self._all:
+                hypothesis.state.counts['carried_landmark'] += newly
+        return event.without(standing.suspects) if standing.suspects else event
+
+    def _observe(self, event: ObservationEvent) -> Outcome:
+        """Use an observation of places."""
         # Nearly always there is one hypothesis, and one meaning: the step, and no more.
         unknown = int(np.count_nonzero(event.ids == UNKNOWN_ID))
         self._some_have_ids = self._some_have_ids or unknown < len(event.ids)

@@ -157,6 +157,12 @@ class EventWarnings:
             )
             self._warn('many_moved', text)
 
+    def carried_landmarks(self, ids: frozenset[int]) -> None:
+        """Warn of landmarks that move with the robot, whenever there are more of them."""
+        if len(ids) > self._reported['carried_landmark']:
+            logger.warning('Not used: landmarks %s move with the robot.', _list(sorted(ids)))
+        self._reported['carried_landmark'] = len(ids)
+
     def unexpected_poses(self, count: Callable[[str], int]) -> None:
         """Warn that the robot is not where it was taken to be, if ``count`` says so again."""
         for name, text in UNEXPECTED_POSES.items():
